@@ -1,0 +1,188 @@
+"""The camera: pinhole intrinsics, lens distortion, and how it is mounted on the body.
+
+Convention:
+    Pixels (x, y) have their centres at integers, the origin at the centre of the top-left pixel (OpenCV's).
+    The optical frame is x right, y down, z forward. ``mount`` takes optical vectors to body
+    forward-right-down: v_body = mount @ v_camera. The default mount looks straight down with the top of
+    the picture towards the nose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import CalibrationError
+
+Array = NDArray[np.float64]
+
+DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
+"""Names of ROS camera_info and the numbers of coefficients that each takes."""
+
+
+def _nadir_mount() -> Array:
+    return np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics and mount of one camera.
+
+    Attributes:
+        width_px: columns of a frame.
+        height_px: rows of a frame.
+        matrix: (3, 3) pinhole matrix K.
+        distortion_model: a key of :data:`DISTORTION_MODELS`.
+        distortion: its coefficients, in OpenCV's order.
+        mount: (3, 3) rotation, v_body = mount @ v_camera.
+
+    Raises:
+        CalibrationError: a field is of the wrong shape, not finite, or not a rotation.
+    """
+
+    width_px: int
+    height_px: int
+    matrix: Array
+    distortion_model: str = "plumb_bob"
+    distortion: Array = field(default_factory=lambda: np.zeros(5))
+    mount: Array = field(default_factory=_nadir_mount)
+
+    def __post_init__(self) -> None:
+        for name in ("matrix", "distortion", "mount"):
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
+        if self.width_px < 1 or self.height_px < 1:
+            raise CalibrationError(f"image size: expected 1 x 1 or more, got {self.width_px} x {self.height_px}")
+        if self.matrix.shape != (3, 3) or not np.isfinite(self.matrix).all():
+            raise CalibrationError(f"camera_matrix: expected 9 finite numbers, got shape {self.matrix.shape}")
+        if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
+            raise CalibrationError(
+                f"camera_matrix: expected positive focal lengths, got {self.matrix[0, 0]}, {self.matrix[1, 1]}"
+            )
+        if self.distortion_model not in DISTORTION_MODELS:
+            known = ", ".join(DISTORTION_MODELS)
+            raise CalibrationError(f"distortion_model: expected one of {known}, got {self.distortion_model!r}")
+        lengths = DISTORTION_MODELS[self.distortion_model]
+        if self.distortion.shape not in [(n,) for n in lengths] or not np.isfinite(self.distortion).all():
+            raise CalibrationError(
+                f"distortion_coefficients: {self.distortion_model} takes {' or '.join(map(str, lengths))} "
+                f"finite numbers, got {self.distortion.tolist()}"
+            )
+        if self.mount.shape != (3, 3) or not np.allclose(self.mount @ self.mount.T, np.eye(3), atol=1e-3):
+            raise CalibrationError("mount: expected a 3 x 3 rotation, got a matrix that is not orthonormal")
+        if np.linalg.det(self.mount) < 0:
+            raise CalibrationError("mount: expected a rotation, got a reflection (determinant -1)")
+
+    @classmethod
+    def from_fov(cls, width_px: int, height_px: int, fov_deg: float) -> Camera:
+        """An ideal nadir camera from its horizontal field of view: f = W / (2 tan(fov / 2))."""
+        if not 0.0 < fov_deg < 180.0:
+            raise CalibrationError(f"fov_deg: expected above 0 and below 180, got {fov_deg}")
+        focal = width_px / (2.0 * np.tan(np.radians(fov_deg) / 2.0))
+        centre = ((width_px - 1) / 2.0, (height_px - 1) / 2.0)
+        return cls(width_px, height_px, np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]]))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Camera:
+        """Read a ROS camera_info YAML file, with an optional ``mount``.
+
+        Raises:
+            CalibrationError: the file is missing, is not YAML, or lacks or garbles a field.
+        """
+        import yaml
+
+        try:
+            content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise CalibrationError(f"camera: no such file: {path}") from None
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            reason = str(error).splitlines()[0]
+            raise CalibrationError(f"camera: {path} is not a readable YAML file: {reason}") from None
+        if not isinstance(content, dict):
+            raise CalibrationError(f"camera: {path} holds no camera_info mapping")
+        try:
+            return cls._from_camera_info(content)
+        except KeyError as error:
+            raise CalibrationError(f"camera: {path} lacks the field {error.args[0]}") from None
+        except CalibrationError as error:
+            raise CalibrationError(f"camera: {path}: {error}") from None
+        except (TypeError, ValueError) as error:
+            raise CalibrationError(f"camera: {path}: {str(error).splitlines()[0]}") from None
+
+    @classmethod
+    def _from_camera_info(cls, info: dict[str, Any]) -> Camera:
+        def numbers(name: str) -> Array:
+            block = info[name]
+            return np.asarray(block["data"] if isinstance(block, dict) else block, dtype=np.float64).ravel()
+
+        matrix, model = numbers("camera_matrix"), str(info.get("distortion_model", "plumb_bob"))
+        if matrix.size != 9:
+            raise CalibrationError(f"camera_matrix: expected 9 numbers, got {matrix.size}")
+        distortion = numbers("distortion_coefficients") if "distortion_coefficients" in info else np.zeros(0)
+        if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
+            distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
+        mount = numbers("mount") if "mount" in info else _nadir_mount().ravel()
+        if mount.size != 9:
+            raise CalibrationError(f"mount: expected 9 numbers, got {mount.size}")
+        return cls(
+            int(info["image_width"]),
+            int(info["image_height"]),
+            matrix.reshape(3, 3),
+            model,
+            distortion,
+            mount.reshape(3, 3),
+        )
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length in pixels."""
+        return float((self.matrix[0, 0] + self.matrix[1, 1]) / 2.0)
+
+    @property
+    def distorts(self) -> bool:
+        """Whether pixels must be moved before the pinhole model holds."""
+        return bool(self.distortion.any()) or self.distortion_model in ("equidistant", "fisheye")
+
+    @cached_property
+    def _undistort_maps(self) -> tuple[Any, Any]:
+        import cv2
+
+        size = (self.width_px, self.height_px)
+        if self.distortion_model in ("equidistant", "fisheye"):
+            return cv2.fisheye.initUndistortRectifyMap(
+                self.matrix, self.distortion, np.eye(3), self.matrix, size, cv2.CV_16SC2
+            )
+        return cv2.initUndistortRectifyMap(self.matrix, self.distortion, None, self.matrix, size, cv2.CV_16SC2)
+
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The picture (H, W) or (H, W, 3) that a pinhole of the same matrix would have taken.
+
+        The lookup is computed once per camera. Pixels that the lens never saw are 0. An ideal camera's
+        picture comes back as it is.
+
+        Raises:
+            CalibrationError: the picture's size is not the camera's.
+        """
+        self.check_size(image.shape)
+        if not self.distorts:
+            return image
+        import cv2
+
+        undistorted = cv2.remap(image, *self._undistort_maps, cv2.INTER_LINEAR)
+        return np.asarray(undistorted, dtype=np.uint8)
+
+    def check_size(self, shape: tuple[int, ...]) -> None:
+        """Refuse a picture of another resolution than the calibration's.
+
+        Raises:
+            CalibrationError: the sizes differ.
+        """
+        if tuple(shape[:2]) != (self.height_px, self.width_px):
+            raise CalibrationError(
+                f"camera: calibrated for {self.width_px} x {self.height_px}, "
+                f"but the frame is {shape[1]} x {shape[0]}"
+            )

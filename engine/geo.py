@@ -1,0 +1,128 @@
+"""Places on the Earth: WGS84, a local east-north-up frame, rotations, and the transport of covariance.
+
+Convention:
+    East, north and up are metres in the plane tangent to the ellipsoid at a stated origin.
+    Rotations are written ``to_from``: ``enu_from_body @ v_body`` is the same vector in east-north-up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+WGS84_A_M = 6378137.0
+"""Semi-major axis of the WGS84 ellipsoid (NIMA TR8350.2)."""
+WGS84_E2 = 6.69437999014e-3
+"""First eccentricity squared of the same."""
+
+
+def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
+    """Earth-centred coordinates (..., 3) in metres of WGS84 latitude, longitude and ellipsoid height."""
+    lat, lon = np.radians(np.asarray(lat_deg, float)), np.radians(np.asarray(lon_deg, float))
+    height = np.asarray(height_m, float)
+    normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
+    x = (normal + height) * np.cos(lat) * np.cos(lon)
+    y = (normal + height) * np.cos(lat) * np.sin(lon)
+    z = (normal * (1.0 - WGS84_E2) + height) * np.sin(lat)
+    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+
+
+def geodetic_from_ecef(ecef_m: Array) -> tuple[Array, Array, Array]:
+    """Latitude and longitude in degrees and ellipsoid height in metres of points (..., 3).
+
+    Fixed-point iteration on the latitude; five rounds bring points near the ground below a nanometre.
+    """
+    x, y, z = np.moveaxis(np.asarray(ecef_m, float), -1, 0)
+    radius = np.hypot(x, y)
+    lat = np.arctan2(z, radius * (1.0 - WGS84_E2))
+    for _ in range(5):
+        normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
+        lat = np.arctan2(z + WGS84_E2 * normal * np.sin(lat), radius)
+    normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
+    # Both forms of the height are exact; the mix below is well conditioned at the equator and at the poles.
+    height = radius * np.cos(lat) + z * np.sin(lat) - WGS84_A_M**2 / normal
+    return np.degrees(lat), np.degrees(np.arctan2(y, x)), height
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """East-north-up about an origin on the ellipsoid.
+
+    Attributes:
+        lat_deg: latitude of the origin.
+        lon_deg: longitude of the origin.
+    """
+
+    lat_deg: float
+    lon_deg: float
+
+    @cached_property
+    def _enu_from_ecef(self) -> Array:
+        lat, lon = math.radians(self.lat_deg), math.radians(self.lon_deg)
+        sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
+        return np.array(
+            [
+                [-sin_lon, cos_lon, 0.0],
+                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+                [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+            ]
+        )
+
+    @cached_property
+    def _origin_ecef_m(self) -> Array:
+        return ecef_from_geodetic(self.lat_deg, self.lon_deg)
+
+    def enu_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
+        """East and north (..., 2) in metres of points on the ellipsoid."""
+        offset = ecef_from_geodetic(lat_deg, lon_deg) - self._origin_ecef_m
+        return (offset @ self._enu_from_ecef.T)[..., :2]
+
+    def geodetic_from_enu(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[Array, Array]:
+        """Latitude and longitude in degrees of the points on the ellipsoid above (east, north)."""
+        east, north = np.broadcast_arrays(np.asarray(east_m, float), np.asarray(north_m, float))
+        # The ellipsoid falls away below the tangent plane by d^2 / 2R; two rounds find that drop.
+        drop = np.zeros_like(east)
+        for _ in range(3):
+            enu = np.stack([east, north, -drop], axis=-1)
+            lat, lon, height = geodetic_from_ecef(enu @ self._enu_from_ecef + self._origin_ecef_m)
+            drop = drop + height
+        return lat, lon
+
+
+def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
+    """Rotation (3, 3) that takes body forward-right-down vectors to east-north-up.
+
+    Convention:
+        Aerospace order: heading about down, then pitch about right, then roll about forward.
+        Heading clockwise from true north, pitch positive nose up, roll positive right side down.
+    """
+    r, p, h = (math.radians(v) for v in (roll_deg, pitch_deg, heading_deg))
+    yaw = np.array([[math.cos(h), -math.sin(h), 0], [math.sin(h), math.cos(h), 0], [0, 0, 1.0]])
+    pitch = np.array([[math.cos(p), 0, math.sin(p)], [0, 1.0, 0], [-math.sin(p), 0, math.cos(p)]])
+    roll = np.array([[1.0, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]])
+    enu_from_ned = np.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -1.0]])
+    return np.asarray(enu_from_ned @ yaw @ pitch @ roll, dtype=np.float64)
+
+
+def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
+    """Roll, pitch and heading in degrees of a rotation; the inverse of :func:`enu_from_body`.
+
+    The heading is in [0, 360). At a pitch of +-90 degrees roll and heading cannot be told apart.
+    """
+    forward, right, down = (enu_from_body_[:, i] for i in range(3))
+    heading = math.degrees(math.atan2(forward[0], forward[1])) % 360.0
+    pitch = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
+    roll = math.degrees(math.atan2(-right[2], -down[2]))
+    return roll, pitch, heading
+
+
+def transport_covariance(jacobian: Array, covariance: Array) -> Array:
+    """First-order covariance of f(x): J C J^T, symmetrised against rounding."""
+    moved = jacobian @ covariance @ jacobian.T
+    return np.asarray(0.5 * (moved + moved.T), dtype=np.float64)
