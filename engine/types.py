@@ -254,6 +254,31 @@ class NoFix:
     timings: Timings = field(default_factory=Timings)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Where the vehicle really was at one moment; what is unknown is None.
+
+    Attributes:
+        timestamp_ns: on the clock of the frames.
+        lat_deg: WGS84 latitude.
+        lon_deg: WGS84 longitude.
+        alt_amsl_m: height above mean sea level.
+        height_agl_m: height above the ground.
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+        heading_deg: clockwise from true north.
+    """
+
+    timestamp_ns: int
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float | None = None
+    height_agl_m: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    heading_deg: float | None = None
+
+
 Result = Fix | NoFix
 """What a frame ends in."""
 
