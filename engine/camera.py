@@ -29,7 +29,7 @@ def _nadir_mount() -> Array:
     return np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no single answer to ==
 class Camera:
     """Intrinsics and mount of one camera.
 
@@ -62,6 +62,10 @@ class Camera:
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
             raise CalibrationError(
                 f"camera_matrix: expected positive focal lengths, got {self.matrix[0, 0]}, {self.matrix[1, 1]}"
+            )
+        if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], (0.0, 0.0, 0.0, 1.0)):
+            raise CalibrationError(  # a transposed matrix, most of all
+                f"camera_matrix: expected fx 0 cx, 0 fy cy, 0 0 1 row by row, got {self.matrix.ravel().tolist()}"
             )
         if self.distortion_model not in DISTORTION_MODELS:
             known = ", ".join(DISTORTION_MODELS)
@@ -117,7 +121,17 @@ class Camera:
     def _from_camera_info(cls, info: dict[str, Any]) -> Camera:
         def numbers(name: str) -> Array:
             block = info[name]
-            return np.asarray(block["data"] if isinstance(block, dict) else block, dtype=np.float64).ravel()
+            data = block.get("data") if isinstance(block, dict) else block
+            try:
+                return np.asarray(data, dtype=np.float64).ravel()
+            except (TypeError, ValueError):
+                raise CalibrationError(f"{name}: expected numbers, got {str(data)[:60]!r}") from None
+
+        def pixels(name: str) -> int:
+            value = info[name]
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise CalibrationError(f"{name}: expected a whole number of pixels, got {value!r}")
+            return value
 
         matrix, model = numbers("camera_matrix"), str(info.get("distortion_model", "plumb_bob"))
         if matrix.size != 9:
@@ -129,8 +143,8 @@ class Camera:
         if mount.size != 9:
             raise CalibrationError(f"mount: expected 9 numbers, got {mount.size}")
         return cls(
-            int(info["image_width"]),
-            int(info["image_height"]),
+            pixels("image_width"),
+            pixels("image_height"),
             matrix.reshape(3, 3),
             model,
             distortion,

@@ -116,10 +116,15 @@ def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
     The heading is in [0, 360). At a pitch of +-90 degrees roll and heading cannot be told apart.
     """
     forward, right, down = (enu_from_body_[:, i] for i in range(3))
-    heading = math.degrees(math.atan2(forward[0], forward[1])) % 360.0
+    heading = wrap_heading_deg(math.degrees(math.atan2(forward[0], forward[1])))
     pitch = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
     roll = math.degrees(math.atan2(-right[2], -down[2]))
     return roll, pitch, heading
+
+
+def wrap_heading_deg(heading_deg: float) -> float:
+    """The same direction in [0, 360); the first remainder of a tiny negative angle rounds to 360 itself."""
+    return heading_deg % 360.0 % 360.0
 
 
 def transport_covariance(jacobian: Array, covariance: Array) -> Array:

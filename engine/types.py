@@ -97,6 +97,8 @@ class Prior:
 
     Attributes:
         sigma_m: one standard deviation of the position, per axis.
+        moved_east_m: how far the vehicle moved since the last frame; eq. 4 and 5 add it to the window.
+        moved_north_m: the same to the north.
 
     Raises:
         OptionError: the position is missing, doubled or not finite, or sigma_m is negative.
@@ -107,6 +109,8 @@ class Prior:
     east_m: float | None = None
     north_m: float | None = None
     sigma_m: float
+    moved_east_m: float = 0.0
+    moved_north_m: float = 0.0
 
     def __post_init__(self) -> None:
         geographic = self.lat_deg is not None and self.lon_deg is not None
@@ -121,6 +125,8 @@ class Prior:
                 raise OptionError(f"lat_deg: expected -90 to 90, got {self.lat_deg}")
             if abs(self.lon_deg) > 360:
                 raise OptionError(f"lon_deg: expected -360 to 360, got {self.lon_deg}")
+        if not (math.isfinite(self.moved_east_m) and math.isfinite(self.moved_north_m)):
+            raise OptionError(f"moved: expected finite metres, got {self.moved_east_m}, {self.moved_north_m}")
         if not (math.isfinite(self.sigma_m) and self.sigma_m >= 0):
             raise OptionError(f"sigma_m: expected 0 m or more, got {self.sigma_m}")
 

@@ -1,0 +1,14 @@
+"""The command line: parse, call, print. Every known error is one line and an exit code, never a traceback."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Entry point of ``scenematch``: exit 0 done, 1 a run that could not be finished, 2 wrong usage."""
+    from engine.cli.app import run
+
+    sys.exit(run(sys.argv[1:]))

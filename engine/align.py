@@ -1,0 +1,194 @@
+"""From a camera frame to a picture that can lie on the map: grey, enhance, rectify (equations 2 and 3).
+
+Convention:
+    A rectified patch has the map's pixels and axes. Its ``offset_px`` is where its top-left pixel lies relative
+    to the camera's nadir, so that nadir = (place found on the map) - offset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.geo import enu_from_body
+from engine.types import Attitude, Frame
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+# Beyond this angle off the vertical a footprint is stretched more than 4 times and relief hides the ground.
+MAX_RAY_DEG = 75.0
+# Where the frame is finer than the map by more than this, it is averaged down first, or it would alias.
+_MAX_SHRINK = 0.75
+_ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
+_SHRINKS = np.linspace(1.0, 0.25, 61)
+# Added to the local variance, in squared grey levels: flat ground stays flat instead of becoming sensor noise.
+_NOISE_VARIANCE = 4.0
+
+
+def to_gray(frame: Frame) -> NDArray[np.uint8]:
+    """The frame's picture as (H, W) uint8 on the CPU; colours by ITU-R BT.601 luma."""
+    image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
+    if image.ndim == 3:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return np.ascontiguousarray(image)
+
+
+def enhance(gray: NDArray[np.uint8], *, radius_px: int = 12, valid: NDArray[np.bool_] | None = None) -> Image:
+    """Local normalisation, (H, W) to (H, W): each pixel less its neighbourhood's mean, over its deviation.
+
+    This is the paper's "enhance" step: shadows, haze and exposure change the local mean and contrast, streets
+    and roofs stay. Neighbourhoods are boxes of 2 radius_px + 1 pixels.
+
+    Args:
+        gray: the picture.
+        radius_px: half the size of the neighbourhood; 0 leaves the picture as it is.
+        valid: where False, pixels take no part and come out as 0.
+
+    Raises:
+        OptionError: the radius is negative.
+    """
+    if radius_px < 0:
+        raise OptionError(f"radius_px: expected 0 or more, got {radius_px}")
+    picture = gray.astype(np.float32)
+    if radius_px == 0:
+        return picture
+    box = (2 * radius_px + 1, 2 * radius_px + 1)
+    if valid is None:
+        mean = cv2.blur(picture, box)
+        square = cv2.blur(picture * picture, box)
+    else:
+        weight = valid.astype(np.float32)
+        share = np.maximum(cv2.blur(weight, box), 1e-6)
+        mean = cv2.blur(picture * weight, box) / share
+        square = cv2.blur(picture * picture * weight, box) / share
+    deviation = np.sqrt(np.maximum(square - mean * mean, 0.0) + _NOISE_VARIANCE)
+    normal = (picture - mean) / deviation
+    return np.asarray(normal if valid is None else normal * weight, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """How a level plane under the camera is seen, in map pixels about the nadir.
+
+    Attributes:
+        image_from_map: (3, 3) homography; map pixels relative to the nadir to frame pixels.
+        center_px: (2,) where the ray of the frame's middle meets the ground.
+        footprint_px: extent (width, height) of the whole frame on the map, the s T of equations 4 and 5.
+        area_px: the area of the whole frame on the map.
+    """
+
+    image_from_map: Array
+    center_px: Array
+    footprint_px: tuple[float, float]
+    area_px: float
+
+
+def view_of(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array) -> View | None:
+    """The camera's view of level ground ``height_m`` below it.
+
+    Equation 2 (scale) and equation 3 (rotation) are the special case of a level camera: the homography holds
+    s = h / (f gsd) and psi - psi_m, and with them the tilt. The map's own rotation against true north and its
+    scale come in by the Jacobian, so that meridian convergence is honoured.
+
+    Args:
+        camera: pinhole (the frame is undistorted).
+        attitude: of the body.
+        height_m: above the plane that is looked at.
+        enu_jacobian: (2, 2) metres east and north per map pixel x and y.
+
+    Returns:
+        View | None: None where a corner of the frame looks too near the horizon, see :data:`MAX_RAY_DEG`.
+    """
+    enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
+    w, h = camera.width_px, camera.height_px
+    pixels = np.array(
+        [[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5], [(w - 1) / 2, (h - 1) / 2]]
+    )
+    rays = np.c_[pixels, np.ones(5)] @ np.linalg.inv(camera.matrix).T @ enu_from_camera.T
+    down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
+    if down.min() < np.cos(np.radians(MAX_RAY_DEG)):
+        return None
+    ground_m = rays[:, :2] * (height_m / -rays[:, 2:])
+    ground_px = np.linalg.solve(enu_jacobian, ground_m.T).T
+    extent = np.ptp(ground_px[:4], axis=0)
+    plane = np.zeros((3, 3))  # map pixels about the nadir to east, north, up of the ground below the camera
+    plane[:2, :2], plane[2, 2] = enu_jacobian, -height_m
+    return View(
+        camera.matrix @ enu_from_camera.T @ plane,
+        ground_px[4],
+        (float(extent[0]), float(extent[1])),
+        float(cv2.contourArea(ground_px[:4].astype(np.float32))),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A rectified part of a frame: (h, w) grey, and where it lies relative to the nadir, in map pixels."""
+
+    gray: NDArray[np.uint8]
+    offset_px: Array
+
+
+def rectify(gray: NDArray[np.uint8], camera: Camera, view: View, *, fraction: float = 0.7) -> Patch | None:
+    """Draw the frame in the map's pixels, and keep the largest upright rectangle that it fills.
+
+    Args:
+        gray: (H, W) undistorted.
+        camera: its pinhole.
+        view: from :func:`view_of`.
+        fraction: upper limit of the rectangle's size against the whole frame's; 0.7 is what a square frame
+            fills at any heading, so that the cost of matching does not depend on where the nose points.
+
+    Returns:
+        Patch | None: None where fewer than 8 x 8 map pixels are filled.
+    """
+    size = _inscribed_size(view, gray.shape, fraction)
+    if size is None:
+        return None
+    width, height = size
+    offset = np.round(view.center_px - (np.array([width, height]) - 1) / 2.0)
+    shift = np.array([[1.0, 0, offset[0]], [0, 1.0, offset[1]], [0, 0, 1.0]])
+    scale = float(np.sqrt(view.area_px / (gray.shape[0] * gray.shape[1])))
+    picture, picture_from_image = _shrink(gray, scale)
+    patch = cv2.warpPerspective(
+        picture,
+        picture_from_image @ view.image_from_map @ shift,
+        (width, height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return Patch(np.asarray(patch, dtype=np.uint8), offset)
+
+
+def _shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Array]:
+    """The picture averaged down to ``scale`` where it is much finer than the map, and its homography."""
+    if scale >= _MAX_SHRINK:
+        return gray, np.eye(3)
+    height, width = (max(8, round(n * scale)) for n in gray.shape)
+    sx, sy = width / gray.shape[1], height / gray.shape[0]
+    homography = np.array([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1.0]])
+    return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), np.uint8), homography
+
+
+def _inscribed_size(view: View, shape: tuple[int, ...], fraction: float) -> tuple[int, int] | None:
+    """Width and height of the largest upright rectangle about the view's centre inside the frame."""
+    side = fraction * np.sqrt(view.area_px)
+    half = side / 2.0 * np.stack([np.sqrt(_ASPECTS), 1.0 / np.sqrt(_ASPECTS)], axis=1)  # (A, 2)
+    half = _SHRINKS[:, None, None] * half  # (S, A, 2), largest first
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = view.center_px + half[:, :, None] * signs  # (S, A, 4, 2)
+    image = corners @ view.image_from_map[:, :2].T + view.image_from_map[:, 2]
+    pixels = image[..., :2] / image[..., 2:]
+    limit = np.array([shape[1] - 1, shape[0] - 1])
+    inside = ((pixels >= 0) & (pixels <= limit) & (image[..., 2:] > 0)).all(axis=(-2, -1))  # (S, A)
+    best = int(inside.argmax())
+    if not inside.flat[best]:
+        return None
+    width, height = (int(2 * n) for n in half.reshape(-1, 2)[best])
+    return (width, height) if min(width, height) >= 8 else None

@@ -1,0 +1,196 @@
+"""A flight: its frames, read one at a time, with what the vehicle knew at each; and the writer of its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from engine.camera import Camera
+from engine.errors import TelemetryError
+from engine.formats.frames import FrameSource, VideoFile, exif_telemetry, open_frames
+from engine.formats.geotiff import write_geotiff
+from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
+from engine.formats.truth import write_truth
+from engine.geo import wrap_heading_deg
+from engine.types import Frame, Prior, Truth
+
+_JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True, slots=True)
+class FlightFrame:
+    """One frame of a flight.
+
+    Attributes:
+        name: file name of the picture, or the index in a video.
+        frame: the picture, with what its telemetry says.
+        prior: the position in the telemetry, or None.
+        telemetry: the row itself, or None where the flight has no telemetry.
+    """
+
+    name: str
+    frame: Frame
+    prior: Prior | None
+    telemetry: TelemetryRow | None
+
+
+@dataclass
+class Flight:
+    """Frames in order of capture. Iterating reads one picture at a time and may be repeated.
+
+    Attributes:
+        source: where pictures come from.
+        rows: the telemetry, one row a frame; empty where there is none.
+        names: the frames, in order.
+        unused: how many pictures no row names.
+    """
+
+    source: FrameSource
+    rows: list[TelemetryRow]
+    names: list[str] = field(init=False)
+    unused: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.names = [row.frame for row in self.rows] or list(self.source.names)
+        self.unused = len(set(self.source.names) - set(self.names))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[FlightFrame]:
+        for i, name in enumerate(self.names):
+            image, row = self.source.read(name), self.rows[i] if self.rows else None
+            if row is None:
+                yield FlightFrame(name, Frame(image), None, None)
+            else:
+                yield FlightFrame(name, _frame(image, row), row.prior, row)
+
+
+def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
+    return Frame(
+        image,
+        timestamp_ns=row.timestamp_ns,
+        height_agl_m=row.height_agl_m,
+        heading_deg=row.heading_deg,
+        roll_deg=row.roll_deg,
+        pitch_deg=row.pitch_deg,
+        east_velocity_mps=row.east_velocity_mps,
+        north_velocity_mps=row.north_velocity_mps,
+    )
+
+
+def open_flight(frames: str | Path, telemetry: str | Path | None = None, camera: Camera | None = None) -> Flight:
+    """Open a flight and check up front that its parts belong together.
+
+    Args:
+        frames: a folder of pictures, or a video.
+        telemetry: telemetry.csv; without it the photographs' EXIF, and where that has no times the pictures
+            in natural order with nothing known.
+        camera: refuses the flight at once where the first picture has another size than the calibration.
+
+    Raises:
+        TelemetryError: a file cannot be read, or a row names a frame that is not there.
+        CalibrationError: the first picture is of another size than the camera's.
+    """
+    source = open_frames(frames)
+    if telemetry is not None:
+        rows = read_telemetry(telemetry, source, source.described)
+    elif isinstance(source, VideoFile):
+        rows = []
+    else:
+        rows = exif_telemetry([source.path / name for name in source.names])
+    flight = Flight(source, rows)
+    if camera is not None:
+        camera.check_size(source.read(flight.names[0]).shape)
+    return flight
+
+
+def write_flight_folder(
+    directory: str | Path,
+    *,
+    frames: Iterable[tuple[str, Frame]],
+    truth: Iterable[Truth],
+    camera: Camera,
+    ortho_rgb: NDArray[np.uint8],
+    pixel_to_crs: ArrayLike,
+    crs_epsg: int,
+    surface_m: NDArray[Any] | None = None,
+    start: Prior | None = None,
+) -> None:
+    """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
+
+    Args:
+        directory: created where it does not exist.
+        frames: file name (.jpg or .png) and stamped frame, consumed one at a time and before ``truth``.
+        truth: where the vehicle really was, in the order of time.
+        camera: intrinsics and mount.
+        ortho_rgb: (H, W, 3) or grey (H, W) map.
+        pixel_to_crs: (2, 3), takes the map's pixel centres (x, y, 1) to the CRS.
+        crs_epsg: EPSG code of the CRS.
+        surface_m: (H, W) heights on the map's grid, or None.
+        start: a prior in latitude and longitude for the first row of the telemetry.
+
+    Raises:
+        TelemetryError: a frame has no stamp, or a file cannot be written.
+        MapError: map.tif or dsm.tif cannot be written.
+    """
+    directory = Path(directory)
+    (directory / "frames").mkdir(parents=True, exist_ok=True)
+    rows: list[TelemetryRow] = []
+    for name, frame in frames:
+        _write_picture(directory / "frames" / name, frame)
+        rows.append(_telemetry_row(name, frame, start if not rows else None))
+    write_telemetry(directory / "telemetry.csv", rows)
+    write_truth(directory / "truth.csv", list(truth))
+    (directory / "camera.yaml").write_text(_camera_info(camera), encoding="utf-8")
+    write_geotiff(directory / "map.tif", ortho_rgb, pixel_to_crs, crs_epsg)
+    if surface_m is not None:
+        write_geotiff(directory / "dsm.tif", np.asarray(surface_m, np.float32), pixel_to_crs, crs_epsg)
+
+
+def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow:
+    if frame.timestamp_ns is None:
+        raise TelemetryError(f"{name}: timestamp_ns: expected a stamp to write into telemetry.csv, got None")
+    return TelemetryRow(
+        timestamp_ns=frame.timestamp_ns,
+        frame=name,
+        height_agl_m=frame.height_agl_m,
+        heading_deg=None if frame.heading_deg is None else wrap_heading_deg(frame.heading_deg),
+        roll_deg=frame.roll_deg,
+        pitch_deg=frame.pitch_deg,
+        east_velocity_mps=frame.east_velocity_mps,
+        north_velocity_mps=frame.north_velocity_mps,
+        lat_deg=prior.lat_deg if prior else None,
+        lon_deg=prior.lon_deg if prior else None,
+        sigma_m=prior.sigma_m if prior else None,
+    )
+
+
+def _write_picture(path: Path, frame: Frame) -> None:
+    from PIL import Image
+
+    image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
+    try:
+        Image.fromarray(image).save(path, quality=_JPEG_QUALITY, subsampling=0)
+    except (OSError, ValueError) as error:
+        raise TelemetryError(f"{path}: cannot be written: {error}") from None
+
+
+def _camera_info(camera: Camera) -> str:
+    def block(name: str, rows: int, values: NDArray[np.float64]) -> str:
+        data = ", ".join(repr(float(value)) for value in values.ravel())
+        return f"{name}:\n  rows: {rows}\n  cols: {values.size // rows}\n  data: [{data}]\n"
+
+    return (
+        f"image_width: {camera.width_px}\nimage_height: {camera.height_px}\ncamera_name: nadir\n"
+        + block("camera_matrix", 3, camera.matrix)
+        + f"distortion_model: {camera.distortion_model}\n"
+        + block("distortion_coefficients", 1, camera.distortion)
+        + "# optical (x right, y down, z forward) to body (forward, right, down): v_body = mount * v_camera\n"
+        + block("mount", 3, camera.mount)
+    )

@@ -1,0 +1,80 @@
+"""Writes a GeoTIFF from an array and where its pixels lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from engine.errors import DtypeError, MapError, OptionError, ShapeError
+
+_DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
+
+
+def write_geotiff(
+    path: str | Path, array: NDArray[Any], pixel_to_crs: ArrayLike, crs_epsg: int, nodata: float | None = None
+) -> None:
+    """Write a tiled, losslessly compressed GeoTIFF.
+
+    Convention:
+        ``pixel_to_crs`` (2, 3) takes (x, y, 1), with centres at integers, to the CRS. GeoTIFF counts from the
+        corner of the top-left pixel; the half pixel is moved here.
+
+    Args:
+        path: the file, overwritten where it exists.
+        array: (H, W) or (H, W, 3).
+        pixel_to_crs: affine map, (2, 3).
+        crs_epsg: EPSG code of the CRS.
+        nodata: the value that stands for nothing.
+
+    Raises:
+        ShapeError: an argument has another shape.
+        DtypeError: the array is of a type that readers do not share.
+        OptionError: the affine map is not finite, or its pixels have no area.
+        MapError: the EPSG code is unknown, or the file cannot be written.
+    """
+    array, affine = np.asarray(array), np.asarray(pixel_to_crs, dtype=np.float64)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or 0 in array.shape:
+        raise ShapeError(f"array: expected (H, W) or (H, W, 3) with at least one pixel, got {array.shape}")
+    if array.dtype.name not in _DTYPES:
+        raise DtypeError(f"array: expected one of {', '.join(_DTYPES)}, got {array.dtype}")
+    if affine.shape != (2, 3):
+        raise ShapeError(f"pixel_to_crs: expected (2, 3), got {affine.shape}")
+    if not np.isfinite(affine).all() or np.linalg.det(affine[:, :2]) == 0.0:
+        raise OptionError(f"pixel_to_crs: expected a finite, invertible affine map, got {affine.tolist()}")
+    corner = affine.copy()
+    corner[:, 2] -= 0.5 * (affine[:, 0] + affine[:, 1])
+    _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs_epsg, nodata)
+
+
+def _write(
+    path: Path, bands: NDArray[Any], corner: NDArray[np.float64], crs_epsg: int, nodata: float | None
+) -> None:
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.transform import Affine
+
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "height": bands.shape[0],
+        "width": bands.shape[1],
+        "count": bands.shape[2],
+        "dtype": bands.dtype.name,
+        "transform": Affine(*corner.ravel().tolist()),
+        "nodata": nodata,
+        "tiled": True,
+        "blockxsize": 256,
+        "blockysize": 256,
+        "compress": "deflate",
+        "predictor": 3 if bands.dtype.kind == "f" else 2,
+        "BIGTIFF": "IF_SAFER",
+    }
+    if bands.shape[2] == 3:
+        profile["photometric"] = "RGB"
+    try:
+        with rasterio.open(path, "w", crs=rasterio.CRS.from_epsg(crs_epsg), **profile) as file:
+            file.write(np.moveaxis(bands, 2, 0))
+    except (RasterioError, OSError, ValueError) as error:
+        raise MapError(f"{path}: cannot be written: {str(error).splitlines()[0]}") from None

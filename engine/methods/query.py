@@ -1,0 +1,147 @@
+"""What every method is given: one frame, what is known of its place, the map, and a running clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from engine.budget import Budget, Deadline
+from engine.camera import Camera
+from engine.device import synchronise
+from engine.orthomap import OrthoMap
+from engine.types import Frame, NoFix, Prior, Reason, Timings, Window
+from engine.window import place_window, window_size_px
+
+Array = NDArray[np.float64]
+
+
+class Stopwatch:
+    """Milliseconds by stage, against a deadline."""
+
+    def __init__(self, budget: Budget, device: torch.device) -> None:
+        self.deadline = Deadline(budget)
+        self._device = device
+        self._stages_ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time one stage; stages of one name add up."""
+        start_ms = self.deadline.elapsed_ms
+        yield
+        synchronise(self._device)
+        self._stages_ms[name] = self._stages_ms.get(name, 0.0) + self.deadline.elapsed_ms - start_ms
+
+    @property
+    def timings(self) -> Timings:
+        """What was measured so far."""
+        return Timings(dict(self._stages_ms))
+
+
+@dataclass(frozen=True)
+class Query:
+    """One frame on its way to a fix.
+
+    Attributes:
+        frame: as it came.
+        gray: (H, W) its undistorted grey picture.
+        camera: the pinhole that the undistorted picture obeys.
+        site: the map.
+        prior: where the vehicle should be, or None: anywhere on the map.
+        device: where tensors live.
+        watch: the running clock.
+    """
+
+    frame: Frame
+    gray: NDArray[np.uint8]
+    camera: Camera
+    site: OrthoMap
+    prior: Prior | None
+    device: torch.device
+    watch: Stopwatch = field(repr=False)
+
+    def prior_px(self) -> Array | None:
+        """The prior's position in map pixels (x, y), or None where there is none."""
+        prior = self.prior
+        if prior is None:
+            return None
+        if prior.east_m is not None and prior.north_m is not None:
+            return self.site.pixel_from_enu(np.array([prior.east_m, prior.north_m]))
+        assert prior.lat_deg is not None  # a Prior has one of the two
+        assert prior.lon_deg is not None
+        return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+
+    def jacobian(self) -> Array:
+        """(2, 2) metres east and north per map pixel where the vehicle should be, else at the map's middle."""
+        place = self.prior_px()
+        if place is None:
+            place = np.array([self.site.width_px - 1, self.site.height_px - 1]) / 2.0
+        return self.site.enu_jacobian(place)
+
+    def window(
+        self,
+        center_px: Array,
+        footprint_px: tuple[float, float],
+        least_px: tuple[float, float],
+        *,
+        margin: float,
+        spread_sigmas: float = 3.0,
+    ) -> Window | None:
+        """The adaptive window in map pixels (eq. 4, 5), or None where it lies outside the map.
+
+        Args:
+            center_px: where the middle of the footprint should lie.
+            footprint_px: extent of the whole frame on the map.
+            least_px: extent of what will be matched. The window holds it at every place within
+                ``spread_sigmas`` of the prior, also where equations 4 and 5 would be smaller.
+            margin: the paper's 1.3.
+            spread_sigmas: see above.
+        """
+        prior = self.prior
+        if prior is None:
+            return Window(0, 0, self.site.width_px, self.site.height_px)
+        moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
+        moved_px = np.abs(np.linalg.solve(self.jacobian(), moved_m))
+        size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
+        slack = 2.0 * spread_sigmas * prior.sigma_m / self.site.gsd_m_per_px
+        width, height = (max(a, b + slack) for a, b in zip(size, least_px, strict=True))
+        shape = (self.site.width_px, self.site.height_px)
+        return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
+
+    def refuse(
+        self,
+        reason: Reason,
+        detail: str,
+        method: str,
+        *,
+        score: float | None = None,
+        window: Window | None = None,
+    ) -> NoFix:
+        """The refusal of this frame, with what was measured so far."""
+        return NoFix(
+            reason=reason,
+            detail=detail,
+            timestamp_ns=self.frame.timestamp_ns,
+            method=method,
+            score=score,
+            window=window,
+            timings=self.watch.timings,
+        )
+
+    def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
+        """A refusal where the picture has no texture to match, else None."""
+        deviation = float(self.gray.std())
+        if deviation >= min_deviation:
+            return None
+        figure = f"the frame's grey levels deviate by {deviation:.1f}"
+        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {min_deviation:g} is asked for", method)
+
+
+def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int) -> int:
+    """The pyramid level whose pixels are nearest to the wanted size without being much coarser."""
+    return int(np.clip(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + 0.25), 0, levels - 1))

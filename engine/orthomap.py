@@ -1,0 +1,402 @@
+"""The map: a georeferenced picture in grey with its pyramid, optionally with a surface model.
+
+Convention:
+    Pixels (x, y) have their centres at integers, the origin at the centre of the top-left pixel. East and north
+    are metres in the plane tangent to WGS84 at the centre of the map, ``OrthoMap.frame``. Pixel x_L of pyramid
+    level L covers the full-resolution pixels around x_0 = (x_L + 0.5) 2^L - 0.5.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine.geo import LocalFrame
+from engine.rasters import (
+    MEMORY_LIMIT_PX,
+    WARP_MARGIN,
+    Array,
+    Gray,
+    GrayReader,
+    Grid,
+    Mask,
+    Warp,
+    earth_crs,
+    metric_copy,
+    open_source,
+    read_surface,
+    warp_between,
+)
+from engine.types import Window
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+Read = Callable[[Window], tuple[Gray, Mask]]
+
+GROUND_PERCENT = 20.0
+"""Percentile of the surface over the map that is taken as the level of the ground."""
+SMALLEST_LEVEL_PX = 16
+GSD_RANGE_M = (1e-3, 1e3)
+
+
+class _Pyramid:
+    """Grey and validity at every level: in memory from the first level that is small enough, read below it."""
+
+    def __init__(self, width_px: int, height_px: int, read: Read) -> None:
+        self._size, self._read = (height_px, width_px), read
+        self.levels = max(1, int(math.log2(max(1.0, min(self._size) / SMALLEST_LEVEL_PX))) + 1)
+        self._base = 0
+        while self._base < self.levels - 1 and math.prod(self.shape(self._base)) > MEMORY_LIMIT_PX:
+            self._base += 1
+        self._kept: dict[int, tuple[Gray, Mask]] = {}
+        self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
+        if self._base == 0:
+            self._kept[0] = self._streamed(0)
+
+    def shape(self, level: int) -> tuple[int, int]:
+        if not 0 <= level < self.levels:
+            raise OptionError(f"level: expected 0 to {self.levels - 1}, got {level}")
+        return self._size[0] >> level, self._size[1] >> level
+
+    def _streamed(self, level: int) -> tuple[Gray, Mask]:
+        """A whole level, read in strips so that colour and masks of the file never lie in memory at once."""
+        height, width = self.shape(level)
+        gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
+        rows = max(1, 1024 >> level)
+        for y0 in range(0, height, rows):
+            strip = Window(0, y0, width, min(rows, height - y0))
+            gray[y0 : y0 + rows], valid[y0 : y0 + rows] = self._from_file(strip, level)
+        return gray, valid
+
+    def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
+        scaled = (v << level for v in (window.x0, window.y0, window.width_px, window.height_px))
+        both = self._read(Window(*scaled))
+        for _ in range(level):
+            both = _halved(*both)
+        return both
+
+    def _level(self, level: int) -> tuple[Gray, Mask]:
+        if level not in self._kept:
+            finer = self._streamed(level) if level == self._base else _halved(*self._level(level - 1))
+            self._kept[level] = finer
+        return self._kept[level]
+
+    def crop(self, window: Window, level: int) -> tuple[Gray, Mask]:
+        """Grey and validity (h, w) of a window in pixels of a level."""
+        height, width = self.shape(level)
+        x1, y1 = window.x0 + window.width_px, window.y0 + window.height_px
+        if not (0 <= window.x0 < x1 <= width and 0 <= window.y0 < y1 <= height):
+            raise OptionError(f"window: expected one inside {width} x {height} px of level {level}, got {window}")
+        if level >= self._base:
+            gray, valid = self._level(level)
+            return gray[window.y0 : y1, window.x0 : x1], valid[window.y0 : y1, window.x0 : x1]
+        last = self._last
+        if last is None or last[0] != (window, level):  # grey and validity of a window are often asked in turn
+            last = self._last = ((window, level), self._from_file(window, level))
+        return last[1]
+
+    @cached_property
+    def nodata_share(self) -> float:
+        """Share of the pixels that are not valid, at the finest level in memory."""
+        return 1.0 - float(self._level(self._base)[1].mean())
+
+    def valid_at(self, xy_px: Array) -> Mask:
+        """Validity (...,) of the nearest pixel at the finest level in memory."""
+        height, width = self.shape(self._base)
+        x, y = np.moveaxis(xy_px.astype(np.intp) >> self._base, -1, 0)
+        return np.asarray(self._level(self._base)[1][np.minimum(y, height - 1), np.minimum(x, width - 1)])
+
+
+def _halved(gray: Gray, valid: Mask) -> tuple[Gray, Mask]:
+    """2 x 2 area averages; valid where all four are. An odd last row or column is left out."""
+    import cv2
+
+    height, width = gray.shape[0] // 2, gray.shape[1] // 2
+    even = slice(0, 2 * height), slice(0, 2 * width)
+    small = cv2.resize(gray[even], (width, height), interpolation=cv2.INTER_AREA)
+    all_four = np.asarray(valid[even].reshape(height, 2, width, 2).all(axis=(1, 3)))
+    return np.asarray(small, np.uint8), all_four
+
+
+class _Surface:
+    """Heights on a grid of their own, NaN where unknown, sampled at map pixels."""
+
+    def __init__(self, heights_m: NDArray[np.float32], from_map: Warp) -> None:
+        self._heights_m, self._from_map = heights_m, from_map
+
+    def sample(self, map_xy: Array) -> Array:
+        """Bilinear heights (...,) of map pixels (..., 2), NaN outside and next to nodata."""
+        height, width = self._heights_m.shape
+        last = np.array([width - 1.0, height - 1.0])
+        at = self._from_map(map_xy)
+        inside = np.asarray(((at >= -0.5) & (at <= last + 0.5)).all(axis=-1))
+        at = np.clip(np.where(inside[..., None], at, 0.0), 0.0, last)
+        low = at.astype(np.intp)
+        (x0, y0), (x1, y1) = np.moveaxis(low, -1, 0), np.moveaxis(np.minimum(low + 1, last.astype(np.intp)), -1, 0)
+        u, v = np.moveaxis(at - low, -1, 0)
+        grid = self._heights_m
+        top = grid[y0, x0] * (1.0 - u) + grid[y0, x1] * u
+        bottom = grid[y1, x0] * (1.0 - u) + grid[y1, x1] * u
+        return np.where(inside, top * (1.0 - v) + bottom * v, np.nan)
+
+    @property
+    def range_m(self) -> tuple[float, float]:
+        """Lowest and highest known height."""
+        return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
+
+
+class OrthoMap:
+    """A map that frames are matched against; made by :meth:`open` or :meth:`from_arrays`.
+
+    Attributes:
+        name: name of the file.
+        width_px: columns.
+        height_px: rows.
+        crs: of the metric grid in use.
+        source_crs: of the file.
+        frame: local east-north-up; its origin is the centre of the map.
+        gsd_m_per_px: true metres on the ground per pixel at the centre: the root of the area of a pixel.
+        bounds_deg: west, south, east, north of the outer edges.
+        has_surface: whether there is a surface model.
+        ground_m: level of the ground in the surface's datum: the 20th percentile of the surface over the valid
+            part of the map, below roofs and crowns but not at the bottom of a pit; 0.0 without a surface.
+        levels: number of levels of the pyramid.
+    """
+
+    def __init__(
+        self, name: str, grid: Grid, read: Read, source_crs: CRS, facts: dict[str, Any] | None = None
+    ) -> None:
+        self.name, self.width_px, self.height_px = name, grid.width_px, grid.height_px
+        self.crs, self.source_crs = grid.crs, source_crs
+        self._grid, self._facts = grid, facts or {}
+        self._surface: _Surface | None = None
+        self.has_surface, self.ground_m = False, 0.0
+        self._to_geodetic, self._from_geodetic = grid.pixels_of(earth_crs("EPSG:4326", "crs"))
+        lon_deg, lat_deg = self._to_geodetic(grid.centre_px)
+        self.frame = LocalFrame(float(lat_deg), float(lon_deg))
+        box = grid.box(WARP_MARGIN)
+        self._to_enu = Warp(self._exact_enu, box, tolerance=1e-4)
+        enu = self._to_enu(np.stack(np.meshgrid(box[:, 0], box[:, 1]), axis=-1).reshape(-1, 2))
+        self._from_enu = Warp(self._exact_pixel, np.stack([enu.min(axis=0), enu.max(axis=0)]), tolerance=1e-4)
+        self.gsd_m_per_px = math.sqrt(abs(np.linalg.det(self.enu_jacobian(grid.centre_px))))
+        if not GSD_RANGE_M[0] <= self.gsd_m_per_px <= GSD_RANGE_M[1]:
+            raise MapError(f"map: expected 1 mm to 1 km a pixel, got {self.gsd_m_per_px:.3g} m; is its CRS right?")
+        lonlat = self._to_geodetic(grid.lattice())
+        (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
+        self.bounds_deg = (float(west), float(south), float(east), float(north))
+        self._pyramid = _Pyramid(grid.width_px, grid.height_px, read)
+        self.levels = self._pyramid.levels
+
+    @classmethod
+    def open(
+        cls,
+        path: str | os.PathLike[str],
+        surface: str | os.PathLike[str] | None = None,
+        *,
+        bounds_deg: tuple[float, float, float, float] | None = None,
+        crs: Any = None,
+        cache_dir: str | os.PathLike[str] | None = None,
+    ) -> OrthoMap:
+        """Open a GeoTIFF, or a picture whose place is given, with an optional surface model.
+
+        A geographic, rotated or non-square raster is resampled once to a north-up UTM grid and kept in
+        ``cache_dir`` (``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``).
+
+        Args:
+            path: the map; see :func:`engine.rasters.open_source` for what may be opened.
+            surface: heights in any grid and CRS.
+            bounds_deg: west, south, east, north of the outer edges of a picture without georeference.
+            crs: of a file that names none.
+            cache_dir: where resampled maps are kept.
+
+        Raises:
+            MapError: a file cannot be read or placed on the Earth, or the surface lies elsewhere.
+        """
+        original = used = open_source(path, bounds_deg=bounds_deg, crs=crs)
+        reader = GrayReader(original)
+        share = reader.invalid_share
+        if not original.grid.is_metric:
+            used = metric_copy(original, reader, cache_dir)
+            reader = GrayReader(used, find_collar=False)
+        facts = {
+            "path": str(original.path),
+            "driver": original.dataset.driver,
+            "bands": original.dataset.count,
+            "dtype": original.dataset.dtypes[0],
+            "source_size_px": [original.grid.width_px, original.grid.height_px],
+            "source_nodata_share": share,
+            "resampled": used is not original,
+            "surface_path": None if surface is None else os.fspath(surface),
+        }
+        site = cls(original.path.name, used.grid, reader.read, original.grid.crs, facts)
+        if surface is not None:
+            heights, lies = read_surface(open_source(surface, "surface"), site._grid)
+            site._attach(_Surface(heights, warp_between(site._grid, lies)))
+        return site
+
+    @classmethod
+    def from_arrays(
+        cls,
+        gray: Gray,
+        pixel_to_crs: ArrayLike,
+        crs: Any,
+        *,
+        surface_m: ArrayLike | None = None,
+        valid: Mask | None = None,
+    ) -> OrthoMap:
+        """A map without a file, for simulators and tests.
+
+        Args:
+            gray: (H, W) uint8.
+            pixel_to_crs: (2, 3) affine from pixels, centres at integers, to a projected north-up grid.
+            crs: anything that pyproj takes.
+            surface_m: (H, W) heights, NaN where unknown.
+            valid: (H, W) bool, all where None.
+
+        Raises:
+            ShapeError: an array does not have the shape of the map.
+            DtypeError: ``gray`` is not uint8.
+            MapError: the grid is not metric and north-up.
+        """
+        if gray.ndim != 2 or 0 in gray.shape:
+            raise ShapeError(f"gray: expected (H, W) with at least one pixel, got {gray.shape}")
+        if gray.dtype != np.uint8:
+            raise DtypeError(f"gray: expected uint8, got {gray.dtype}")
+        mask = np.ones(gray.shape, np.bool_) if valid is None else np.asarray(valid, np.bool_)
+        heights = None if surface_m is None else np.asarray(surface_m, np.float32)
+        for name, array in (("valid", mask), ("surface_m", heights)):
+            if array is not None and array.shape != gray.shape:
+                raise ShapeError(f"{name}: expected the shape of gray {gray.shape}, got {array.shape}")
+        matrix = np.asarray(pixel_to_crs, np.float64)
+        if matrix.shape != (2, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:, :2]) == 0.0:
+            raise MapError(f"pixel_to_crs: expected a finite, invertible (2, 3), got {matrix.tolist()}")
+        grid = Grid(gray.shape[1], gray.shape[0], matrix, earth_crs(crs, "crs"))
+        if not grid.is_metric:
+            raise MapError(
+                f"pixel_to_crs: expected a square north-up grid in a projected CRS, got {grid.crs.name!r}"
+            )
+
+        def read(window: Window) -> tuple[Gray, Mask]:
+            part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
+            return gray[part], mask[part]
+
+        site = cls("arrays", grid, read, grid.crs)
+        if heights is not None:
+            site._attach(_Surface(heights, warp_between(grid, grid)))
+        return site
+
+    def _attach(self, surface: _Surface) -> None:
+        xy = np.clip(np.rint(self._grid.lattice(257)), 0, [self.width_px - 1, self.height_px - 1])
+        heights = surface.sample(xy)
+        known = heights[np.asarray(np.isfinite(heights) & self._pyramid.valid_at(xy))]
+        if known.size == 0:
+            raise MapError("surface: expected known heights under the valid part of the map, got none")
+        self._surface, self.has_surface = surface, True
+        self.ground_m = float(np.percentile(known, GROUND_PERCENT))
+
+    @property
+    def fully_valid(self) -> bool:
+        """Whether no pixel is nodata."""
+        return self._pyramid.nodata_share == 0.0
+
+    def gray(self, window: Window, level: int = 0) -> Gray:
+        """Grey values (h, w) of a window in pixels of ``level``; without meaning where it is not valid.
+
+        Raises:
+            OptionError: the window is empty or does not lie inside, or there is no such level.
+        """
+        return self._pyramid.crop(window, level)[0].copy()
+
+    def valid(self, window: Window, level: int = 0) -> Mask:
+        """Where (h, w) a window holds map rather than nodata; raises as :meth:`gray`."""
+        return self._pyramid.crop(window, level)[1].copy()
+
+    def level_shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        return self._pyramid.shape(level)
+
+    def level_from_full(self, xy_px: ArrayLike, level: int) -> Array:
+        """Pixels (..., 2) of a level from pixels of the full map."""
+        return (np.asarray(xy_px, np.float64) + 0.5) / 2.0**level - 0.5
+
+    def full_from_level(self, xy_px: ArrayLike, level: int) -> Array:
+        """Pixels (..., 2) of the full map from pixels of a level."""
+        return (np.asarray(xy_px, np.float64) + 0.5) * 2.0**level - 0.5
+
+    def surface_at(self, xy_px: ArrayLike) -> Array:
+        """Height (...,) of the surface at pixels (..., 2), in the surface's datum.
+
+        Bilinear; ``ground_m`` outside the surface and next to its nodata; 0.0 everywhere without a surface.
+        """
+        xy = np.asarray(xy_px, np.float64)
+        if self._surface is None:
+            return np.zeros(xy.shape[:-1])
+        heights = self._surface.sample(xy)
+        return np.where(np.isnan(heights), self.ground_m, heights)
+
+    def _exact_enu(self, xy_px: Array) -> Array:
+        lonlat = self._to_geodetic(xy_px)
+        with np.errstate(invalid="ignore"):  # far outside its CRS a pixel lies nowhere
+            return self.frame.enu_from_geodetic(lonlat[..., 1], lonlat[..., 0])
+
+    def _exact_pixel(self, en_m: Array) -> Array:
+        with np.errstate(invalid="ignore"):
+            lat, lon = self.frame.geodetic_from_enu(en_m[..., 0], en_m[..., 1])
+        return self._from_geodetic(np.stack([lon, lat], axis=-1))
+
+    def enu_from_pixel(self, xy_px: ArrayLike) -> Array:
+        """East and north (..., 2) in metres of pixels (..., 2)."""
+        return self._to_enu(np.asarray(xy_px, np.float64))
+
+    def pixel_from_enu(self, en_m: ArrayLike) -> Array:
+        """Pixels (..., 2) of east and north (..., 2) in metres."""
+        return self._from_enu(np.asarray(en_m, np.float64))
+
+    def enu_jacobian(self, xy_px: ArrayLike) -> Array:
+        """d(east, north) / d(x, y) (2, 2) in metres per pixel at a pixel (2,).
+
+        It carries the ground sample distance, the point scale of the projection and the meridian convergence.
+        """
+        half = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        right, left, below, above = self._to_enu(np.asarray(xy_px, np.float64) + half)
+        return np.column_stack([right - left, below - above])
+
+    def geodetic_from_pixel(self, xy_px: ArrayLike) -> tuple[Array, Array]:
+        """WGS84 latitude and longitude in degrees of pixels (..., 2)."""
+        lonlat = self._to_geodetic(np.asarray(xy_px, np.float64))
+        return lonlat[..., 1], lonlat[..., 0]
+
+    def pixel_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
+        """Pixels (..., 2) of WGS84 latitude and longitude in degrees."""
+        lat, lon = np.broadcast_arrays(np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64))
+        return self._from_geodetic(np.stack([lon, lat], axis=-1))
+
+    def info(self) -> dict[str, Any]:
+        """Facts about the map that JSON can hold; ``convergence_deg`` is the true heading of the map's up."""
+        east, north = -self.enu_jacobian(self._grid.centre_px)[:, 1]
+        surface = self._surface
+        return {
+            "name": self.name,
+            **self._facts,
+            "width_px": self.width_px,
+            "height_px": self.height_px,
+            "levels": self.levels,
+            "crs": self.crs.to_string(),
+            "source_crs": self.source_crs.to_string(),
+            "gsd_m_per_px": self.gsd_m_per_px,
+            "bounds_deg": list(self.bounds_deg),
+            "origin_lat_deg": self.frame.lat_deg,
+            "origin_lon_deg": self.frame.lon_deg,
+            "convergence_deg": math.degrees(math.atan2(east, north)),
+            "nodata_share": self._pyramid.nodata_share,
+            "surface_range_m": None if surface is None else list(surface.range_m),
+            "ground_m": self.ground_m,
+        }

@@ -1,0 +1,47 @@
+"""The adaptive window: how large a crop of the map each frame is matched against (equations 4 and 5)."""
+
+from __future__ import annotations
+
+import math
+
+from engine.errors import OptionError
+from engine.types import Window
+
+
+def window_size_px(
+    footprint_px: tuple[float, float], moved_px: tuple[float, float], *, margin: float = 1.3
+) -> tuple[float, float]:
+    """Width and height of the window in map pixels: W = 1.3 s T + v tau (eq. 4, 5).
+
+    Args:
+        footprint_px: s T, the frame's extent (width, height) once it lies on the map.
+        moved_px: v tau, the movement (x, y) since the last frame; only its size counts.
+        margin: the paper's 1.3.
+
+    Raises:
+        OptionError: margin is below 1, or an extent is not positive and finite.
+    """
+    if not margin >= 1.0:
+        raise OptionError(f"margin: expected 1 or more, got {margin}")
+    if not all(math.isfinite(v) and v > 0 for v in footprint_px):
+        raise OptionError(f"footprint_px: expected positive finite extents, got {footprint_px}")
+    width, height = (margin * extent + abs(step) for extent, step in zip(footprint_px, moved_px, strict=True))
+    return width, height
+
+
+def place_window(
+    center_px: tuple[float, float], size_px: tuple[float, float], map_size_px: tuple[int, int]
+) -> Window | None:
+    """The window in whole pixels about a centre (x, y), clipped at the edge of a map (width, height).
+
+    Returns:
+        Window | None: None where the window and the map have nothing in common.
+    """
+    spans = []
+    for center, size, limit in zip(center_px, size_px, map_size_px, strict=True):
+        low = max(0, math.floor(center - size / 2.0 + 0.5))
+        high = min(limit, math.floor(center + size / 2.0 + 0.5) + 1)
+        if low >= high:
+            return None
+        spans.append((low, high - low))
+    return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])

@@ -1,0 +1,190 @@
+"""camera.py: camera_info files, undistortion against OpenCV, and files that must be refused."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from engine.camera import Camera
+from engine.errors import CalibrationError
+
+K = [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]
+PLUMB_BOB = [-0.28, 0.09, 0.0007, -0.0004, -0.01]
+FISHEYE = [0.03, -0.012, 0.004, -0.001]
+
+INFO = """\
+image_width: 640
+image_height: 480
+camera_name: nadir
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.28, 0.09, 0.0007, -0.0004, -0.01]
+"""
+
+
+@pytest.fixture
+def save(tmp_path):
+    def write(text):
+        path = tmp_path / "camera.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def camera(model="plumb_bob", distortion=PLUMB_BOB, matrix=K):
+    return Camera(640, 480, np.reshape(matrix, (3, 3)), model, np.array(distortion))
+
+
+def texture(shape=(480, 640, 3)):
+    noise = np.random.default_rng(5).integers(0, 256, shape, dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 3.0)
+
+
+def test_reads_camera_info_with_the_default_mount(save):
+    read = Camera.load(save(INFO))
+    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "plumb_bob")
+    np.testing.assert_array_equal(read.matrix.ravel(), K)
+    np.testing.assert_array_equal(read.distortion, PLUMB_BOB)
+    assert read.focal_px == 502.5
+    # The top of the picture looks to the nose, the right of it to the right, and the axis down.
+    np.testing.assert_array_equal(read.mount @ [0, -1, 0], [1, 0, 0])
+    np.testing.assert_array_equal(read.mount @ [1, 0, 0], [0, 1, 0])
+    np.testing.assert_array_equal(read.mount @ [0, 0, 1], [0, 0, 1])
+
+
+def test_reads_a_mount_and_plain_lists(save):
+    turned = "mount: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+    plain = INFO.replace("\n  rows: 3\n  cols: 3\n  data:", "")
+    read = Camera.load(save(plain + turned))
+    np.testing.assert_array_equal(read.mount, np.eye(3))
+    np.testing.assert_array_equal(read.matrix.ravel(), K)
+
+
+@pytest.mark.parametrize("zeros", ["[]", "[0, 0, 0, 0]", "[0, 0, 0, 0, 0]"])
+def test_an_ideal_camera_may_be_written_in_any_length_of_zeros(save, zeros):
+    read = Camera.load(save(INFO.replace(str(PLUMB_BOB), zeros)))
+    assert not read.distorts
+    image = texture()
+    assert read.undistort(image) is image
+
+
+@pytest.mark.parametrize("model", ["equidistant", "fisheye"])
+def test_a_fisheye_lens_distorts_even_with_zero_coefficients(save, model):
+    read = Camera.load(save(INFO.replace("plumb_bob", model).replace(str(PLUMB_BOB), "[0, 0, 0, 0]")))
+    assert read.distorts
+
+
+def test_focal_length_from_the_field_of_view_is_the_papers():
+    paper = Camera.from_fov(300, 300, 60.0)
+    assert paper.focal_px == pytest.approx(150.0 / math.tan(math.radians(30.0)))
+    assert paper.matrix[0, 2] == paper.matrix[1, 2] == 149.5
+    assert not paper.distorts
+
+
+@pytest.mark.parametrize("fov_deg", [0.0, 180.0, -5.0, float("nan")])
+def test_an_impossible_field_of_view_is_refused(fov_deg):
+    with pytest.raises(CalibrationError, match="fov_deg"):
+        Camera.from_fov(300, 300, fov_deg)
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (480, 640, 3)])
+def test_plumb_bob_undistortion_is_opencvs(shape):
+    image, lens = texture(shape), camera()
+    expected = cv2.undistort(image, lens.matrix, lens.distortion)
+    np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
+
+
+def test_rational_undistortion_is_opencvs():
+    image = texture()
+    lens = camera("rational_polynomial", [0.2, 0.05, 0.0005, -0.0003, 0.01, 0.45, 0.1, 0.02])
+    expected = cv2.undistort(image, lens.matrix, lens.distortion)
+    np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
+
+
+@pytest.mark.parametrize("model", ["equidistant", "fisheye"])
+def test_fisheye_undistortion_is_opencvs(model):
+    image, lens = texture(), camera(model, FISHEYE)
+    expected = cv2.fisheye.undistortImage(image, lens.matrix, lens.distortion, Knew=lens.matrix)
+    np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
+
+
+def blob(at):
+    y, x = np.mgrid[:480, :640]
+    return np.round(255 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 18.0)).astype(np.uint8)
+
+
+def centroid(image):
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    return np.array([(x * image.astype(float)).sum(), (y * image.astype(float)).sum()]) / image.sum()
+
+
+@pytest.mark.parametrize("ray", [(0.0, 0.0), (0.3, -0.2), (-0.35, 0.25)])
+@pytest.mark.parametrize(("model", "coefficients"), [("plumb_bob", PLUMB_BOB), ("equidistant", FISHEYE)])
+def test_a_point_in_the_world_lands_where_the_pinhole_puts_it(model, coefficients, ray):
+    lens = camera(model, coefficients)
+    point = np.array([[[*ray, 1.0]]])
+    project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
+    seen = project(point, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0]
+    pinhole = lens.matrix @ [*ray, 1.0]
+    np.testing.assert_allclose(centroid(lens.undistort(blob(seen.ravel()))), pinhole[:2], atol=0.25)
+
+
+def test_a_frame_of_another_size_is_refused():
+    with pytest.raises(CalibrationError, match=r"640 x 480.*frame is 320 x 240"):
+        camera().undistort(texture((240, 320)))
+
+
+BAD = {
+    "missing field": (INFO.replace("image_height: 480\n", ""), "lacks the field image_height"),
+    "missing matrix": (INFO.replace("camera_matrix", "matrix"), "lacks the field camera_matrix"),
+    "matrix without data": (INFO.replace("data: [500", "values: [500"), "camera_matrix: expected 9 numbers"),
+    "short matrix": (INFO.replace(", 0.0, 0.0, 1.0]", "]"), "camera_matrix: expected 9 numbers, got 6"),
+    "words": (INFO.replace("[500.0,", "[wide,"), "camera_matrix: expected numbers"),
+    "nan": (INFO.replace("[500.0,", "[.nan,"), "camera_matrix: expected 9 finite"),
+    "focal length": (INFO.replace("[500.0,", "[-500.0,"), "positive focal lengths"),
+    "transposed": (
+        INFO.replace(
+            "[500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]", "[500, 0, 0, 0, 505, 0, 319, 239, 1]"
+        ),
+        "camera_matrix: expected fx 0 cx, 0 fy cy, 0 0 1",
+    ),
+    "model": (INFO.replace("plumb_bob", "omni"), "distortion_model: expected one of plumb_bob"),
+    "coefficients": (INFO.replace(str(PLUMB_BOB), "[0.1, 0.2]"), "plumb_bob takes 4 or 5"),
+    "fisheye with five": (INFO.replace("plumb_bob", "equidistant"), "equidistant takes 4"),
+    "size": (INFO.replace("480", "0"), "image size: expected 1 x 1 or more"),
+    "fractional size": (INFO.replace("480", "480.5"), "image_height: expected a whole number"),
+    "blank size": (INFO.replace("480", ""), "image_height: expected a whole number"),
+    "mount": (INFO + "mount: [1, 0, 0, 0, 2, 0, 0, 0, 1]\n", "not orthonormal"),
+    "reflection": (INFO + "mount: [1, 0, 0, 0, 1, 0, 0, 0, -1]\n", "reflection"),
+    "short mount": (INFO + "mount: [1, 0, 0]\n", "mount: expected 9 numbers, got 3"),
+    "empty": ("", "no camera_info mapping"),
+    "list": ("- 1\n- 2\n", "no camera_info mapping"),
+    "not yaml": ("image_width: [1, 2\n", "not a readable YAML file"),
+    "not text": (b"\xff\xfe\x00\x80", "not a readable YAML file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD, ids=list(BAD))
+def test_a_bad_file_is_refused_in_one_line_that_names_it(save, case):
+    text, expected = BAD[case]
+    with pytest.raises(CalibrationError) as caught:
+        Camera.load(save(text))
+    message = str(caught.value)
+    assert expected in message
+    assert "camera.yaml" in message
+    assert "\n" not in message
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    with pytest.raises(CalibrationError, match="no such file"):
+        Camera.load(tmp_path / "none.yaml")
+    with pytest.raises(CalibrationError, match="not a readable"):
+        Camera.load(tmp_path)

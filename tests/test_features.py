@@ -1,0 +1,352 @@
+"""Truths about the features: where a blob lies, what a rotation does, what OpenCV and kornia find."""
+
+import math
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from engine.errors import DtypeError, OptionError, ShapeError
+from engine.features import Features, _orient, match, opencv_sift, sift
+
+LEVEL_RATIO = 2 ** (1 / 3)
+
+
+def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    """Rectangles over smooth noise, uint8: corners, edges and blobs of many sizes."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((height, width), np.float32)
+    for sigma in (1.5, 4.0, 10.0):
+        noise = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), sigma)
+        image += noise / (noise.std() + 1e-6) * 12
+    for _ in range(height * width // 900):
+        x, y = rng.integers(0, (width, height))
+        w, h = rng.integers(4, 24, 2)
+        image[y : y + h, x : x + w] += rng.uniform(-70, 70)
+    return np.clip(cv2.GaussianBlur(image, (0, 0), 0.7) + 128, 0, 255).astype(np.uint8)
+
+
+def tensor(*images: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.stack(images))[:, None].float() / 255
+
+
+def blob(x: float, y: float, sigma: float, size: int = 64) -> torch.Tensor:
+    v, u = np.mgrid[:size, :size]
+    values = 0.2 + 0.6 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
+    return torch.from_numpy(values)[None, None]
+
+
+def warped(image: np.ndarray, angle: float, scale: float, shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    height, width = image.shape
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle, scale)
+    matrix[:, 2] += shift
+    return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), matrix
+
+
+def valid(features: Features, name: str, element: int = 0) -> np.ndarray:
+    return getattr(features, name)[element, features.valid[element]].numpy()
+
+
+# Where and how large.
+
+
+@pytest.mark.parametrize(("upsample", "tolerance_px"), [(1.0, 0.35), (1.5, 0.08), (2.0, 0.05)])
+@pytest.mark.parametrize("sigma", [2.3, 3.1, 4.6])
+@pytest.mark.parametrize("centre", [(31.0, 31.0), (30.25, 33.5), (32.7, 29.1), (31.5, 31.75)])
+def test_a_blob_lies_at_its_centre_and_has_its_scale(upsample, tolerance_px, sigma, centre):
+    found = sift(blob(*centre, sigma), upsample=upsample)
+    best = 0  # slots are ordered by contrast
+    assert found.valid[0, best]
+    error = found.xy_px[0, best].numpy() - centre
+    assert np.abs(error).max() < tolerance_px
+    scene = math.sqrt(sigma**2 - 0.5**2)  # the camera's blur is taken out
+    assert found.scale_px[0, best] == pytest.approx(scene / math.sqrt(LEVEL_RATIO), rel=0.05)
+
+
+def test_positions_have_no_bias():
+    rng = np.random.default_rng(5)
+    centres = rng.uniform(28, 36, (60, 2))
+    images = torch.cat([blob(x, y, 3.0) for x, y in centres])
+    errors = sift(images, max_keypoints=1).xy_px[:, 0].numpy() - centres
+    assert np.abs(errors.mean(0)).max() < 0.004  # OpenCV's is 0.25
+
+
+def test_a_quarter_turn_of_the_image_turns_the_features():
+    size = 129
+    image = tensor(texture(size, size, 3))
+    plain = sift(image, spread=1)
+    turned = sift(torch.rot90(image, 1, (2, 3)), spread=1)  # (x, y) goes to (y, size - 1 - x)
+    assert plain.valid.sum() > 60
+    xy = plain.xy_px[0]
+    expected = torch.stack([xy[:, 1], size - 1 - xy[:, 0]], 1)[plain.valid[0]]
+    distance, nearest = torch.cdist(expected, turned.xy_px[0]).min(1)
+    same = distance < 0.05
+    assert same.float().mean() > 0.97
+    turn = turned.angle_deg[0, nearest] - plain.angle_deg[0, plain.valid[0]] + 90
+    assert ((turn + 180).remainder(360) - 180)[same].abs().quantile(0.9) < 2
+    cosine = (turned.descriptors[0, nearest] * plain.descriptors[0, plain.valid[0]]).sum(1)
+    assert cosine[same].median() > 0.999
+
+
+def test_the_angle_turns_from_x_towards_y():
+    v, u = np.mgrid[:64, :64]
+    direction = math.radians(40)
+    ramp = 0.02 * ((u - 32) * math.cos(direction) + (v - 32) * math.sin(direction))
+    found = sift(blob(32, 32, 3) * 0.3 + torch.from_numpy(ramp), max_keypoints=1)
+    assert found.angle_deg[0, 0] == pytest.approx(40, abs=5)
+    assert sift(blob(32, 32, 3), upright=True).angle_deg.abs().max() == 0
+
+
+def test_position_scale_and_angle_agree_with_opencv():
+    image = texture(200, 240, 1)
+    ours, theirs = sift(tensor(image), max_keypoints=600), opencv_sift(image, max_keypoints=600, contrast_threshold=0.02)
+    distance = torch.cdist(ours.xy_px[0], theirs.xy_px[0] - 0.25)
+    scales = (ours.scale_px[0, :, None] / theirs.scale_px[0].clamp_min(1e-3)).log2().abs()
+    near = (distance < 0.5) & (scales < 0.2) & ours.valid[0][:, None] & theirs.valid[0]
+    assert near.any(1).sum() > 0.75 * ours.valid.sum()
+    turn = (ours.angle_deg[0, :, None] - theirs.angle_deg[0] + 180).remainder(360) - 180
+    turn = turn.abs().masked_fill(~near, torch.inf).amin(1)[near.any(1)]
+    assert turn.median() < 3
+    assert (turn < 15).float().mean() > 0.8
+
+
+# What is kept.
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 40), (16, 16), (17, 23), (63, 500)])
+@pytest.mark.parametrize("content", ["flat", "texture", "nan", "infinite"])
+@pytest.mark.parametrize("upright", [False, True])
+def test_any_image_gives_finite_features(shape, content, upright):
+    image = torch.full((2, 1, *shape), 0.5)
+    if content != "flat":
+        image[0] = tensor(texture(*shape))
+    if content in ("nan", "infinite"):
+        image[:, :, ::7, ::5] = float("nan" if content == "nan" else "inf")
+    found = sift(image, max_keypoints=20, upright=upright)
+    for name in ("xy_px", "scale_px", "angle_deg", "descriptors"):
+        assert torch.isfinite(getattr(found, name)).all()
+    assert found.descriptors.shape == (2, 20, 128)
+    if content == "flat":
+        assert not found.valid.any()
+
+
+def test_invalid_slots_are_zero_and_valid_ones_of_unit_norm():
+    found = sift(tensor(texture(60, 60)), max_keypoints=500)
+    assert 0 < found.valid.sum() < 500
+    empty = ~found.valid
+    assert found.xy_px[empty].abs().max() == found.descriptors[empty].abs().max() == 0
+    torch.testing.assert_close(found.descriptors[found.valid].norm(dim=1), torch.ones(int(found.valid.sum())))
+    assert (found.angle_deg >= 0).all()
+    assert (found.angle_deg < 360).all()
+
+
+def test_a_batch_is_its_images():
+    images = tensor(texture(90, 110, 1), texture(90, 110, 2), np.full((90, 110), 9, np.uint8))
+    together = sift(images, max_keypoints=50)
+    for i in range(3):
+        alone = sift(images[i : i + 1], max_keypoints=50)
+        assert torch.equal(alone.valid[0], together.valid[i])
+        torch.testing.assert_close(alone.xy_px[0], together.xy_px[i], atol=1e-3, rtol=0)
+        torch.testing.assert_close(alone.descriptors[0], together.descriptors[i], atol=1e-3, rtol=0)
+
+
+def test_repeats_are_equal():
+    image = tensor(texture(90, 110))
+    first, second = sift(image), sift(image)
+    assert torch.equal(first.descriptors, second.descriptors)
+    assert torch.equal(first.xy_px, second.xy_px)
+
+
+def test_the_mask_holds_keypoints_back():
+    image = tensor(texture(120, 120))
+    mask = torch.zeros_like(image, dtype=torch.bool)
+    mask[..., 30:70, 50:100] = True
+    found = sift(image, mask=mask)
+    xy = valid(found, "xy_px")
+    assert 5 < len(xy) < sift(image).valid.sum()
+    assert (np.abs(xy - (74.5, 49.5)) <= (25, 20)).all()
+
+
+def test_spread_reaches_weak_texture():
+    strong, weak = texture(120, 60, 1), texture(120, 180, 2)
+    image = np.hstack([strong, (weak.astype(np.float32) * 0.25 + 96).astype(np.uint8)])
+    shares = [(valid(sift(tensor(image), max_keypoints=60, spread=s, contrast_threshold=0.005), "xy_px")[:, 0] > 60).mean() for s in (1, 6)]
+    assert shares[0] < 0.2 < 0.4 < shares[1]
+
+
+# What is described.
+
+
+def test_splitting_a_gradient_loses_nothing():
+    gx, gy = torch.randn(2, 1000, dtype=torch.float64)
+    weights = _orient(gx, gy) * math.sqrt(2)
+    angles = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
+    assert (weights >= 0).all()
+    assert ((weights > 1e-12).sum(0) <= 2).all()
+    torch.testing.assert_close(angles.cos() @ weights, gx)
+    torch.testing.assert_close(angles.sin() @ weights, gy)
+
+
+def test_light_does_not_change_descriptors():
+    image = tensor(texture(120, 120))
+    plain, dim = sift(image), sift(0.6 * image + 0.3, contrast_threshold=0.6 * 0.02)
+    pairs = match(plain, dim).pairs()
+    assert len(pairs) > 0.9 * plain.valid.sum()
+    gap = (plain.xy_px[0, pairs[:, 0]] - dim.xy_px[0, pairs[:, 1]]).norm(dim=1)
+    assert (gap < 0.1).float().mean() > 0.99
+
+
+def quality(detect, image: np.ndarray, angle: float, scale: float, shift: tuple[float, float]) -> tuple[float, ...]:
+    """Repeatability, inlier ratio and number of inliers under a known warp."""
+    other, matrix = warped(image, angle, scale, shift)
+    first, second = detect(image), detect(other)
+    expected = first.xy_px[0].numpy() @ matrix[:, :2].T + matrix[:, 2]
+    distance = np.linalg.norm(expected[:, None] - second.xy_px[0].numpy(), axis=2)
+    limit = np.array(image.shape[::-1]) - 9
+    inside = first.valid[0].numpy() & ((expected > 8) & (expected < limit)).all(1)
+    pairs = match(first, second).pairs().numpy()
+    good = distance[pairs[:, 0], pairs[:, 1]] < 3
+    near = (distance < 2) & second.valid[0].numpy()
+    return float(near[inside].any(1).mean()), float(good.mean()), float(good.sum())
+
+
+def test_quality_is_opencvs():
+    warps = [(0, 1.0, (3.3, -2.6)), (35, 1.0, (0, 0)), (-80, 1.25, (4, 1)), (160, 0.8, (0, 3)), (10, 0.7, (1, 1))]
+    ours, theirs = [], []
+    for seed in range(4):
+        image = texture(180, 180, seed)
+        for angle, scale, shift in warps:
+            ours.append(quality(lambda i: sift(tensor(i)), image, angle, scale, shift))
+            theirs.append(quality(lambda i: opencv_sift(i, contrast_threshold=0.02), image, angle, scale, shift))
+    ratio = np.mean(ours, 0) / np.mean(theirs, 0)
+    assert ratio[0] > 0.95  # repeatability
+    assert ratio[1] > 0.98  # inlier ratio
+    assert ratio[2] > 0.85  # inliers; OpenCV gives a place several orientations
+
+
+def test_lafs_are_kornias():
+    kornia_feature = pytest.importorskip("kornia.feature")
+    found = sift(tensor(texture(90, 90)), max_keypoints=30)
+    lafs, keep = found.lafs(), found.valid[0]
+    torch.testing.assert_close(kornia_feature.get_laf_center(lafs), found.xy_px)
+    torch.testing.assert_close(kornia_feature.get_laf_scale(lafs)[0, keep, 0, 0], 6 * found.scale_px[0, keep])
+    turn = kornia_feature.get_laf_orientation(lafs)[0, keep, 0] + found.angle_deg[0, keep]
+    assert ((turn + 180).remainder(360) - 180).abs().max() < 1e-3
+
+
+# What matches.
+
+
+def features(descriptors: torch.Tensor, **other: torch.Tensor) -> Features:
+    batch, count, _ = descriptors.shape
+    zeros = torch.zeros(batch, count)
+    return Features(
+        xy_px=torch.zeros(batch, count, 2),
+        scale_px=other.get("scale", zeros + 1),
+        angle_deg=other.get("angle", zeros),
+        descriptors=torch.nn.functional.normalize(descriptors, dim=2),
+        valid=other.get("valid", torch.ones(batch, count, dtype=torch.bool)),
+    )
+
+
+@pytest.fixture
+def pair() -> tuple[Features, Features]:
+    generator = torch.Generator().manual_seed(2)
+    base = torch.rand(2, 70, 128, generator=generator)
+    noise = torch.rand(2, 90, 128, generator=generator)
+    noise[:, 10:80] = base + 0.6 * torch.rand(2, 70, 128, generator=generator)
+    return features(base), features(noise)
+
+
+@pytest.mark.parametrize("ratio", [0.8, 0.95])
+def test_matches_are_kornias(pair, ratio):
+    kornia_feature = pytest.importorskip("kornia.feature")
+    query, train = pair
+    ours = match(query, train, ratio=ratio, mutual=False)
+    for b in range(2):
+        _, theirs = kornia_feature.match_snn(query.descriptors[b], train.descriptors[b], ratio)
+        assert ours.pairs(b).tolist() == theirs.tolist()
+        _, theirs = kornia_feature.match_mnn(query.descriptors[b], train.descriptors[b])
+        assert sorted(match(query, train, ratio=1.0).pairs(b).tolist()) == sorted(theirs.tolist())
+        both = match(query, train, ratio=ratio).pairs(b).tolist()
+        assert both == [p for p in ours.pairs(b).tolist() if p in theirs.tolist()]
+
+
+def test_distances_are_those_of_the_pairs(pair):
+    query, train = pair
+    found = match(query, train)
+    full = torch.cdist(query.descriptors, train.descriptors)
+    torch.testing.assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
+    two = full.topk(2, largest=False).values
+    torch.testing.assert_close(found.ratio, two[..., 0] / two[..., 1], atol=1e-4, rtol=1e-4)
+
+
+def test_invalid_slots_never_match(pair):
+    query, train = pair
+    none = torch.zeros(2, 90, dtype=torch.bool)
+    blind = features(train.descriptors, valid=none)
+    assert not match(query, blind).valid.any()
+    assert not match(blind, query).valid.any()
+    assert match(query, blind).pairs().shape == (0, 2)
+    one = none.clone()
+    one[:, 10] = True
+    assert match(query, features(train.descriptors, valid=one)).pairs().tolist() == [[0, 10]]
+
+
+def test_known_rotation_and_scale_leave_out_contradictions():
+    descriptors = torch.eye(128)[None, :4]
+    query = features(descriptors, angle=torch.tensor([[10.0, 350.0, 10.0, 10.0]]), scale=torch.ones(1, 4))
+    train = features(
+        descriptors,
+        angle=torch.tensor([[40.0, 20.0, 90.0, 40.0]]),
+        scale=torch.tensor([[2.0, 2.0, 2.0, 9.0]]),
+    )
+    found = match(query, train, rotation_deg=30, max_angle_diff_deg=5, scale=2, max_scale_factor=1.5)
+    exact = found.valid & (found.distance < 0.1)
+    assert exact[0].tolist() == [True, True, False, False]
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("images", "options", "error", "text"),
+    [
+        (torch.zeros(9, 9), {}, ShapeError, "images: expected (B, 1, H, W), got (9, 9)"),
+        (torch.zeros(1, 3, 9, 9), {}, ShapeError, "images: expected (B, 1, H, W), got (1, 3, 9, 9)"),
+        (torch.zeros(1, 1, 9, 9, dtype=torch.uint8), {}, DtypeError, "images: expected floating point, got torch.uint8"),
+        (torch.zeros(1, 1, 9, 9), {"max_keypoints": 0}, OptionError, "max_keypoints: expected at least 1, got 0"),
+        (torch.zeros(1, 1, 9, 9), {"upsample": 3}, OptionError, "upsample: expected 1, 1.5 or 2, got 3"),
+        (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected at least 1, got 0"),
+        (torch.zeros(1, 1, 9, 9), {"contrast_threshold": -1}, OptionError, "contrast_threshold"),
+        (torch.zeros(1, 1, 9, 9), {"mask": torch.ones(1, 1, 9, 8, dtype=torch.bool)}, ShapeError, "mask: expected"),
+        (torch.zeros(1, 1, 9, 9), {"mask": torch.ones(1, 1, 9, 9)}, DtypeError, "mask: expected bool"),
+    ],
+)
+def test_wrong_arguments_are_named(images, options, error, text):
+    with pytest.raises(error) as caught:
+        sift(images, **options)
+    assert text in str(caught.value)
+
+
+def test_wrong_arguments_of_the_others_are_named(pair):
+    with pytest.raises(ShapeError, match="images"):
+        opencv_sift(np.zeros(5, np.uint8))
+    with pytest.raises(DtypeError, match="images"):
+        opencv_sift(np.zeros((5, 5), np.float32))
+    with pytest.raises(OptionError, match="ratio"):
+        match(*pair, ratio=1.5)
+
+
+def test_opencv_takes_batches_and_flat_images():
+    found = opencv_sift(np.stack([texture(80, 80), np.zeros((80, 80), np.uint8)]), max_keypoints=40)
+    assert found.valid.sum(1).tolist() == [40, 0]
+    torch.testing.assert_close(found.descriptors[0].norm(dim=1), torch.ones(40))
+
+
+def test_importing_does_not_load_kornia():
+    code = "import sys, engine.features; sys.exit(bool('kornia' in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,161 @@
+"""geo.py against pyproj, its own inverses, and the signs of the conventions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import Transformer
+
+from engine.geo import (
+    LocalFrame,
+    attitude_from_rotation,
+    ecef_from_geodetic,
+    enu_from_body,
+    geodetic_from_ecef,
+    transport_covariance,
+    wrap_heading_deg,
+)
+
+LATITUDES = st.floats(-90.0, 90.0)
+LONGITUDES = st.floats(-180.0, 180.0)
+PLACES = [(0.0, 0.0), (32.79, 34.99), (-33.9, 151.2), (71.0, -156.8), (89.9, 12.0), (-45.0, 179.9999)]
+
+
+def topocentric(lat_deg, lon_deg):
+    """PROJ's own east-north-up about a point on the ellipsoid."""
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon_deg!r} +lat_0={lat_deg!r} +h_0=0"
+    )
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-500.0, 20_000.0))
+@settings(max_examples=60, deadline=None)
+def test_ecef_agrees_with_proj(lat_deg, lon_deg, height_m):
+    proj = Transformer.from_crs(4979, 4978, always_xy=True)
+    expected = proj.transform(lon_deg, lat_deg, height_m)
+    np.testing.assert_allclose(ecef_from_geodetic(lat_deg, lon_deg, height_m), expected, atol=1e-6)
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-500.0, 20_000.0))
+@settings(max_examples=60, deadline=None)
+def test_ecef_round_trip_closes_to_a_micrometre(lat_deg, lon_deg, height_m):
+    point = ecef_from_geodetic(lat_deg, lon_deg, height_m)
+    np.testing.assert_allclose(ecef_from_geodetic(*geodetic_from_ecef(point)), point, atol=1e-6)
+    lat, _, height = geodetic_from_ecef(point)
+    assert float(lat) == pytest.approx(lat_deg, abs=1e-11)
+    assert float(height) == pytest.approx(height_m, abs=1e-6)
+
+
+def test_ecef_of_landmarks():
+    np.testing.assert_allclose(ecef_from_geodetic(0.0, 0.0), [6378137.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(ecef_from_geodetic(0.0, 90.0), [0.0, 6378137.0, 0.0], atol=1e-8)
+    np.testing.assert_allclose(ecef_from_geodetic(90.0, 0.0), [0.0, 0.0, 6356752.314245], atol=1e-5)
+
+
+@pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
+def test_enu_agrees_with_proj_topocentric(lat_deg, lon_deg):
+    lat = lat_deg + np.array([0.0, 0.02, -0.03, 0.05])
+    lon = lon_deg + np.array([0.0, 0.01, 0.04, -0.05])
+    east, north, _ = topocentric(lat_deg, lon_deg).transform(lon, lat, np.zeros(4))
+    enu = LocalFrame(lat_deg, lon_deg).enu_from_geodetic(lat, lon)
+    np.testing.assert_allclose(enu, np.stack([east, north], axis=-1), atol=1e-6)
+
+
+def test_enu_of_the_origin_is_zero_and_axes_point_east_and_north():
+    frame = LocalFrame(32.79, 34.99)
+    np.testing.assert_allclose(frame.enu_from_geodetic(32.79, 34.99), [0.0, 0.0], atol=1e-9)
+    assert frame.enu_from_geodetic(32.79, 35.0)[0] > 900.0
+    assert frame.enu_from_geodetic(32.80, 34.99)[1] > 1100.0
+
+
+def test_a_degree_is_as_long_as_the_radii_of_curvature_say():
+    frame = LocalFrame(45.0, 10.0)
+    step_deg = 1e-4
+    north_m = frame.enu_from_geodetic(45.0 + step_deg, 10.0)[1]
+    east_m = frame.enu_from_geodetic(45.0, 10.0 + step_deg)[0]
+    assert north_m / step_deg == pytest.approx(111_131.8, rel=1e-5)
+    assert east_m / step_deg == pytest.approx(78_846.8, rel=1e-5)
+
+
+@given(st.floats(-85.0, 85.0), LONGITUDES, st.floats(-20_000.0, 20_000.0), st.floats(-20_000.0, 20_000.0))
+@settings(max_examples=80, deadline=None)
+def test_enu_round_trip_closes_to_a_micrometre(lat_deg, lon_deg, east_m, north_m):
+    frame = LocalFrame(lat_deg, lon_deg)
+    lat, lon = frame.geodetic_from_enu(east_m, north_m)
+    np.testing.assert_allclose(frame.enu_from_geodetic(lat, lon), [east_m, north_m], atol=1e-6)
+
+
+def test_enu_takes_arrays_of_any_shape():
+    frame = LocalFrame(-33.9, 151.2)
+    east, north = np.meshgrid(np.linspace(-500, 500, 4), np.linspace(-300, 300, 3))
+    lat, lon = frame.geodetic_from_enu(east, north)
+    assert lat.shape == lon.shape == (3, 4)
+    np.testing.assert_allclose(frame.enu_from_geodetic(lat, lon), np.stack([east, north], axis=-1), atol=1e-7)
+
+
+FORWARD, RIGHT, DOWN = np.eye(3)
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "nose"),
+    [(0.0, [0, 1, 0]), (90.0, [1, 0, 0]), (180.0, [0, -1, 0]), (270.0, [-1, 0, 0])],
+)
+def test_heading_turns_clockwise_from_north(heading_deg, nose):
+    rotation = enu_from_body(0.0, 0.0, heading_deg)
+    np.testing.assert_allclose(rotation @ FORWARD, nose, atol=1e-12)
+    np.testing.assert_allclose(rotation @ DOWN, [0, 0, -1], atol=1e-12)
+
+
+def test_positive_pitch_lifts_the_nose():
+    nose = enu_from_body(0.0, 10.0, 0.0) @ FORWARD
+    np.testing.assert_allclose(nose, [0.0, math.cos(math.radians(10)), math.sin(math.radians(10))], atol=1e-12)
+
+
+def test_positive_roll_lowers_the_right_side():
+    right = enu_from_body(10.0, 0.0, 0.0) @ RIGHT
+    np.testing.assert_allclose(right, [math.cos(math.radians(10)), 0.0, -math.sin(math.radians(10))], atol=1e-12)
+
+
+def test_angles_compose_as_heading_then_pitch_then_roll():
+    # With the nose to the east and up, a roll is about the nose and leaves it where it is.
+    nose = enu_from_body(0.0, 20.0, 90.0) @ FORWARD
+    np.testing.assert_allclose(enu_from_body(35.0, 20.0, 90.0) @ FORWARD, nose, atol=1e-12)
+    np.testing.assert_allclose(nose, [math.cos(math.radians(20)), 0.0, math.sin(math.radians(20))], atol=1e-12)
+
+
+@given(st.floats(-179.0, 179.0), st.floats(-89.0, 89.0), st.floats(0.0, 359.999))
+@settings(max_examples=150, deadline=None)
+def test_attitude_round_trip(roll_deg, pitch_deg, heading_deg):
+    rotation = enu_from_body(roll_deg, pitch_deg, heading_deg)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    roll, pitch, heading = attitude_from_rotation(rotation)
+    assert 0.0 <= heading < 360.0
+    assert roll == pytest.approx(roll_deg, abs=1e-7)
+    assert pitch == pytest.approx(pitch_deg, abs=1e-7)
+    assert abs((heading - heading_deg + 180.0) % 360.0 - 180.0) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("given_deg", "expected_deg"), [(-1e-17, 0.0), (360.0, 0.0), (-90.0, 270.0), (725.0, 5.0), (0.0, 0.0)]
+)
+def test_heading_never_wraps_to_360(given_deg, expected_deg):
+    assert wrap_heading_deg(given_deg) == expected_deg
+
+
+def test_heading_of_a_rotation_a_hair_west_of_north_is_below_360():
+    rotation = enu_from_body(0.0, 0.0, 0.0)
+    rotation[0, 0] = -1e-20
+    assert attitude_from_rotation(rotation)[2] == 0.0
+
+
+def test_covariance_transport_is_first_order_and_symmetric():
+    rng = np.random.default_rng(3)
+    jacobian, root = rng.normal(size=(2, 3)), rng.normal(size=(3, 3))
+    moved = transport_covariance(jacobian, root @ root.T)
+    assert np.array_equal(moved, moved.T)
+    samples = rng.normal(size=(200_000, 3)) @ root.T @ jacobian.T
+    np.testing.assert_allclose(np.cov(samples.T), moved, rtol=0.05, atol=0.05)
