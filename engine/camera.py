@@ -167,10 +167,12 @@ class Camera:
 
         size = (self.width_px, self.height_px)
         if self.distortion_model in ("equidistant", "fisheye"):
-            return cv2.fisheye.initUndistortRectifyMap(
+            maps: tuple[Any, Any] = cv2.fisheye.initUndistortRectifyMap(
                 self.matrix, self.distortion, np.eye(3), self.matrix, size, cv2.CV_16SC2
             )
-        return cv2.initUndistortRectifyMap(self.matrix, self.distortion, None, self.matrix, size, cv2.CV_16SC2)
+        else:
+            maps = cv2.initUndistortRectifyMap(self.matrix, self.distortion, None, self.matrix, size, cv2.CV_16SC2)
+        return maps
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture (H, W) or (H, W, 3) that a pinhole of the same matrix would have taken.

@@ -17,7 +17,8 @@ Convention:
 References:
     Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004,
     https://doi.org/10.1023/B:VISI.0000029664.99615.94.
-    Arandjelovic and Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012 (RootSIFT).
+    Arandjelovic and Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012,
+    https://doi.org/10.1109/CVPR.2012.6248018 (RootSIFT).
 """
 
 import math
@@ -39,9 +40,9 @@ _BLOCK = 16  # input samples per block of a banded matrix
 _BORDER = 4  # octave pixels along the edge that carry no keypoint
 _SMALLEST_OCTAVE = 12
 _EDGE_RATIO = 10.0
+_EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _FARTHEST = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
-_STRIP_ROWS = 48
 _ANGLE_BINS = 36
 _ORIENT_SAMPLES = 13  # per side, 0.75 sigma apart: Lowe's window of 4.5 sigma
 _ORIENT_STEP = 0.75
@@ -55,7 +56,8 @@ _DESC_SAMPLES = 12
 class Features:
     """Keypoints and descriptors of a batch of images, in slots of fixed number.
 
-    A slot that holds no keypoint is False in ``valid`` and zero elsewhere. Slots are ordered by falling contrast.
+    A slot that holds no keypoint is False in ``valid`` and zero elsewhere. The first slots hold the keypoints
+    within their cell's share (see :func:`sift`), the next those beyond it, both by falling contrast.
 
     Attributes:
         xy_px: (B, N, 2) positions (x, y), pixel centres at integers.
@@ -323,6 +325,11 @@ class _Plan:
     table: Tensor  # (octaves, 6) int64: height, width, offset, and the strides of level, row and image
 
     @property
+    def index(self) -> torch.dtype:
+        """The integer that holds every index of the buffer; the shorter one gathers faster."""
+        return torch.int32 if self.gaussian_size < 2**31 else torch.int64
+
+    @property
     def first_sigma(self) -> float:
         """Sigma of each octave's first level in pixels of the octave."""
         return _FIRST_SIGMA_PX * self.upsample
@@ -404,7 +411,7 @@ class _Points:
 def _detect(gaussians: Tensor, plan: _Plan, contrast_threshold: float) -> _Points:
     """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges."""
     threshold = contrast_threshold / _SCALES
-    found = [_extrema(gaussians, octave, 0.5 * threshold) for octave in plan.octaves]
+    found = [_extrema(gaussians, octave, _EARLY * threshold) for octave in plan.octaves]
     number = torch.cat([torch.full_like(f[:, 0], n) for n, f in enumerate(found)])
     level, y, image, x = torch.cat(found).unbind(1)
     for last in (False,) * _MOVES + (True,):
@@ -427,19 +434,24 @@ def _detect(gaussians: Tensor, plan: _Plan, contrast_threshold: float) -> _Point
 
 def _extrema(gaussians: Tensor, octave: _Octave, threshold: float) -> Tensor:
     """Return (M, 4) level, y, image, x where |DoG| is the largest of its 3 x 3 x 3 and above the threshold."""
-    levels = octave.levels(gaussians)[..., _BORDER - 1 : octave.width - _BORDER + 1]
-    begin, end = _BORDER, octave.height - _BORDER
-    rows = _STRIP_ROWS if gaussians.device.type == "cpu" else octave.height
-    found = [torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)]
-    for y in range(begin, end, rows):  # strips stay in the cache
-        strip = levels[:, y - 1 : min(y + rows, end) + 1]
-        size = torch.sub(strip[1:], strip[:-1]).abs_()
-        top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
-        top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
-        top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
-        first = torch.tensor([1, y, 0, _BORDER], device=gaussians.device)
-        found.append((size[1:-1, 1:-1, :, 1:-1] >= top).nonzero() + first)
-    return torch.cat(found)
+    rows, columns = (slice(_BORDER - 1, n - _BORDER + 1) for n in (octave.height, octave.width))
+    levels = octave.levels(gaussians)[:, rows, :, columns]
+    if min(levels.shape[1], levels.shape[3]) < 3:
+        return torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)
+    size = torch.sub(levels[1:], levels[:-1]).abs_()
+    top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
+    top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
+    top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
+    first = torch.tensor([1, _BORDER, 0, _BORDER], device=gaussians.device)
+    return _nonzero(size[1:-1, 1:-1, :, 1:-1] >= top) + first
+
+
+def _nonzero(mask: Tensor) -> Tensor:
+    """Return mask.nonzero(), by looking at eight elements at a time: few are True."""
+    padded = torch.nn.functional.pad(mask.flatten(), (0, -mask.numel() % 8))
+    words = padded.view(torch.int64).nonzero()
+    index = (words * 8 + torch.arange(8, device=mask.device)).flatten()
+    return torch.stack(torch.unravel_index(index[padded[index]], mask.shape), dim=1)
 
 
 def _fit_quadratic(
@@ -450,8 +462,10 @@ def _fit_quadratic(
     _, _, offset, per_level, per_row, per_image = plan.table[number].unbind(1)
     centre = offset + level * per_level + y * per_row + image * per_image + x
     s, v, u = neighbours.unbind(1)
-    index = centre[:, None] + s * per_level[:, None] + v * per_row[:, None] + u
-    cube = (gaussians[index + per_level[:, None]] - gaussians[index]).view(-1, 27)
+    centre, per_level, per_row = (t.to(plan.index)[:, None] for t in (centre, per_level, per_row))
+    index = centre + s * per_level + v * per_row + u
+    voxels = gaussians.index_select(0, index.flatten()).view(-1, 4, 9)
+    cube = (voxels[:, 1:] - voxels[:, :-1]).view(-1, 27)
     fit = cube @ stencil
     gradient, hessian = fit[:, :3], fit[:, 3:]
     rows = hessian[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
@@ -463,23 +477,26 @@ def _fit_quadratic(
 
 @lru_cache(maxsize=8)
 def _quadratic(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return (27, 9) Lowe's differences for x, y, s, xx, yy, ss, xy, xs, ys, and (27, 3) the neighbours (s, y, x)."""
-    steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(27, 3)
-    s, y, x = steps.T
+    """Return (27, 9), Lowe's differences for x, y, s, xx, yy, ss, xy, xs, ys of the neighbours (s, y, x) of a DoG.
+
+    And (36, 3) int32, the Gaussians (s, y, x) that they are differences of: one level more.
+    """
+    gaussians = np.stack(np.meshgrid([-1, 0, 1, 2], [-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(36, 3)
+    s, y, x = gaussians[:27].T
 
     def first(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        return a / 2 * (b == 0) * (c == 0)
+        return np.asarray(a / 2 * (b == 0) * (c == 0))
 
     def second(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        return np.where(a == 0, -2.0, 1.0) * (b == 0) * (c == 0)
+        return np.asarray(np.where(a == 0, -2.0, 1.0) * (b == 0) * (c == 0))
 
     def cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        return a * b / 4 * (c == 0)
+        return np.asarray(a * b / 4 * (c == 0))
 
     columns = [first(x, y, s), first(y, s, x), first(s, x, y), second(x, y, s), second(y, s, x), second(s, x, y)]
     columns += [cross(x, y, s), cross(x, s, y), cross(y, s, x)]
     stencil = torch.from_numpy(np.stack(columns, 1).astype(np.float32)).to(device)
-    return stencil, torch.from_numpy(steps).to(device)
+    return stencil, torch.from_numpy(gaussians.astype(np.int32)).to(device)
 
 
 def _allowed(points: _Points, mask: Tensor) -> Tensor:
@@ -517,13 +534,13 @@ def _rank(group: Tensor) -> Tensor:
 def _sample(gaussians: Tensor, points: _Points, plan: _Plan, x: Tensor, y: Tensor) -> Tensor:
     """Return the points' Gaussian levels at x, y (P, S) in octave pixels, bilinear, edges extended."""
     height, width, offset, per_level, per_row, per_image = plan.table[points.octave].unbind(1)
-    base = (offset + points.level * per_level + points.image * per_image).int()[:, None]
-    height, width, per_row = height[:, None], width[:, None], per_row.int()[:, None]
+    base = (offset + points.level * per_level + points.image * per_image).to(plan.index)[:, None]
+    height, width, per_row = height[:, None], width[:, None], per_row.to(plan.index)[:, None]
     x = torch.minimum(x.clamp_min(0), (width - 1).float() - 1e-3)
     y = torch.minimum(y.clamp_min(0), (height - 1).float() - 1e-3)
     left, top = x.floor(), y.floor()
     fx, fy = x - left, y - top
-    corner = top.int() * per_row + left.int() + base
+    corner = top.to(plan.index) * per_row + left.to(plan.index) + base
     a, b, c, d = (
         gaussians.index_select(0, at.flatten()).view_as(x)
         for at in (corner, corner + 1, corner + per_row, corner + per_row + 1)
@@ -555,7 +572,8 @@ def _dominant_angle(gaussians: Tensor, points: _Points, plan: _Plan) -> Tensor:
     """Return the angle (radians) of the highest peak in the histogram of gradient directions."""
     gx, gy = _gradients(gaussians, points, plan, None, _ORIENT_SAMPLES, _ORIENT_STEP)
     window, smooth = _orientation_weights(gaussians.device)
-    bins = (torch.atan2(gy, gx) * (_ANGLE_BINS / math.tau)).round_().long().remainder_(_ANGLE_BINS)
+    bins = (torch.atan2(gy, gx) * (_ANGLE_BINS / math.tau)).round_().long()
+    bins = torch.where(bins < 0, bins + _ANGLE_BINS, bins)
     histogram = gx.new_zeros(len(gx), _ANGLE_BINS).scatter_add_(1, bins, torch.hypot(gx, gy) * window) @ smooth
     peak = histogram.argmax(1, keepdim=True)
     left, top, right = (histogram.gather(1, (peak + k).remainder(_ANGLE_BINS)) for k in (-1, 0, 1))
@@ -609,7 +627,7 @@ def _normalise(descriptors: Tensor, *, root: bool) -> Tensor:
     """Return unit vectors, entries bounded by 0.2 before the last normalisation; RootSIFT if root."""
     unit = torch.nn.functional.normalize(descriptors, dim=-1).clamp_max_(0.2)
     if root:
-        return torch.nn.functional.normalize(unit, p=1.0, dim=-1).sqrt_()
+        return torch.nn.functional.normalize(unit, p=1.0, dim=-1).sqrt()
     return torch.nn.functional.normalize(unit, dim=-1)
 
 

@@ -77,16 +77,15 @@ class _Pyramid:
         return gray, valid
 
     def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
-        scaled = (v << level for v in (window.x0, window.y0, window.width_px, window.height_px))
-        both = self._read(Window(*scaled))
+        both = self._read(Window(*(v << level for v in (window.x0, window.y0, window.width_px, window.height_px))))
         for _ in range(level):
             both = _halved(*both)
         return both
 
     def _level(self, level: int) -> tuple[Gray, Mask]:
         if level not in self._kept:
-            finer = self._streamed(level) if level == self._base else _halved(*self._level(level - 1))
-            self._kept[level] = finer
+            at_base = level == self._base
+            self._kept[level] = self._streamed(level) if at_base else _halved(*self._level(level - 1))
         return self._kept[level]
 
     def crop(self, window: Window, level: int) -> tuple[Gray, Mask]:
@@ -99,7 +98,7 @@ class _Pyramid:
             gray, valid = self._level(level)
             return gray[window.y0 : y1, window.x0 : x1], valid[window.y0 : y1, window.x0 : x1]
         last = self._last
-        if last is None or last[0] != (window, level):  # grey and validity of a window are often asked in turn
+        if last is None or last[0] != (window, level):  # grey and validity are often asked in turn
             last = self._last = ((window, level), self._from_file(window, level))
         return last[1]
 
@@ -158,14 +157,12 @@ class OrthoMap:
 
     Attributes:
         name: name of the file.
-        width_px: columns.
-        height_px: rows.
-        crs: of the metric grid in use.
-        source_crs: of the file.
+        width_px, height_px: columns and rows.
+        crs, source_crs: of the metric grid in use, and of the file.
         frame: local east-north-up; its origin is the centre of the map.
         gsd_m_per_px: true metres on the ground per pixel at the centre: the root of the area of a pixel.
         bounds_deg: west, south, east, north of the outer edges.
-        has_surface: whether there is a surface model.
+        has_surface: whether it has one.
         ground_m: level of the ground in the surface's datum: the 20th percentile of the surface over the valid
             part of the map, below roofs and crowns but not at the bottom of a pit; 0.0 without a surface.
         levels: number of levels of the pyramid.
@@ -365,8 +362,8 @@ class OrthoMap:
 
         It carries the ground sample distance, the point scale of the projection and the meridian convergence.
         """
-        half = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        right, left, below, above = self._to_enu(np.asarray(xy_px, np.float64) + half)
+        half_steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+        right, left, below, above = self._to_enu(np.asarray(xy_px, np.float64) + half_steps)
         return np.column_stack([right - left, below - above])
 
     def geodetic_from_pixel(self, xy_px: ArrayLike) -> tuple[Array, Array]:

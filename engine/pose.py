@@ -208,9 +208,7 @@ def _checked(points_m: Array, points_px: Array, camera_matrix: Array, weights: A
     weights = np.ones(count) if weights is None else weights
     expected = {"points_m": (count, 3), "points_px": (count, 2), "camera_matrix": (3, 3), "weights": (count,)}
     out = []
-    for (name, shape), values in zip(
-        expected.items(), (points_m, points_px, camera_matrix, weights), strict=True
-    ):
+    for (name, shape), values in zip(expected.items(), (points_m, points_px, camera_matrix, weights), strict=True):
         array = np.asarray(values)
         if array.shape != shape:
             raise ShapeError(f"{name}: expected {shape}, got {array.shape}")
@@ -378,7 +376,9 @@ def _log10_nfa(matches: _Matches, fit: _Fit, options: PoseOptions) -> float:
     extent = np.ptp(matches.pixels, axis=0) + 1
     uniform = math.pi * square / float(extent[0] * extent[1])
     p = min(max(agree / (len(own) * (total - 1)), uniform), 1.0)
-    counts = _log10_choose(total, k) + _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
+    counts = (
+        _log10_choose(total, k) + _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
+    )
     return counts + (k - _SAMPLE) * math.log10(p)
 
 

@@ -111,7 +111,10 @@ class Warp:
 
 
 def _powers(x: Array) -> Array:
-    return np.asarray(np.asarray(x)[..., None] ** np.arange(6.0), np.float64)
+    powers = np.ones((*np.shape(x), 6))
+    for k in range(1, 6):  # products: ten times as fast as ** on some hundred points, a little slower on one
+        np.multiply(powers[..., k - 1], x, out=powers[..., k])
+    return powers
 
 
 def _lattice(x: Array) -> Array:
@@ -364,7 +367,8 @@ def _from_bounds(bounds_deg: tuple[float, float, float, float], crs: CRS, width:
     to_crs = Transformer.from_crs(4326, crs, always_xy=True)
     x, y = to_crs.transform(np.array([west, east, west, east]), np.array([north, south, south, north]))
     step_x, step_y = (x[1] - x[0]) / width, (y[1] - y[0]) / height
-    if not (abs(x[2] - x[0]) <= step_x / 2 and abs(y[3] - y[0]) <= -step_y / 2):
+    slant_x, slant_y = np.abs([x[2] - x[0], x[3] - x[1]]).max(), np.abs([y[3] - y[0], y[2] - y[1]]).max()
+    if not (slant_x <= step_x / 2 and slant_y <= -step_y / 2):
         raise MapError(
             f"bounds_deg: the corners are no rectangle in crs {crs.name!r}; expected one of its own bounds"
         )

@@ -376,11 +376,35 @@ def test_an_index_outside_a_video_is_refused(video):
         assert f"expected an index from 0 to 11 of the video, got {name!r}" in refusal(source.read, name)
 
 
-def test_a_video_that_ends_early_is_refused(tmp_path, video):
-    (tmp_path / "cut.avi").write_bytes(video.read_bytes()[: video.stat().st_size // 2])
-    source = open_frames(tmp_path / "cut.avi")
-    source.names, source._names = [str(i) for i in range(12)], frozenset(str(i) for i in range(12))
-    assert "frame 11: expected 12 frames as the file says, got no more than" in refusal(source.read, "11")
+class LyingCapture:
+    """A video whose header counts frames wrongly."""
+
+    counted, real = 15, cv2.VideoCapture
+
+    def __init__(self, path):
+        self._capture = self.real(path)
+
+    def get(self, prop):
+        return self.counted if prop == cv2.CAP_PROP_FRAME_COUNT else self._capture.get(prop)
+
+    def __getattr__(self, name):
+        return getattr(self._capture, name)
+
+
+def test_a_video_that_ends_early_is_refused(video, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", LyingCapture)
+    source = open_frames(video)
+    assert value_of(source, "11") == 11
+    for name in ("12", "14"):
+        message = refusal(source.read, name)
+        assert f"frame {name}: expected 15 frames as the file says, got no more than 12" in message
+    assert value_of(source, "3") == 3
+
+
+def test_a_video_that_does_not_say_how_long_it_is_is_counted(video, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", LyingCapture)
+    monkeypatch.setattr(LyingCapture, "counted", -1)
+    assert len(open_frames(video).names) == 12
 
 
 # ----------------------------------------------------------------------------------------------------- EXIF

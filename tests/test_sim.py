@@ -332,6 +332,8 @@ def test_options_are_refused_by_name(town):
         FlightStyle(acceleration_mps2=2.0)
     with pytest.raises(OptionError, match="frames"):
         plan_flight(town=town, frames=0)
+    with pytest.raises(OptionError, match="seed: expected 0 or more, got -1"):
+        build_town(-1)
     with pytest.raises(OptionError, match="rate_hz"):
         plan_flight(town=town, rate_hz=0.0)
     with pytest.raises(OptionError, match="town: expected a map larger"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -83,25 +83,22 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
         deadline_met: whether that was inside the budget; None where there was none.
     """
     window = result.window
-    width_px, height_px = (window.width_px, window.height_px) if window is not None else (None, None)
-    if isinstance(result, NoFix):
-        return TrackRow(
-            timestamp_ns=result.timestamp_ns,
-            frame=name,
-            status="no_fix",
-            reason=result.reason.value,
-            score=result.score,
-            method=result.method,
-            window_width_px=width_px,
-            window_height_px=height_px,
-            latency_ms=latency_ms,
-            deadline_met=deadline_met,
-        )
-    covariance = result.covariance_m2
-    return TrackRow(
+    row = TrackRow(
         timestamp_ns=result.timestamp_ns,
         frame=name,
-        status="fix",
+        status="no_fix" if isinstance(result, NoFix) else "fix",
+        score=None if result.score is None else float(result.score),
+        method=result.method,
+        window_width_px=None if window is None else window.width_px,
+        window_height_px=None if window is None else window.height_px,
+        latency_ms=latency_ms,
+        deadline_met=deadline_met,
+    )
+    if isinstance(result, NoFix):
+        return replace(row, reason=result.reason.value)
+    covariance = result.covariance_m2
+    return replace(
+        row,
         lat_deg=float(result.lat_deg),
         lon_deg=float(result.lon_deg),
         east_m=float(result.east_m),
@@ -110,12 +107,6 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
         sigma_east_m=math.sqrt(covariance[0, 0]),
         sigma_north_m=math.sqrt(covariance[1, 1]),
         covariance_en_m2=float(covariance[0, 1]),
-        score=float(result.score),
-        method=result.method,
-        window_width_px=width_px,
-        window_height_px=height_px,
-        latency_ms=latency_ms,
-        deadline_met=deadline_met,
     )
 
 

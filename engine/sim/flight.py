@@ -16,7 +16,7 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.sim.render import Sensor, render_frame, transformer
-from engine.sim.town import GROUND_AMSL_M, Town, build_town
+from engine.sim.town import GROUND_AMSL_M, Town, build_town, generator
 from engine.sim.vehicle import FlightStyle, Motion, SensorNoise, fly, measure
 from engine.types import Attitude, Frame, Truth
 
@@ -64,7 +64,7 @@ class Plan:
 
     def iter_frames(self) -> Iterator[Frame]:
         """Draw the frames one after the other."""
-        rng = np.random.default_rng([self.seed, 0xCA])
+        rng = generator(self.seed, 0xCA)
         for k in range(len(self)):
             yield self._frame(k, rng)
 
@@ -140,6 +140,13 @@ def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Gener
     return np.asarray(square - np.sign(square) * rng.uniform(0.0, 6.0, square.shape))
 
 
+def _check_frames(frames: int | None, rate_hz: float) -> None:
+    if frames is not None and frames < 1:
+        raise OptionError(f"frames: expected 1 or more, got {frames}")
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
+
+
 def plan_flight(
     seed: int = 1,
     *,
@@ -158,30 +165,26 @@ def plan_flight(
         frames: how many, from take-off on; None flies to the end (about 150).
         rate_hz: frames per second.
         light: of the frames, "noon" or "evening"; ignored where a town is given.
-        noise: of the telemetry; None takes the defaults of :class:`SensorNoise`.
-        style: of flying; None takes the defaults of :class:`FlightStyle`.
+        noise: of the telemetry; None takes the defaults, as for the style.
+        style: of flying.
         town: to fly over; None builds the seed's.
         camera: None takes the paper's, 300 x 300 px with 60 degrees.
 
     Raises:
-        OptionError: frames or the rate is out of range, or the map is too small for the height.
+        OptionError: an argument is out of range, or the map is too small for the height.
     """
-    if frames is not None and frames < 1:
-        raise OptionError(f"frames: expected 1 or more, got {frames}")
-    if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
+    _check_frames(frames, rate_hz)
     style, camera = style or FlightStyle(), camera or Camera.from_fov(300, 300, 60.0)
     town = town or build_town(seed, light=light)
-    rng = np.random.default_rng([seed, 0xF1])
+    rng = generator(seed, 0xF1)
     motion = fly(_waypoints(town, camera, style.height_agl_m, rng), style, rng)
     count = int(motion.time_s[-1] * rate_hz) + 1
     stamps = np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz).astype(np.int64)
     truth = motion.at(stamps * 1e-9)
     middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
     lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
-    told = measure(truth, noise or SensorNoise(), np.random.default_rng([seed, 0x5E]))
-    timestamps = tuple(START_NS + int(s) for s in stamps)
-    return Plan(town, camera, LocalFrame(lat, lon), truth, told, timestamps, seed)
+    told = measure(truth, noise or SensorNoise(), generator(seed, 0x5E))
+    return Plan(town, camera, LocalFrame(lat, lon), truth, told, tuple((START_NS + stamps).tolist()), seed)
 
 
 def paper_flight(

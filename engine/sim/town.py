@@ -98,20 +98,20 @@ class _Canvas:
         self.material: Image = np.full(size, GRASS, np.uint8)
         self.busy: Image = np.zeros(size, np.uint8)
         turn = math.radians(rng.uniform(11.0, 27.0))
-        self.turn = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-        self.centre = np.array([(size[1] - 1) / 2.0, (size[0] - 1) / 2.0])
+        self.turn: Array = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        self.centre: Array = np.array([(size[1] - 1) / 2.0, (size[0] - 1) / 2.0])
         self.reach_m = gsd * math.hypot(*size) / 2.0 + 5.0
 
     def px(self, uv: Array) -> Array:
         """Raster pixels (N, 2) of town coordinates (N, 2)."""
-        turned: Array = self.turn @ np.asarray(uv, float).T / self.gsd
-        return self.centre + turned.T
+        return self.centre + uv @ self.turn.T / self.gsd
 
     def corners(self, u: float, v: float, length: float, width: float, angle: float = 0.0) -> Array:
         """Town coordinates (4, 2) of a rectangle's corners; the angle is in radians from the u axis."""
         c, s = math.cos(angle) / 2.0, math.sin(angle) / 2.0
         along, across = np.array([c, s]) * length, np.array([-s, c]) * width
-        return np.array([u, v]) + np.array([-along - across, along - across, along + across, across - along])
+        uv: Array = np.array([u, v]) + np.array([-along - across, along - across, along + across, across - along])
+        return uv
 
     def fill(self, uv: Array, rgb: Colour, material: int | None = None, busy: bool = False) -> None:
         """Paint a polygon of town coordinates."""
@@ -529,6 +529,13 @@ def _park_cars(canvas: _Canvas, roads: list[tuple[Array, float]]) -> tuple[Image
     return days
 
 
+def generator(seed: int, stream: int) -> np.random.Generator:
+    """One of the independent random streams of a seed."""
+    if seed < 0:
+        raise OptionError(f"seed: expected 0 or more, got {seed}")
+    return np.random.default_rng([seed, stream])
+
+
 def _shrink(raster: NDArray[Any], times: int) -> NDArray[Any]:
     """The raster's means over squares of so many pixels."""
     size = (raster.shape[1] // times, raster.shape[0] // times)
@@ -540,6 +547,12 @@ def _georeference(width_px: int, height_px: int, gsd: float) -> Array:
     easting, northing = transformer(CRS_EPSG).transform(CENTRE_LON_DEG, CENTRE_LAT_DEG)
     corner = (round(easting - width_px * gsd / 2), round(northing + height_px * gsd / 2))
     return np.array([[gsd, 0.0, corner[0]], [0.0, -gsd, corner[1]]], dtype=np.float64)
+
+
+def _check_size(width_px: int, height_px: int, gsd: float) -> None:
+    if width_px < 16 or height_px < 16 or not 0.1 <= gsd <= 5.0:
+        got = f"{width_px} x {height_px} at {gsd}"
+        raise OptionError(f"town: expected 16 px or more at 0.1 to 5 m/px, got {got}")
 
 
 def build_town(
@@ -556,18 +569,14 @@ def build_town(
         seed: of everything random in it.
         width_px: columns of the map.
         height_px: rows of the map.
-        gsd_m_per_px: size of a map pixel in metres on the grid.
-        light: of the world that frames see, a name of :data:`engine.sim.render.LIGHTS`; the map's is noon.
+        gsd_m_per_px: a map pixel in metres on the grid.
+        light: a name of :data:`LIGHTS`, for the frames; the map's is noon.
 
     Raises:
-        OptionError: the size or the light is out of range.
+        OptionError: an argument is out of range.
     """
-    if width_px < 16 or height_px < 16 or not 0.1 <= gsd_m_per_px <= 5.0:
-        raise OptionError(
-            f"town: expected 16 px or more at 0.1 to 5 m/px, got {width_px} x {height_px} at {gsd_m_per_px}"
-        )
-    flight_light = light_by_name(light)
-    rng = np.random.default_rng([seed, 0x70])
+    _check_size(width_px, height_px, gsd_m_per_px)
+    flight_light, rng = light_by_name(light), generator(seed, 0x70)
     fine = max(1, round(gsd_m_per_px / 0.265))
     margin = math.ceil(MARGIN_M / gsd_m_per_px)
     size = ((height_px + 2 * margin) * fine, (width_px + 2 * margin) * fine)
@@ -576,14 +585,12 @@ def build_town(
     _blocks(canvas, edges_u, edges_v)
     canvas.texture()
     then, today = _park_cars(canvas, roads)
-    map_rgb = illuminate(then, canvas.height, canvas.gsd, LIGHTS["noon"])
-    inner = (slice(margin * fine, -margin * fine), slice(margin * fine, -margin * fine))
-    ortho = MAP_SENSOR.develop(_shrink(map_rgb[inner], fine), rng)
-    surface = _shrink(canvas.height[inner], fine)
+    inner = (slice(margin * fine, -margin * fine),) * 2
+    then = illuminate(then, canvas.height, canvas.gsd, LIGHTS["noon"])[inner]
+    ortho, surface = MAP_SENSOR.develop(_shrink(then, fine), rng), _shrink(canvas.height[inner], fine)
     to_crs = _georeference(width_px, height_px, gsd_m_per_px)
-    # A map pixel's centre lies between fine pixels when their number in it is even.
-    first = np.array([-margin - 0.5 + 0.5 / fine, -margin - 0.5 + 0.5 / fine, 1.0])
-    fine_to_crs = np.column_stack([to_crs[:, :2] / fine, to_crs @ first])
-    world_rgb = illuminate(today, canvas.height, canvas.gsd, flight_light)
-    world = World(world_rgb, canvas.sides, canvas.height, fine_to_crs, CRS_EPSG)
+    first = -margin - 0.5 + 0.5 / fine
+    fine_to_crs = np.column_stack([to_crs[:, :2] / fine, to_crs @ (first, first, 1.0)])
+    seen = illuminate(today, canvas.height, canvas.gsd, flight_light)
+    world = World(seen, canvas.sides, canvas.height, fine_to_crs, CRS_EPSG)
     return Town(ortho, surface, to_crs, CRS_EPSG, gsd_m_per_px, world)
