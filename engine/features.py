@@ -41,6 +41,7 @@ _BORDER = 4  # octave pixels along the edge that carry no keypoint
 _SMALLEST_OCTAVE = 12
 _EDGE_RATIO = 10.0
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
+_STRIP = 100_000  # pixels of a level that the search for extrema takes at a time on a CPU
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _FARTHEST = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 _ANGLE_BINS = 36
@@ -373,17 +374,17 @@ def _blur(images: Tensor, octave: _Octave, gaussians: Tensor) -> Tensor:
     count, levels, size, _ = across.blocks.shape
     wide = images.new_zeros(height, batch, across.padded)
     wide[..., across.reach : across.reach + width] = images.transpose(0, 1)
-    windows = wide.view(height * batch, -1).unfold(1, _BLOCK + 2 * across.reach, _BLOCK).transpose(0, 1)
-    rows = torch.bmm(windows, across.blocks.flatten(1, 2).mT).view(count, height, batch, levels, size)
-
-    tall = images.new_empty(levels, down.padded, batch, count, size)
-    tall[:, : down.reach] = 0
-    tall[:, down.reach + height :] = 0
-    tall[:, down.reach : down.reach + height] = rows.permute(3, 1, 2, 0, 4)
+    across_windows = wide.view(height * batch, -1).unfold(1, _BLOCK + 2 * across.reach, _BLOCK).transpose(0, 1)
+    tall = images.new_zeros(down.padded, batch, count, size)
+    inner = tall[down.reach : down.reach + height]
+    down_windows = tall.flatten(1).unfold(0, _BLOCK + 2 * down.reach, _BLOCK).transpose(1, 2)
     out = octave.levels(gaussians)
     for level in range(levels):
-        windows = tall[level].flatten(1).unfold(0, _BLOCK + 2 * down.reach, _BLOCK).transpose(1, 2)
-        torch.bmm(down.blocks[:, level], windows, out=out[level].view(len(windows), -1, windows.shape[2]))
+        rows = torch.bmm(across_windows, across.blocks[:, level].mT)
+        inner.copy_(rows.view(count, height, batch, size).permute(1, 2, 0, 3))
+        torch.bmm(
+            down.blocks[:, level], down_windows, out=out[level].view(len(down_windows), -1, batch * count * size)
+        )
     return out.transpose(1, 2)[..., : octave.height, : octave.width]
 
 
@@ -434,16 +435,21 @@ def _detect(gaussians: Tensor, plan: _Plan, contrast_threshold: float) -> _Point
 
 def _extrema(gaussians: Tensor, octave: _Octave, threshold: float) -> Tensor:
     """Return (M, 4) level, y, image, x where |DoG| is the largest of its 3 x 3 x 3 and above the threshold."""
-    rows, columns = (slice(_BORDER - 1, n - _BORDER + 1) for n in (octave.height, octave.width))
-    levels = octave.levels(gaussians)[:, rows, :, columns]
-    if min(levels.shape[1], levels.shape[3]) < 3:
-        return torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)
-    size = torch.sub(levels[1:], levels[:-1]).abs_()
-    top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
-    top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
-    top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
-    first = torch.tensor([1, _BORDER, 0, _BORDER], device=gaussians.device)
-    return _nonzero(size[1:-1, 1:-1, :, 1:-1] >= top) + first
+    levels = octave.levels(gaussians)[..., _BORDER - 1 : octave.width - _BORDER + 1]
+    begin, end = _BORDER, octave.height - _BORDER
+    found = [torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)]
+    if levels.shape[3] < 3:
+        return found[0]
+    rows = max(16, _STRIP // octave.width) if gaussians.device.type == "cpu" else octave.height
+    for y in range(begin, end, rows):  # a strip stays in a processor's cache
+        strip = levels[:, y - 1 : min(y + rows, end) + 1]
+        size = torch.sub(strip[1:], strip[:-1]).abs_()
+        top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
+        top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
+        top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
+        first = torch.tensor([1, y, 0, _BORDER], device=gaussians.device)
+        found.append(_nonzero(size[1:-1, 1:-1, :, 1:-1] >= top) + first)
+    return torch.cat(found)
 
 
 def _nonzero(mask: Tensor) -> Tensor:
@@ -637,7 +643,8 @@ def _to_slots(points: _Points, angle: Tensor, descriptors: Tensor, batch: int, s
 
     def place(values: Tensor) -> Tensor:
         out = values.new_zeros(batch * slots, *values.shape[1:])
-        return out.index_copy_(0, index, values).unflatten(0, (batch, slots))
+        out[index] = values
+        return out.view(batch, slots, *values.shape[1:])
 
     xy = torch.stack([points.x, points.y], dim=1) * points.pixel_px[:, None]
     scale = _FIRST_SIGMA_PX * points.growth * torch.exp2(points.octave.float())

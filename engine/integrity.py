@@ -37,6 +37,8 @@ class AssumedErrors:
         tilt_deg: of roll and of pitch, where the frame came with them.
         unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
         map_m: of the map's georeference, per axis.
+        surface_slope_deg: of the ground under one frame, where a surface model gives its height.
+        unknown_slope_deg: the same where flat ground is assumed.
     """
 
     height_m: float = 0.5
@@ -45,6 +47,8 @@ class AssumedErrors:
     tilt_deg: float = 0.5
     unknown_tilt_deg: float = 2.0
     map_m: float = 0.3
+    surface_slope_deg: float = 0.1
+    unknown_slope_deg: float = 2.0
 
     def __post_init__(self) -> None:
         _check_positive(self, *self.__dataclass_fields__)

@@ -285,29 +285,31 @@ def open_source(
         dataset = rasterio.open(file, driver=_driver(file, argument))
         transform, own_crs = dataset.transform, dataset.crs
     width, height = dataset.width, dataset.height
-    if bounds_deg is None:
-        if transform.is_identity:
-            raise MapError(
-                f"{argument}: {file} is a picture without georeference; give bounds_deg=(west, south, east, "
-                "north), or a world file and its CRS (control points and RPCs are not used: gdalwarp them first)"
-            )
-        found = _crs_of(file, argument, own_crs, crs)
-        matrix = _centred(transform)
-    else:
-        if not transform.is_identity:
+    own = None if transform.is_identity else _centred(transform)
+    if bounds_deg is not None:
+        if own is not None:
             raise MapError(f"bounds_deg: expected none for a file with a georeference of its own, {file}")
         found = earth_crs(crs if crs is not None else "EPSG:4326", "crs")
         matrix = _from_bounds(bounds_deg, found, width, height)
+    elif own is not None:
+        found, matrix = _crs_of(file, argument, own_crs, crs), own
+    else:
+        raise MapError(
+            f"{argument}: {file} is a picture without georeference; give bounds_deg=(west, south, east, "
+            "north), or a world file and its CRS (control points and RPCs are not used: gdalwarp them first)"
+        )
+    return Source(file, dataset, _checked(Grid(width, height, matrix, found), argument, file))
+
+
+def _checked(grid: Grid, argument: str, file: Path) -> Grid:
+    matrix = grid.pixel_to_crs
     determinant = np.linalg.det(matrix[:, :2]) if np.isfinite(matrix).all() else 0.0
     if determinant == 0.0:
-        raise MapError(
-            f"{argument}: expected a finite, invertible geotransform, got {list(transform)[:6]} in {file}"
-        )
-    grid = Grid(width, height, matrix, found)
+        raise MapError(f"{argument}: expected a finite, invertible geotransform, got {matrix.tolist()} in {file}")
     lon, lat = grid.pixels_of(_wgs84())[0](grid.centre_px)
     if not (abs(lat) <= 90.0 and abs(lon) <= 540.0):  # NaN and infinity fail too
-        raise MapError(f"{argument}: the centre of {file} lies outside its CRS {found.name!r}")
-    return Source(file, dataset, grid)
+        raise MapError(f"{argument}: the centre of {file} lies outside its CRS {grid.crs.name!r}")
+    return grid
 
 
 def _local_file(path: str | os.PathLike[str], argument: str) -> Path:
@@ -602,6 +604,17 @@ def _written(target: Path, reader: GrayReader, source: Grid, grid: Grid) -> Sour
     return copy
 
 
+def _overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First pixel (x, y), and the one past the last, of another grid under a grid, widened by two."""
+    points = warp_between(grid, other)(grid.lattice())
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        return np.zeros(2, np.intp), np.zeros(2, np.intp)
+    limit = np.array([other.width_px, other.height_px])
+    low = np.clip(np.floor(points.min(axis=0)) - 2, 0, limit).astype(np.intp)
+    return low, np.clip(np.ceil(points.max(axis=0)) + 3, 0, limit).astype(np.intp)
+
+
 def read_surface(source: Source, grid: Grid) -> tuple[NDArray[np.float32], Grid]:
     """Heights (NaN where unknown) and grid of the part of a surface model that lies under a map.
 
@@ -616,13 +629,7 @@ def read_surface(source: Source, grid: Grid) -> tuple[NDArray[np.float32], Grid]
     dataset, own = source.dataset, source.grid
     if np.dtype(dataset.dtypes[0]).kind not in "iuf":
         raise MapError(f"surface: expected heights as real numbers, got {dataset.dtypes[0]} in {source.path}")
-    points = warp_between(grid, own)(grid.lattice())
-    points = points[np.isfinite(points).all(axis=1)]
-    limit = np.array([own.width_px, own.height_px])
-    low, high = np.zeros(2, int), np.zeros(2, int)
-    if len(points):
-        low = np.clip(np.floor(points.min(axis=0)) - 2, 0, limit).astype(int)
-        high = np.clip(np.ceil(points.max(axis=0)) + 3, 0, limit).astype(int)
+    low, high = _overlap(grid, own)
     if not (high > low).all():
         raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
     size = high - low

@@ -86,7 +86,7 @@ class Frame:
         """The attitude with unknown roll and pitch taken as level, or None where the heading is unknown."""
         if self.heading_deg is None:
             return None
-        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.heading_deg % 360.0)
+        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.heading_deg % 360.0 % 360.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,17 @@ from engine.features import Features, _orient, match, opencv_sift, sift
 LEVEL_RATIO = 2 ** (1 / 3)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Keep to one thread: small images gain nothing from more, and on a busy machine they lose much."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    yield
+    torch.set_num_threads(before[0])
+    cv2.setNumThreads(before[1])
+
+
 def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
     """Rectangles over smooth noise, uint8: corners, edges and blobs of many sizes."""
     rng = np.random.default_rng(seed)

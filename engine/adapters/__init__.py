@@ -1,0 +1,1 @@
+"""Bridges to autopilots and robots: they translate, and hold no algorithms."""

@@ -112,9 +112,7 @@ def locate(
     camera: CameraOption,
     surface: SurfaceOption = None,
     height_agl: Annotated[float | None, typer.Option("--height-agl", help="Metres above ground.")] = None,
-    heading: Annotated[
-        float | None, typer.Option("--heading", help="Degrees clockwise from true north.")
-    ] = None,
+    heading: Annotated[float | None, typer.Option("--heading", help="Degrees clockwise from true north.")] = None,
     roll: Annotated[float | None, typer.Option("--roll", help="Degrees, right side down.")] = None,
     pitch: Annotated[float | None, typer.Option("--pitch", help="Degrees, nose up.")] = None,
     near: Annotated[str | None, typer.Option("--near", help="LAT,LON[,SIGMA_M]; else the whole map.")] = None,
@@ -142,9 +140,7 @@ def locate(
 @app.command()
 def evaluate(
     directory: Annotated[Path, typer.Argument(help="Output folder of track.")],
-    truth: Annotated[
-        Path | None, typer.Option("--truth", help="truth.csv; else the one that track used.")
-    ] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", help="truth.csv; else the one that track used.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score a finished track against truth; rewrites its summary.json and figures."""

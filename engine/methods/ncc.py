@@ -17,7 +17,7 @@ from engine.integrity import (
     ncc_covariance_m2,
     peak_covariance_px,
 )
-from engine.methods.query import Query, level_for
+from engine.methods.query import Query, level_crop, level_for
 from engine.ncc_fft import find_peak, ncc
 from engine.types import Fix, NoFix, Peak, Reason, Window
 
@@ -134,15 +134,6 @@ def _window_about(query: Query, aligned: _Aligned, nadir_px: Array, options: Ncc
     return query.window(center, footprint, least, margin=options.margin)
 
 
-def _level_window(window: Window, level: int, query: Query) -> Window:
-    """The part of one pyramid level that a window in map pixels covers."""
-    rows, columns = query.site.level_shape(level)
-    x0, y0 = window.x0 >> level, window.y0 >> level
-    x1 = min(columns, (window.x0 + window.width_px) >> level)
-    y1 = min(rows, (window.y0 + window.height_px) >> level)
-    return Window(x0, y0, max(0, x1 - x0), max(0, y1 - y0))
-
-
 def _surface(query: Query, aligned: _Aligned, window: Window, options: NccOptions) -> torch.Tensor | None:
     """NCC over the window (H', W'); places on nodata score -1. None where the patch does not fit."""
     height, width = aligned.enhanced.shape
@@ -173,7 +164,7 @@ def _share_of_valid(valid: NDArray[np.bool_], height: int, width: int) -> NDArra
 
 def _search(query: Query, aligned: _Aligned, window: Window, options: NccOptions) -> Peak | None:
     """The peak in the window, in pixels of the aligned level (not of the crop)."""
-    crop = _level_window(window, aligned.level, query)
+    crop = level_crop(query.site, window, aligned.level)
     surface = _surface(query, aligned, crop, options)
     if surface is None:
         return None

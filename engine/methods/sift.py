@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from engine.align import view_of
 from engine.errors import OptionError
 from engine.features import Features, match, sift
-from engine.geo import attitude_from_rotation
+from engine.geo import attitude_from_rotation, enu_from_body
 from engine.integrity import AssumedErrors
-from engine.methods.query import Query, level_for
-from engine.pose import PoseOptions, PoseStats, solve_pose
+from engine.methods.query import Query, level_crop, level_for
+from engine.orthomap import OrthoMap
+from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
 from engine.types import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
 METHOD = "sift"
+_CROP_STEP_PX = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,8 +38,10 @@ class SiftOptions:
         ratio: best against second-best descriptor distance (Lowe's test).
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
+        use_attitude: where the frame came with heading, roll and pitch, let them weigh in the pose by their
+            assumed errors; a few features alone can hardly tell a tilt from a displacement.
         pose: settings of PnP and RANSAC.
-        errors: what is assumed of the map.
+        errors: what is assumed of the telemetry and the map.
     """
 
     margin: float = 1.3
@@ -47,6 +51,7 @@ class SiftOptions:
     ratio: float = 0.8
     min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
+    use_attitude: bool = True
     pose: PoseOptions = field(default_factory=PoseOptions)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
@@ -85,7 +90,8 @@ def locate(query: Query, options: SiftOptions) -> Fix | NoFix:
         return query.refuse(Reason.LATE, "the budget was spent before the pose", METHOD, window=window)
     with watch.stage("pose"):
         points_m = np.c_[query.site.enu_from_pixel(map_px), query.site.surface_at(map_px)]
-        stats = solve_pose(points_m, points_px, query.camera.matrix, options.pose)
+        prior = _attitude_prior(query, options)
+        stats = solve_pose(points_m, points_px, query.camera.matrix, options.pose, prior=prior)
     if stats is None:
         detail = f"no pose explains enough of the {len(pairs)} matches"
         return query.refuse(Reason.BAD_POSE, detail, METHOD, window=window)
@@ -123,14 +129,7 @@ def _map_features(query: Query, window: Window, options: SiftOptions) -> tuple[F
     if query.frame.height_agl_m is not None:
         reduced_gsd = query.frame.height_agl_m / (query.camera.focal_px * options.scale)
         level = level_for(site.gsd_m_per_px, reduced_gsd, site.levels)
-    rows, columns = site.level_shape(level)
-    x0, y0 = window.x0 >> level, window.y0 >> level
-    crop = Window(
-        x0,
-        y0,
-        min(columns - x0, max(1, window.width_px >> level)),
-        min(rows - y0, max(1, window.height_px >> level)),
-    )
+    crop = level_crop(site, window, level, step_px=_CROP_STEP_PX)
     mask = None
     if not site.fully_valid:
         mask = torch.from_numpy(site.valid(crop, level)).to(query.device)[None, None]
@@ -154,11 +153,26 @@ def _full_resolution(xy_px: Array, scale: tuple[float, float]) -> Array:
     return np.asarray((xy_px + 0.5) / np.array(scale) - 0.5, dtype=np.float64)
 
 
+def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
+    """(3, 3) what the map adds: its georeference, and a slope of the ground that PnP takes for a tilt."""
+    slope_deg = errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg
+    horizontal = errors.map_m**2 + (height_m * math.radians(slope_deg)) ** 2
+    return np.diag([horizontal, horizontal, errors.map_m**2])
+
+
+def _attitude_prior(query: Query, options: SiftOptions) -> AttitudePrior | None:
+    """The frame's own attitude with its assumed error about the camera's axes, or None where it is not known."""
+    frame, errors = query.frame, options.errors
+    if not options.use_attitude or frame.heading_deg is None or frame.roll_deg is None or frame.pitch_deg is None:
+        return None
+    enu_from_camera = enu_from_body(frame.roll_deg, frame.pitch_deg, frame.heading_deg) @ query.camera.mount
+    return AttitudePrior(enu_from_camera.T, (errors.tilt_deg, errors.tilt_deg, errors.heading_deg))
+
+
 def _fix(query: Query, stats: PoseStats, window: Window, options: SiftOptions) -> Fix | NoFix:
     """The camera's centre as a fix; refused where a drone over this map cannot be there."""
     site = query.site
-    enu_from_body = stats.rotation.T @ query.camera.mount.T
-    roll, pitch, heading = attitude_from_rotation(enu_from_body)
+    roll, pitch, heading = attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)
     east, north, up = (float(v) for v in stats.center_m)
     nadir = site.pixel_from_enu(np.array([east, north]))
     share = float(stats.inliers.mean())
@@ -167,7 +181,7 @@ def _fix(query: Query, stats: PoseStats, window: Window, options: SiftOptions) -
         detail = f"the pose is {tilt:.0f} degrees off the vertical at a height of {up:.0f} m"
         return query.refuse(Reason.BAD_POSE, detail, METHOD, score=share, window=window)
     lat, lon = site.geodetic_from_pixel(nadir)
-    covariance = stats.covariance_center_m2 + options.errors.map_m**2 * np.eye(3)
+    covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
     return Fix(
         timestamp_ns=query.frame.timestamp_ns,
         lat_deg=float(lat),

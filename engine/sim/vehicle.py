@@ -65,7 +65,7 @@ class FlightStyle:
 
     Attributes:
         height_agl_m: above the flat ground.
-        cruise_mps: speed in the middle of a leg; with the defaults legs are flown at 7 m/s on average.
+        cruise_mps: speed in the middle of a leg; with the defaults legs are flown at 6.6 m/s on average.
         acceleration_mps2: on a leg; its tilt is atan(a / g).
         ramp_s: time in which the acceleration builds up and fades, which limits the jerk.
         pause_s: hover at each waypoint, in which the nose turns.
@@ -77,8 +77,8 @@ class FlightStyle:
     """
 
     height_agl_m: float = 150.0
-    cruise_mps: float = 11.0
-    acceleration_mps2: float = 1.0
+    cruise_mps: float = 8.5
+    acceleration_mps2: float = 1.15
     ramp_s: float = 1.0
     pause_s: float = 2.5
     peak_tilt_deg: float = 7.2
