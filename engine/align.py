@@ -26,7 +26,9 @@ MAX_RAY_DEG = 75.0
 # Where the frame is finer than the map by more than this, it is averaged down first, or it would alias.
 _MAX_SHRINK = 0.75
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
-_SHRINKS = np.linspace(1.0, 0.25, 61)
+# A patch is at least this share of the fraction that is asked for, or there is none.
+MIN_SHRINK = 0.25
+_SHRINKS = np.linspace(1.0, MIN_SHRINK, 61)
 # Added to the local variance, in squared grey levels: flat ground stays flat instead of becoming sensor noise.
 _NOISE_VARIANCE = 4.0
 
@@ -39,15 +41,16 @@ def to_gray(frame: Frame) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
-def enhance(gray: NDArray[np.uint8], *, radius_px: int = 12, valid: NDArray[np.bool_] | None = None) -> Image:
+def enhance(gray: NDArray[np.uint8], *, radius_px: int = 6, valid: NDArray[np.bool_] | None = None) -> Image:
     """Local normalisation, (H, W) to (H, W): each pixel less its neighbourhood's mean, over its deviation.
 
     This is the paper's "enhance" step: shadows, haze and exposure change the local mean and contrast, streets
-    and roofs stay. Neighbourhoods are boxes of 2 radius_px + 1 pixels.
+    and roofs stay. Neighbourhoods are boxes of 2 radius_px + 1 pixels. Before it the picture is smoothed by the
+    binomial 1-2-1: sampled edges alias, and aliasing draws correlation peaks towards whole pixels.
 
     Args:
         gray: the picture.
-        radius_px: half the size of the neighbourhood; 0 leaves the picture as it is.
+        radius_px: half the size of the neighbourhood; 0 only smooths.
         valid: where False, pixels take no part and come out as 0.
 
     Raises:
@@ -55,15 +58,20 @@ def enhance(gray: NDArray[np.uint8], *, radius_px: int = 12, valid: NDArray[np.b
     """
     if radius_px < 0:
         raise OptionError(f"radius_px: expected 0 or more, got {radius_px}")
-    picture = gray.astype(np.float32)
-    if radius_px == 0:
-        return picture
     box = (2 * radius_px + 1, 2 * radius_px + 1)
     if valid is None:
-        mean = cv2.blur(picture, box)
-        square = cv2.blur(picture * picture, box)
+        smooth = cv2.GaussianBlur(gray, (3, 3), 0)
+        picture: Image = smooth.astype(np.float32)
+        if radius_px == 0:
+            return picture
+        mean = cv2.boxFilter(smooth, cv2.CV_32F, box)
+        square = cv2.sqrBoxFilter(smooth, cv2.CV_32F, box)
     else:
         weight = valid.astype(np.float32)
+        share = np.maximum(cv2.GaussianBlur(weight, (3, 3), 0), 1e-6)
+        picture = cv2.GaussianBlur(gray * weight, (3, 3), 0) / share
+        if radius_px == 0:
+            return picture * weight
         share = np.maximum(cv2.blur(weight, box), 1e-6)
         mean = cv2.blur(picture * weight, box) / share
         square = cv2.blur(picture * picture * weight, box) / share

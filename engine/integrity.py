@@ -54,21 +54,36 @@ class AssumedErrors:
         _check_positive(self, *self.__dataclass_fields__)
 
 
+# Neighbouring pixels share their noise: so many of them, squared, count as one.
+_CORRELATION_PX = 5.0
+
+
+def score_sigma(pixels: int) -> float:
+    """One standard deviation of the NCC of a patch with ground that it does not show.
+
+    The correlation coefficient of N independent samples about zero has the variance 1/N.
+    """
+    return 1.0 / math.sqrt(max(1.0, pixels / _CORRELATION_PX**2))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeakRule:
     """When a correlation peak is believed.
 
+    Scores are counted in :func:`score_sigma`, so that a rule holds for small patches as for large ones. On 1,300
+    searches of simulated towns for a place that was not there, the best place led its rival by at most 1.3.
+
     Attributes:
-        min_score: below this NCC the frame does not show this piece of map.
-        min_margin: how far the best rival must stay below the peak.
-        min_margin_whole_map: the same where the whole map was searched and nothing else vouches for the place.
+        min_sigmas: a peak below this may be chance.
+        min_margin_sigmas: how far the best rival must stay below the peak.
+        min_margin_sigmas_whole_map: the same where the whole map was searched and nothing else vouches for it.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
 
-    min_score: float = 0.15
-    min_margin: float = 0.03
-    min_margin_whole_map: float = 0.08
+    min_sigmas: float = 4.0
+    min_margin_sigmas: float = 1.75
+    min_margin_sigmas_whole_map: float = 2.5
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 
@@ -76,25 +91,31 @@ class PeakRule:
         _check_positive(self, *self.__dataclass_fields__)
 
 
-def judge_peak(peak: Peak, rule: PeakRule, *, whole_map: bool) -> tuple[Reason, str] | None:
-    """The reason to refuse a peak, with its figures, or None where it is believed."""
-    if peak.score < rule.min_score:
-        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f} is below {rule.min_score:g}"
-    margin = rule.min_margin_whole_map if whole_map else rule.min_margin
+def judge_peak(peak: Peak, pixels: int, rule: PeakRule, *, whole_map: bool) -> tuple[Reason, str] | None:
+    """The reason to refuse the peak of a patch of so many pixels, with its figures, or None: believed."""
+    sigma = score_sigma(pixels)
+    if peak.score < rule.min_sigmas * sigma:
+        return (
+            Reason.LOW_SCORE,
+            f"best NCC {peak.score:.3f} may be chance; {rule.min_sigmas * sigma:.3f} is asked for",
+        )
+    if not peak.curvature.any():
+        return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
+    margin = sigma * (rule.min_margin_sigmas_whole_map if whole_map else rule.min_margin_sigmas)
     if peak.score - peak.second_score < margin:
-        rival = f"a rival reaches NCC {peak.second_score:.3f}"
-        return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:g} between them is asked for"
+        rival = f"a rival reaches {peak.second_score:.3f}"
+        return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
     return None
 
 
-def peak_covariance_px(peak: Peak, pixels: int, *, correlation_px: float = 5.0) -> Array:
+def peak_covariance_px(peak: Peak, pixels: int) -> Array:
     """(2, 2) covariance of a correlation peak, in square pixels.
 
     For a picture that is the map plus Gaussian noise, the log-likelihood of a shift is N/2 log(1 - rho^2), whose
     second derivative at the peak is N rho rho'' / (1 - rho^2); its inverse is the covariance (Cramer-Rao).
-    Neighbouring pixels share their noise, so N counts blocks of ``correlation_px`` squared.
+    N is that of :func:`score_sigma`.
     """
-    independent = max(1.0, pixels / correlation_px**2)
+    independent = 1.0 / score_sigma(pixels) ** 2
     rho = min(max(peak.score, 0.05), 0.999)
     information = -peak.curvature * independent * rho / (1.0 - rho * rho)
     # A ridge has no curvature along it: the peak is then known to a few pixels there, not infinitely badly.

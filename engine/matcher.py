@@ -13,10 +13,11 @@ from engine.budget import Budget
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.methods import ncc, paper, sift
-from engine.methods.ncc import NccOptions
+from engine.methods.laid import NccOptions
 from engine.methods.query import Query, Stopwatch
 from engine.methods.sift import SiftOptions
 from engine.orthomap import OrthoMap
+from engine.prepared import PreparedMap
 from engine.types import Fix, Frame, NoFix, Prior, Reason
 
 METHODS = ("ncc", "sift", "auto")
@@ -75,6 +76,7 @@ class SceneMatcher:
         self.camera = camera
         self.method = method
         self.device = devices.resolve(device)
+        self._prepared = PreparedMap(site, self.device, self.options.ncc.enhance_radius_px)
         # What an undistorted picture obeys; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 
@@ -115,7 +117,7 @@ class SceneMatcher:
         known = query.frame.height_agl_m is not None and query.frame.heading_deg is not None
         if self.method == "sift" or (self.method == "auto" and not known):
             return sift.locate(query, self.options.sift)
-        result = ncc.locate(query, self.options.ncc)
+        result = ncc.locate(query, self._prepared, self.options.ncc)
         if self.method == "auto" and isinstance(result, NoFix) and result.reason is not Reason.LATE:
             return sift.locate(query, self.options.sift)
         return result

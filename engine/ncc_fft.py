@@ -7,6 +7,9 @@ Convention:
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,10 +20,26 @@ from engine.errors import DtypeError, OptionError, ShapeError
 from engine.types import Peak
 
 _DTYPES = (torch.uint8, torch.int16, torch.uint16, torch.int32, torch.float16, torch.float32, torch.float64)
-_DOUBLE = (torch.float64, torch.int32, torch.uint16)  # float32 holds these too, but not squares near their ends
+_DOUBLE = (torch.float64, torch.int32)  # float32 would round these
+
+# Coarse to fine: templates are halved while they stay at least this wide and the window is worth it.
+_COARSE_TEMPLATE_PX = 48
+_WORTH_HALVING_PX = 128 * 128
+_CANDIDATES = 6
+_SEPARATION_PX = 2  # of candidates, on the coarsest level
+_MAX_HALVINGS = 3
+_UPHILL_STEPS = 2  # within the reach of one LocalScores
 
 
-def ncc(search: Tensor, templates: Tensor, *, zero_mean: bool = True) -> Tensor:
+def ncc(
+    search: Tensor,
+    templates: Tensor,
+    *,
+    zero_mean: bool = True,
+    search_valid: Tensor | None = None,
+    templates_valid: Tensor | None = None,
+    min_overlap: float = 0.5,
+) -> Tensor:
     """Values in [-1, 1]: normalised cross-correlation of templates with every place of a window.
 
     Args:
@@ -28,6 +47,10 @@ def ncc(search: Tensor, templates: Tensor, *, zero_mean: bool = True) -> Tensor:
         templates: (B, T, h, w) with h <= H and w <= W, on the same device.
         zero_mean: take the means off first (OpenCV's ``TM_CCOEFF_NORMED``); otherwise the paper's equation 1
             as it stands (``TM_CCORR_NORMED``).
+        search_valid: (B, H, W) bool, or None: all. Invalid pixels take part in no sum.
+        templates_valid: (B, T, h, w) bool, or None: all.
+        min_overlap: with masks, places where less than this share of the template's valid pixels lies on valid
+            map score -1.
 
     Returns:
         (B, T, H-h+1, W-w+1), float64 if either input is float64, else float32. A perfect match scores 1, an
@@ -35,17 +58,22 @@ def ncc(search: Tensor, templates: Tensor, *, zero_mean: bool = True) -> Tensor:
 
     Raises:
         ShapeError: the shapes do not fit each other.
-        DtypeError: an element type is not in the list above.
-        OptionError: the tensors live on different devices, or hold NaN or infinity.
+        DtypeError: an element type is not in the list above, or a mask is not bool.
+        OptionError: the tensors live on different devices, or hold NaN or infinity, or masks come without
+            ``zero_mean``.
     """
     _check(search, templates)
     double = torch.float64 in (search.dtype, templates.dtype)
-    work = torch.float64 if double else torch.float32
-    if {search.dtype, templates.dtype} & set(_DOUBLE):
-        scores = kernels.ncc_surface(search.double(), templates.double(), zero_mean=zero_mean)
-    else:
-        scores = kernels.ncc_surface(search.float(), templates.float(), zero_mean=zero_mean)
-    return scores.to(work)
+    out = torch.float64 if double else torch.float32
+    if search_valid is not None or templates_valid is not None:
+        masks = _masks(search, templates, search_valid, templates_valid)
+        if not zero_mean:
+            raise OptionError("zero_mean: expected True where masks are given, got False")
+        if not 0.0 < min_overlap <= 1.0:
+            raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
+        return kernels.masked_ncc_surface(search, masks[0], templates, masks[1], min_overlap=min_overlap).to(out)
+    work = torch.float64 if {search.dtype, templates.dtype} & set(_DOUBLE) else torch.float32
+    return kernels.ncc_surface(search.to(work), templates.to(work), zero_mean=zero_mean).to(out)
 
 
 def _check(search: Tensor, templates: Tensor) -> None:
@@ -54,69 +82,277 @@ def _check(search: Tensor, templates: Tensor) -> None:
     if templates.ndim != 4 or 0 in templates.shape:
         raise ShapeError(f"templates: expected (B, T, h, w) with no empty axis, got {tuple(templates.shape)}")
     if search.shape[0] != templates.shape[0]:
-        raise ShapeError(
-            f"templates: expected a batch of {search.shape[0]} as in search, got {templates.shape[0]}"
-        )
+        raise ShapeError(f"templates: expected a batch of {search.shape[0]} (search), got {templates.shape[0]}")
     (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
     for name, tensor in (("search", search), ("templates", templates)):
         if tensor.dtype not in _DTYPES:
             raise DtypeError(f"{name}: expected uint8, int16, uint16, int32 or a float, got {tensor.dtype}")
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+        if tensor.is_floating_point() and not _is_finite(tensor):
             raise OptionError(f"{name}: expected finite values, got NaN or infinity")
     if search.device != templates.device:
         raise OptionError(f"templates: expected on {search.device} like search, got {templates.device}")
 
 
-def find_peak(surface: Tensor, *, exclusion_px: float) -> Peak:
+def _is_finite(tensor: Tensor) -> bool:
+    """Whether all values are finite; a sum is finite only then, and is much quicker than looking at each."""
+    return bool(torch.isfinite(tensor.sum())) or bool(torch.isfinite(tensor).all())
+
+
+def _masks(
+    search: Tensor, templates: Tensor, search_valid: Tensor | None, templates_valid: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Both masks, all True where none was given."""
+    found = []
+    for name, tensor, mask in (
+        ("search_valid", search, search_valid),
+        ("templates_valid", templates, templates_valid),
+    ):
+        mask = torch.ones_like(tensor, dtype=torch.bool) if mask is None else mask
+        if mask.dtype != torch.bool:
+            raise DtypeError(f"{name}: expected bool, got {mask.dtype}")
+        if mask.shape != tensor.shape:
+            raise ShapeError(f"{name}: expected {tuple(tensor.shape)}, got {tuple(mask.shape)}")
+        found.append(mask)
+    return found[0], found[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """A piece of map that was prepared for matching: what a frame need not compute again.
+
+    Attributes:
+        image: (H, W) float32, of a mean that is small against its deviation.
+        sums: (2, H+1, W+1) float64 running sums of the picture and of its square.
+        half: the same piece at half resolution, whose pixel (x, y) is the mean of 2 x 2 pixels from (2x, 2y);
+            None where there is no further level.
+    """
+
+    image: Tensor
+    sums: Tensor
+    half: Search | None = None
+
+    def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
+        """Columns [x0, x0 + width), rows [y0, y0 + height), without a copy.
+
+        The half-resolution level is kept where the crop begins on an even pixel.
+        """
+        rows, columns = slice(y0, y0 + height), slice(x0, x0 + width)
+        half = None
+        if self.half is not None and not (x0 & 1 or y0 & 1):
+            half = self.half.crop(x0 >> 1, y0 >> 1, width >> 1, height >> 1)
+        return Search(self.image[rows, columns], self.sums[:, y0 : y0 + height + 1, x0 : x0 + width + 1], half)
+
+
+def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
+    """Running sums and half-resolution levels of a picture (H, W) float32."""
+    if image.ndim != 2 or 0 in image.shape:
+        raise ShapeError(f"image: expected (H, W) with no empty axis, got {tuple(image.shape)}")
+    if image.dtype != torch.float32:
+        raise DtypeError(f"image: expected float32, got {image.dtype}")
+    half = None
+    if halvings > 0 and min(image.shape) >= 2 * _COARSE_TEMPLATE_PX:
+        half = prepare(_halved(image), halvings=halvings - 1)
+    return Search(image.contiguous(), kernels.integrals(image), half)
+
+
+def _halved(image: Tensor) -> Tensor:
+    """Means of 2 x 2 pixels; an odd last row or column is left out."""
+    return kernels.halved(image)
+
+
+def surface(search: Search, templates: Tensor) -> Tensor:
+    """Zero-mean NCC (T, H-h+1, W-w+1) of float32 templates (T, h, w) with a prepared piece of map."""
+    if templates.ndim != 3 or 0 in templates.shape:
+        raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
+    (H, W), (h, w) = search.image.shape, templates.shape[-2:]
+    if h > H or w > W:
+        raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
+    centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
+    return kernels.prepared_surface(search.image, search.sums, centred)
+
+
+def match_template(search: Search, template: Tensor, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
+    """The peak of one template (h, w) in a prepared piece of map.
+
+    Coarse to fine: all places are scored at reduced resolution, the best few at full resolution. It is safe where
+    no place that was left out can win: the coarse scores are taken to be wrong by no more than twice what they
+    were wrong by at the places that were looked at. Where that does not exclude every other place, and with
+    ``exhaustive``, all places are scored at full resolution.
+
+    Args:
+        search: from :func:`prepare`.
+        template: (h, w) float32 on the same device.
+        exclusion_px: rivals nearer than this to the peak are the peak itself.
+        exhaustive: score all places at full resolution; the peak is then the reference's.
+    """
+    if template.ndim != 2 or 0 in template.shape:
+        raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
+    with torch.inference_mode():
+        if not exhaustive and search.image.device.type == "cpu":
+            found = _coarse_to_fine(search, template, exclusion_px)
+            if found is not None:
+                return found
+        return find_peak(surface(search, template[None]), exclusion_px=exclusion_px)
+
+
+def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Peak | None:
+    """The peak by way of the half-resolution levels, or None where they cannot be trusted."""
+    levels = [(search, template - template.mean())]
+    while True:
+        piece, model = levels[-1]
+        (H, W), (h, w) = piece.image.shape, model.shape
+        if len(levels) > _MAX_HALVINGS or piece.half is None or min(h, w) < 2 * _COARSE_TEMPLATE_PX:
+            break
+        if H * W < _WORTH_HALVING_PX or min(H - h, W - w) < 16:
+            break
+        levels.append((piece.half, _halved(model)))
+    if len(levels) == 1:
+        return None  # nothing to gain
+    (coarse, model), scale = levels[-1], 2 ** (len(levels) - 1)
+    scores = kernels.prepared_surface(coarse.image, coarse.sums, model[None])[0]
+    places = best_places(scores, _SEPARATION_PX, _CANDIDATES + 1)
+    best: Peak | None = None
+    doubt, others = 0.0, []
+    for index, (x, y, score) in enumerate(places):
+        if best is not None and score + doubt < best.score:
+            others += [Peak(x * scale, y * scale, score, -1.0, np.zeros((2, 2))) for x, y, score in places[index:]]
+            break  # places come in falling order: none of the rest can win
+        if index == _CANDIDATES:
+            return None
+        found = _refined(levels, scores, x, y)
+        if found is None:
+            return None
+        doubt = max(doubt, 2.0 * abs(found.score - score) + 0.01)
+        others.append(found)
+        best = found if best is None or found.score > best.score else best
+    assert best is not None  # a surface has a highest place
+    away = [p.score for p in others if math.hypot(p.x - best.x, p.y - best.y) > exclusion_px]
+    return replace(best, second_score=max(away, default=-1.0))
+
+
+def _refined(levels: list[tuple[Search, Tensor]], scores: Tensor, x: int, y: int) -> Peak | None:
+    """Follow a place of the coarsest level down to full resolution; None where it runs into the window's edge."""
+    if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
+        return None
+    around = scores[y - 1 : y + 2, x - 1 : x + 2].double().numpy()
+    for piece, model in reversed(levels[:-1]):
+        dx, dy, _ = fit_summit(around)
+        y, x = round(2 * (y + dy)), round(2 * (x + dx))
+        scorer = kernels.LocalScores(piece.image.numpy(), piece.sums.numpy(), model.numpy(), (y, x))
+        for uphill in range(_UPHILL_STEPS + 1):
+            if uphill == _UPHILL_STEPS or not all(
+                2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)
+            ):
+                return None
+            around = scorer.at(y + _NEAR[0], x + _NEAR[1]).reshape(3, 3)
+            best = int(around.argmax())
+            if best == 4:
+                break
+            y, x = y + best // 3 - 1, x + best % 3 - 1
+    wide = np.zeros((5, 5))
+    wide[1:4, 1:4] = around
+    wide[_FAR[0] + 2, _FAR[1] + 2] = scorer.at(y + _FAR[0], x + _FAR[1])
+    dx, dy, curvature = fit_summit(wide)
+    return Peak(x + dx, y + dy, float(around[1, 1]), -1.0, curvature)
+
+
+def best_places(scores: Tensor, separation: int, count: int) -> list[tuple[int, int, float]]:
+    """The ``count`` highest places (x, y, score) of (H, W) that are more than ``separation`` apart."""
+    left, places = scores.clone(), []
+    for _ in range(count):
+        index = int(left.argmax())
+        y, x = divmod(index, left.shape[1])
+        score = float(left[y, x])
+        if score <= -1.0:
+            break
+        places.append((x, y, score))
+        left[max(0, y - separation) : y + separation + 1, max(0, x - separation) : x + separation + 1] = -1.0
+    return places
+
+
+def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
     """The highest place of one surface (T, H', W'), refined below the pixel, with its best rival.
 
     Args:
-        surface: scores of T hypotheses; the peak is the highest over all of them.
+        scores: of T hypotheses; the peak is the highest over all of them.
         exclusion_px: rivals nearer than this to the peak, under any hypothesis, are the peak itself.
 
     Returns:
-        Peak: (x, y) by the least-squares quadratic of the 3 x 3 neighbourhood, never further than half a pixel
-        from the best whole pixel; unrefined on the border of the surface.
+        Peak: (x, y) by :func:`fit_summit`, never further than half a pixel from the best whole pixel;
+        unrefined on the border of the surface.
     """
-    if surface.ndim != 3 or 0 in surface.shape:
-        raise ShapeError(f"surface: expected (T, H, W) with no empty axis, got {tuple(surface.shape)}")
-    _, height, width = surface.shape
-    index = int(surface.argmax())
-    t, y, x = index // (height * width), index // width % height, index % width
-    score = float(surface[t, y, x])
+    if scores.ndim != 3 or 0 in scores.shape:
+        raise ShapeError(f"scores: expected (T, H, W) with no empty axis, got {tuple(scores.shape)}")
+    values = scores.cpu().numpy()
+    t, y, x = (int(v) for v in np.unravel_index(int(values.argmax()), values.shape))
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
-    if 0 < x < width - 1 and 0 < y < height - 1:
-        patch = surface[t, y - 1 : y + 2, x - 1 : x + 2].double().cpu().numpy()
-        dx, dy, curvature = fit_quadratic(patch)
-    return Peak(x + dx, y + dy, score, _second_score(surface, x, y, exclusion_px), curvature, t)
+    r = min(2, x, y, values.shape[2] - 1 - x, values.shape[1] - 1 - y)
+    if r > 0:
+        dx, dy, curvature = fit_summit(values[t, y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))
+    second = _second_score(values, x, y, exclusion_px)
+    return Peak(x + dx, y + dy, float(values[t, y, x]), second, curvature, t)
 
 
-def _second_score(surface: Tensor, x: int, y: int, exclusion_px: float) -> float:
-    """The best score outside a disc about the peak: the four strips around the disc's box, then its corners."""
-    best = surface.amax(dim=0)
-    height, width = best.shape
+def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: float) -> float:
+    """The best of (T, H, W) outside a disc about the peak: the strips around the disc's box, then its corners."""
+    height, width = scores.shape[1:]
     r = int(exclusion_px)
     x0, x1, y0, y1 = max(0, x - r), min(width, x + r + 1), max(0, y - r), min(height, y + r + 1)
-    outside = [best[:y0], best[y1:], best[y0:y1, :x0], best[y0:y1, x1:]]
-    box = best[y0:y1, x0:x1]
-    rows = torch.arange(y0, y1, device=best.device)[:, None] - y
-    columns = torch.arange(x0, x1, device=best.device)[None, :] - x
-    outside.append(box[rows * rows + columns * columns > exclusion_px * exclusion_px])
-    return max((float(part.max()) for part in outside if part.numel()), default=-1.0)
+    rows, columns = np.ogrid[y0 - y : y1 - y, x0 - x : x1 - x]
+    outside = [scores[:, :y0], scores[:, y1:], scores[:, y0:y1, :x0], scores[:, y0:y1, x1:]]
+    outside.append(scores[:, y0:y1, x0:x1][:, rows * rows + columns * columns > exclusion_px * exclusion_px])
+    return max((float(part.max()) for part in outside if part.size), default=-1.0)
 
 
-# Least squares of a + b x + c y + d x^2 + e x y + f y^2 over the 3 x 3 neighbourhood; rows give b, c, d, e, f.
-_Y, _X = (g.ravel().astype(float) for g in np.mgrid[-1:2, -1:2])
-_QUADRATIC = np.linalg.pinv(np.stack([np.ones(9), _X, _Y, _X * _X, _X * _Y, _Y * _Y], axis=1))[1:]
+# The neighbourhood of a peak as rows and columns (dy, dx): 3 x 3 places, and the four two pixels away.
+_NEAR = np.array([[-1, -1, -1, 0, 0, 0, 1, 1, 1], [-1, 0, 1, -1, 0, 1, -1, 0, 1]])
+_FAR = np.array([[-2, 2, 0, 0], [0, 0, -2, 2]])
+# Powers (i, j) of the polynomials c[i, j] x^i y^j that follow it: a quadratic by least squares over the 3 x 3;
+# and, since a peak is sharper than a parabola, one of degree 4 that goes through all 13.
+_QUADRATIC = [(0, 0), (1, 0), (2, 0), (0, 1), (0, 2), (1, 1)]
+_QUARTIC = [*_QUADRATIC, (3, 0), (4, 0), (0, 3), (0, 4), (2, 1), (1, 2), (2, 2)]
 
 
-def fit_quadratic(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:
-    """Offset (dx, dy) of the summit of a 3 x 3 patch from its centre, and its (2, 2) second derivatives."""
-    b, c, d, e, f = _QUADRATIC @ patch.ravel()
-    curvature = np.array([[2 * d, e], [e, 2 * f]])
-    if d >= 0 or f >= 0 or 4 * d * f <= e * e:  # not a summit: a ridge or a saddle
-        return 0.0, 0.0, curvature
-    dx, dy = np.clip(-np.linalg.solve(curvature, [b, c]), -0.5, 0.5)
-    return float(dx), float(dy), curvature
+def _derivatives(places: NDArray[np.int64], powers: list[tuple[int, int]], n: int) -> NDArray[np.float64]:
+    """Takes the scores at places (dy, dx) to d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2 of the polynomial, n x n each."""
+    y, x = places.astype(float)
+    inverse = np.linalg.pinv(np.stack([x**i * y**j for i, j in powers], axis=1))
+    c = np.zeros((n, n, places.shape[1]))
+    for row, power in zip(inverse, powers, strict=True):
+        c[power] = row
+    slope = np.diag(np.arange(1.0, n), 1)
+    in_x, in_y = np.einsum("ai,ijp->ajp", slope, c), np.einsum("bj,ijp->ibp", slope, c)
+    in_xx, in_xy = np.einsum("ai,ijp->ajp", slope, in_x), np.einsum("bj,ijp->ibp", slope, in_x)
+    return np.stack([in_x, in_y, in_xx, in_xy, np.einsum("bj,ijp->ibp", slope, in_y)]).reshape(5 * n * n, -1)
+
+
+_WIDE = np.concatenate([_NEAR, _FAR], axis=1)
+_SUMMITS = {3: (_NEAR + 1, _derivatives(_NEAR, _QUADRATIC, 3)), 5: (_WIDE + 2, _derivatives(_WIDE, _QUARTIC, 5))}
+_NEWTON_STEPS = 5
+_NEWTON_END_PX = 1e-4
+
+
+def fit_summit(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:
+    """Offset (dx, dy) of the summit of a 3 x 3 or 5 x 5 patch from its centre, and its second derivatives (2, 2).
+
+    By Newton's method from the centre, on the polynomial through the neighbourhood of the centre. Where the way
+    does not lead to a summit within half a pixel, the offset is cut off there.
+    """
+    n = patch.shape[0]
+    places, take = _SUMMITS[n]
+    derivatives = (take @ patch[places[0], places[1]]).reshape(5, n, n)
+    orders = np.arange(n)
+    x = y = 0.0
+    for _ in range(_NEWTON_STEPS):
+        gx, gy, xx, xy, yy = (derivatives @ y**orders @ x**orders).tolist()
+        determinant = xx * yy - xy * xy
+        if xx >= 0 or determinant <= 0:  # no summit: a ridge, a saddle
+            break
+        last_x, last_y = x, y
+        x = min(0.5, max(-0.5, x - (yy * gx - xy * gy) / determinant))
+        y = min(0.5, max(-0.5, y - (xx * gy - xy * gx) / determinant))
+        if abs(x - last_x) + abs(y - last_y) < _NEWTON_END_PX:
+            break
+    return x, y, np.array([[xx, xy], [xy, yy]])

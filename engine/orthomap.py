@@ -19,21 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
 from engine.geo import LocalFrame
-from engine.rasters import (
-    MEMORY_LIMIT_PX,
-    WARP_MARGIN,
-    Array,
-    Gray,
-    GrayReader,
-    Grid,
-    Mask,
-    Warp,
-    earth_crs,
-    metric_copy,
-    open_source,
-    read_surface,
-    warp_between,
-)
+from engine.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
+from engine.metric_copy import open_metric_copy
+from engine.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Mask, open_source, read_surface
 from engine.types import Window
 
 if TYPE_CHECKING:
@@ -221,7 +209,7 @@ class OrthoMap:
         reader = GrayReader(original)
         share = reader.invalid_share
         if not original.grid.is_metric:
-            used = metric_copy(original, reader, cache_dir)
+            used = open_metric_copy(original, reader, cache_dir)
             reader = GrayReader(used, find_collar=False)
         facts = {
             "path": str(original.path),

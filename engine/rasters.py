@@ -1,8 +1,8 @@
-"""Raster files: what may be opened, where it lies on the Earth, its grey values, and a metric copy of it.
+"""Raster files: what may be opened, where it lies on the Earth, its grey values or its heights.
 
 Convention:
-    ``pixel_to_crs`` is a (2, 3) affine matrix that takes pixels (x, y), centres at integers, to coordinates
-    (easting, northing) or (longitude, latitude). GDAL's corner origin is left behind in :func:`_centred`.
+    GDAL's origin, the outer corner of the first pixel, is left behind in :func:`_centred`; a :class:`Source` has
+    the pixels of :mod:`engine.grids`, centres at integers.
 
 Nodata is what the file says (tag, mask, alpha, NaN). A file that says nothing may still have a collar: pixels
 whose bands are all exactly 0, or all exactly the largest value, that hang together with the border of the
@@ -11,15 +11,11 @@ picture and jointly cover more than :data:`COLLAR_SHARE` of it, count as nodata.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
-import shutil
-import tempfile
 import threading
 import warnings
-import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,16 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
-from engine.geo import LocalFrame
+from engine.grids import Array, Grid, apply_affine, earth_crs, overlap, wgs84
 from engine.types import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Function = Callable[[Array], Array]
 
 SIGNATURES = (
     ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
@@ -59,181 +53,8 @@ OVERVIEW_PX = 4096
 """Stretch and collar are found on a copy of at most this many pixels a side."""
 MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
-MAX_SIDE_PX = 1_000_000
-WARP_MARGIN = 0.5
-"""Fast transforms reach this share of the map's longer side beyond its edges; further out they are exact."""
 HEIGHT_RANGE_M = (-1000.0, 20000.0)
 """Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
-GRID_VERSION = 1
-"""Part of the key of cached grids; to be raised with every change of how they are made."""
-
-
-class Warp:
-    """A smooth map of the plane by polynomials that were checked against the exact function.
-
-    PROJ and the way from the tangent plane to the ellipsoid take a fraction of a millisecond a call. Over one
-    map both are so smooth that polynomials of degree 5 follow them to micrometres. Points outside ``box``, and
-    all points where the fit misses ``tolerance``, take the exact function.
-    """
-
-    def __init__(self, exact: Function, box: Array, tolerance: float) -> None:
-        self._exact = exact
-        self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
-        nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev's keep the error even
-        terms = (_powers(nodes[:, 0])[:, :, None] * _powers(nodes[:, 1])[:, None, :]).reshape(len(nodes), 36)
-        values = exact(self._centre + self._half * nodes)
-        self._coefficients: Array = np.zeros((6, 12))
-        self.fitted = bool(np.isfinite(values).all())
-        if self.fitted:
-            self._coefficients[:] = np.linalg.lstsq(terms, values, rcond=None)[0].reshape(6, 12)
-            check = _lattice(np.linspace(-1.0, 1.0, 17))
-            error = self._polynomial(check) - exact(self._centre + self._half * check)
-            self.fitted = bool(np.abs(error).max() <= tolerance)  # NaN compares as not fitted
-
-    def _polynomial(self, unit: Array) -> Array:
-        over_y = (_powers(unit[..., 0]) @ self._coefficients).reshape(*unit.shape[:-1], 6, 2)
-        return np.asarray((over_y * _powers(unit[..., 1])[..., None]).sum(axis=-2))
-
-    def __call__(self, points: Array) -> Array:
-        """The images (..., 2) of points (..., 2)."""
-        unit = (points - self._centre) / self._half
-        if self.fitted and (np.abs(unit) <= 1.0).all():
-            return self._polynomial(unit)
-        return self._exact(points)
-
-    def on_grid(self, x: Array, y: Array) -> Array:
-        """The images (len(y), len(x), 2) of all pairs of columns and rows."""
-        if not self.fitted:
-            return self._exact(np.stack(np.meshgrid(x, y), axis=-1))
-        in_x, in_y = (_powers((v - c) / h) for v, c, h in zip((x, y), self._centre, self._half, strict=True))
-        cubes = self._coefficients.reshape(6, 6, 2)
-        return np.stack([in_y @ cubes[..., k].T @ in_x.T for k in (0, 1)], axis=-1)
-
-
-def _powers(x: Array) -> Array:
-    powers = np.ones((*np.shape(x), 6))
-    for k in range(1, 6):  # products: ten times as fast as ** on some hundred points, a little slower on one
-        np.multiply(powers[..., k - 1], x, out=powers[..., k])
-    return powers
-
-
-def _lattice(x: Array) -> Array:
-    return np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
-
-
-def apply_affine(matrix: Array, points: Array) -> Array:
-    """M (2, 3) on points (..., 2)."""
-    return np.asarray(points @ matrix[:, :2].T + matrix[:, 2])
-
-
-def invert_affine(matrix: Array) -> Array:
-    """The (2, 3) matrix that undoes another."""
-    linear = np.linalg.inv(matrix[:, :2])
-    return np.column_stack([linear, -linear @ matrix[:, 2]])
-
-
-def earth_crs(value: Any, argument: str) -> CRS:
-    """The horizontal part of whatever pyproj takes for a coordinate reference system of the Earth.
-
-    Raises:
-        MapError: it is none, or is not tied to the Earth.
-    """
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import ProjError
-
-    try:
-        crs = CRS.from_user_input(value)
-        crs = crs.sub_crs_list[0] if crs.is_compound else crs
-        if not (crs.is_geographic or crs.is_projected):
-            raise MapError(f"{argument}: expected a CRS on the Earth, got {crs.type_name} {crs.name!r}")
-        crs = crs.to_2d() if len(crs.axis_info) > 2 else crs
-        Transformer.from_crs(crs, 4326)
-    except ProjError as error:
-        reason = str(error).splitlines()[0]
-        raise MapError(f"{argument}: expected a coordinate reference system of the Earth: {reason}") from None
-    return crs
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Pixels and where they lie.
-
-    Attributes:
-        width_px: columns.
-        height_px: rows.
-        pixel_to_crs: (2, 3), integer pixels are centres.
-        crs: what the coordinates mean.
-    """
-
-    width_px: int
-    height_px: int
-    pixel_to_crs: Array
-    crs: CRS
-
-    @property
-    def centre_px(self) -> Array:
-        """Middle of the picture."""
-        return np.array([(self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0])
-
-    def pixels_of(self, other: CRS) -> tuple[Function, Function]:
-        """Exact functions: coordinates (x, y) of another CRS from pixels, and pixels from those coordinates."""
-        from pyproj import Transformer
-
-        forward = Transformer.from_crs(self.crs, other, always_xy=True)
-        backward = Transformer.from_crs(other, self.crs, always_xy=True)
-        crs_to_pixel = invert_affine(self.pixel_to_crs)
-        centre_x = apply_affine(self.pixel_to_crs, self.centre_px)[0]
-
-        def there(pixels: Array) -> Array:
-            at = apply_affine(self.pixel_to_crs, pixels)
-            return np.asarray(np.stack(forward.transform(at[..., 0], at[..., 1]), axis=-1), np.float64)
-
-        def back(points: Array) -> Array:
-            x, y = backward.transform(points[..., 0], points[..., 1])
-            if self.crs.is_geographic:  # a map across the antimeridian counts on beyond 180 degrees
-                x = centre_x + (np.asarray(x) - centre_x + 180.0) % 360.0 - 180.0
-            return apply_affine(crs_to_pixel, np.stack([x, y], axis=-1))
-
-        return there, back
-
-    def box(self, margin: float = 0.0) -> Array:
-        """Corners (2, 2), low and high, of the outer edges widened by a share of the longer side."""
-        grow = 0.5 + margin * max(self.width_px, self.height_px)
-        return np.array([[-grow, -grow], [self.width_px - 1 + grow, self.height_px - 1 + grow]])
-
-    def lattice(self, count: int = 33) -> Array:
-        """Points (count ** 2, 2) spread over the picture, its outer edges included."""
-        low, high = self.box()
-        unit = _lattice(np.linspace(-1.0, 1.0, count))
-        return np.asarray((low + high) / 2.0 + (high - low) / 2.0 * unit)
-
-    @property
-    def is_metric(self) -> bool:
-        """Whether it can serve as a map as it is: projected, rows to the north, square on the ground to 1 %."""
-        linear = self.pixel_to_crs[:, :2]
-        step = np.abs(linear).max()
-        upright = linear[0, 0] > 0 and linear[1, 1] < 0 and abs(linear[[0, 1], [1, 0]]).max() < 1e-3 * step
-        if self.crs.is_geographic or not upright:
-            return False
-        lon, lat = np.moveaxis(
-            self.pixels_of(_wgs84())[0](self.centre_px + np.array([[0, 0], [1, 0], [0, 1]])), -1, 0
-        )
-        with np.errstate(invalid="ignore"):
-            steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
-        return bool(steps_m.max() <= 1.01 * steps_m.min())
-
-
-def warp_between(grid: Grid, other: Grid) -> Warp:
-    """Pixels of another grid from pixels of a grid, to a hundredth of a pixel."""
-    to_crs = grid.pixels_of(other.crs)[0]
-    to_pixel = invert_affine(other.pixel_to_crs)
-    return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
-
-
-def _wgs84() -> CRS:
-    from pyproj import CRS
-
-    return CRS.from_epsg(4326)
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +127,7 @@ def _checked(grid: Grid, argument: str, file: Path) -> Grid:
     determinant = np.linalg.det(matrix[:, :2]) if np.isfinite(matrix).all() else 0.0
     if determinant == 0.0:
         raise MapError(f"{argument}: expected a finite, invertible geotransform, got {matrix.tolist()} in {file}")
-    lon, lat = grid.pixels_of(_wgs84())[0](grid.centre_px)
+    lon, lat = grid.pixels_of(wgs84())[0](grid.centre_px)
     if not (abs(lat) <= 90.0 and abs(lon) <= 540.0):  # NaN and infinity fail too
         raise MapError(f"{argument}: the centre of {file} lies outside its CRS {grid.crs.name!r}")
     return grid
@@ -474,147 +295,6 @@ def _collars(data: NDArray[Any]) -> dict[float, Mask]:
     return found
 
 
-def metric_grid(source: Grid) -> Grid:
-    """The north-up UTM grid (zone of the source's centre) that covers it in the finer of its two steps."""
-    from pyproj import CRS
-
-    lon, lat = source.pixels_of(_wgs84())[0](source.centre_px)
-    zone = int((lon + 180.0) // 6.0) % 60 + 1
-    utm = CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
-    to_utm = source.pixels_of(utm)[0]
-    near = to_utm(source.centre_px + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
-    outline = to_utm(source.lattice())
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    with np.errstate(invalid="ignore"):  # places that UTM cannot show are infinite; the check below refuses them
-        step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
-        size = (high - low) / step
-    if not (np.isfinite(size).all() and size.max() <= MAX_SIDE_PX):
-        raise MapError(f"map: expected at most {MAX_SIDE_PX} px a side on a UTM grid, got {size} of {step:.3g} m")
-    matrix = np.array([[step, 0.0, low[0] + step / 2.0], [0.0, -step, high[1] - step / 2.0]])
-    return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
-
-
-def _resampled(
-    reader: GrayReader, source: Grid, grid: Grid, block_px: int = 1024
-) -> Iterator[tuple[Window, Gray]]:
-    """Blocks of the metric grid as (2, h, w) grey and alpha; grey is cubic, alpha 255 where all of it is valid."""
-    import cv2
-
-    to_source = source.pixels_of(grid.crs)[1]
-    warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
-    limit = np.array([source.width_px, source.height_px])
-    for y0 in range(0, grid.height_px, block_px):
-        for x0 in range(0, grid.width_px, block_px):
-            window = Window(x0, y0, min(block_px, grid.width_px - x0), min(block_px, grid.height_px - y0))
-            columns = np.arange(x0, x0 + window.width_px, dtype=np.float64)
-            rows = np.arange(y0, y0 + window.height_px, dtype=np.float64)
-            at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
-            low = np.clip(np.floor(at.min(axis=(0, 1))) - 3, 0, limit).astype(int)
-            high = np.clip(np.ceil(at.max(axis=(0, 1))) + 4, 0, limit).astype(int)
-            block = np.zeros((2, window.height_px, window.width_px), np.uint8)
-            if (high > low).all():
-                gray, valid = reader.read(Window(*low.tolist(), *(high - low).tolist()))
-                x, y = np.moveaxis((at - low).astype(np.float32), -1, 0)
-                # One pixel eroded plus the reach of bilinear make up the reach of cubic.
-                solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
-                block[0] = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-                solid = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                inside = ((at >= -0.5) & (at <= limit - 0.5)).all(axis=-1)
-                block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
-            yield window, block
-
-
-def metric_copy(source: Source, reader: GrayReader, cache_dir: str | os.PathLike[str] | None) -> Source:
-    """The source on its metric grid, from the cache where it was made before.
-
-    The key is the SHA-256 of the content of the file and of the files beside it that GDAL uses, of the
-    georeference, and of the version of this format. A cached file that does not fit or cannot be read is made
-    anew; where the cache cannot be written, the copy lives in the temporary directory as long as the map.
-    """
-    grid = metric_grid(source.grid)
-    default = os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenematch")
-    target = Path(cache_dir if cache_dir is not None else default) / f"{_key(source)}.tif"
-    cached = _cached(target, grid)
-    if cached is not None:
-        return cached
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        return _written(target, reader, source.grid, grid)
-    except OSError:
-        folder = tempfile.mkdtemp(prefix="scenematch-")
-    with map_errors("map", source.path):
-        copy = _written(Path(folder) / target.name, reader, source.grid, grid)
-    weakref.finalize(copy, shutil.rmtree, folder, ignore_errors=True)
-    return copy
-
-
-def _key(source: Source) -> str:
-    digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
-    digest.update(source.grid.pixel_to_crs.tobytes())
-    for name in source.dataset.files:
-        with open(name, "rb") as stream:
-            digest.update(hashlib.file_digest(stream, "sha256").digest())
-    return digest.hexdigest()
-
-
-def _cached(path: Path, grid: Grid) -> Source | None:
-    """The cached file, or None where it is missing, broken or of another grid."""
-    try:
-        source = open_source(path)
-        same = np.allclose(source.grid.pixel_to_crs, grid.pixel_to_crs, rtol=0, atol=1e-6)
-        size = (source.grid.width_px, source.grid.height_px)
-        if not same or size != (grid.width_px, grid.height_px) or source.dataset.count != 2:
-            return None
-        with map_errors("map", path):  # a file cut short shows in its last rows
-            whole = size[0] * size[1] <= MEMORY_LIMIT_PX
-            source.dataset.read(window=((0 if whole else size[1] - 1, size[1]), (0, size[0])))
-    except (MapError, OSError):
-        return None
-    return source
-
-
-def _written(target: Path, reader: GrayReader, source: Grid, grid: Grid) -> Source:
-    """Write the metric grid beside its place and move it there in one step.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    import rasterio
-    from rasterio.enums import ColorInterp
-    from rasterio.windows import Window as RasterWindow
-
-    (a, _, c), (_, e, f) = grid.pixel_to_crs
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 2, "crs": grid.crs.to_wkt(), "bigtiff": "if_safer"}
-    profile |= {"tiled": True, "compress": "deflate", "width": grid.width_px, "height": grid.height_px}
-    profile["transform"] = rasterio.Affine(a, 0.0, c - a / 2.0, 0.0, e, f - e / 2.0)
-    handle, name = tempfile.mkstemp(suffix=".tif", dir=target.parent)
-    os.close(handle)
-    try:
-        with rasterio.open(name, "w", **profile) as dataset:
-            dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
-            for window, block in _resampled(reader, source, grid):
-                place = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
-                dataset.write(block, window=place)
-        os.replace(name, target)
-    finally:
-        Path(name).unlink(missing_ok=True)
-    copy = _cached(target, grid)
-    if copy is None:
-        raise OSError(f"{target} could not be read back")
-    return copy
-
-
-def _overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First pixel (x, y), and the one past the last, of another grid under a grid, widened by two."""
-    points = warp_between(grid, other)(grid.lattice())
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        return np.zeros(2, np.intp), np.zeros(2, np.intp)
-    limit = np.array([other.width_px, other.height_px])
-    low = np.clip(np.floor(points.min(axis=0)) - 2, 0, limit).astype(np.intp)
-    return low, np.clip(np.ceil(points.max(axis=0)) + 3, 0, limit).astype(np.intp)
-
-
 def read_surface(source: Source, grid: Grid) -> tuple[NDArray[np.float32], Grid]:
     """Heights (NaN where unknown) and grid of the part of a surface model that lies under a map.
 
@@ -629,7 +309,7 @@ def read_surface(source: Source, grid: Grid) -> tuple[NDArray[np.float32], Grid]
     dataset, own = source.dataset, source.grid
     if np.dtype(dataset.dtypes[0]).kind not in "iuf":
         raise MapError(f"surface: expected heights as real numbers, got {dataset.dtypes[0]} in {source.path}")
-    low, high = _overlap(grid, own)
+    low, high = overlap(grid, own)
     if not (high > low).all():
         raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
     size = high - low

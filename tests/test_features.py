@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from engine.descriptors import _orient
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.features import Features, _orient, match, opencv_sift, sift
+from engine.features import Features, match, opencv_sift, sift
 
 LEVEL_RATIO = 2 ** (1 / 3)
 

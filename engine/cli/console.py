@@ -8,18 +8,21 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from rich import box
 from rich.console import Console
 from rich.progress import track as rich_track
 from rich.table import Table
+from rich.text import Text
 
 T = TypeVar("T")
 
-_errors = Console(stderr=True, highlight=False, soft_wrap=True)
+_errors = Console(stderr=True, highlight=False)
+_PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
 
 
 def say(text: str) -> None:
-    """One line for a person, on standard error."""
-    _errors.print(text, markup=False)
+    """One line for a person, on standard error; never folded."""
+    print(" ".join(text.split()), file=sys.stderr, flush=True)
 
 
 def progress(items: Iterable[T], total: int, description: str) -> Iterator[T]:
@@ -35,33 +38,53 @@ def print_json(value: Any) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A table for people on standard output; as wide as its text where nobody looks at a terminal."""
-    table = Table(title=title, title_justify="left", title_style="bold")
+    """A titled table for people on standard output; the first column is words, the others are figures."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="")
     for index, name in enumerate(columns):
-        table.add_column(name, justify="left" if index == 0 else "right", no_wrap=index > 0)
+        table.add_column(name, justify="left" if index == 0 else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
+    _print(title, table)
+
+
+def print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:
+    """Names and values for people on standard output, one a line; a long value is folded under itself."""
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in pairs:
+        table.add_row(Text(name), Text(value))
+    _print(title, table)
+
+
+def _print(title: str, table: Table) -> None:
     console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=160)
-    console.print(table)
+    if console.is_terminal:
+        console.print(Text(title, style="bold"), soft_wrap=True)
+        console.print(table)
+        return
+    wide = Console(highlight=False, width=_PIPE_WIDTH)
+    with wide.capture() as capture:
+        wide.print(table)
+    lines = (line.rstrip() for line in capture.get().splitlines())
+    print(title, *lines, sep="\n")
 
 
 def facts(values: Mapping[str, Any], as_json: bool, title: str) -> None:
     """Names and values, one a line."""
     if as_json:
         print_json(values)
-        return
-    print_table(title, ("what", "value"), ((name, _text(value)) for name, value in values.items()))
+    else:
+        print_pairs(title, ((name, _text(value, name)) for name, value in values.items()))
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
+def _text(value: Any, name: str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):  # of a latitude, 7 decimals are a centimetre
+        return f"{value:.7f}" if name.endswith(("lat_deg", "lon_deg", "bounds_deg")) else f"{value:.6g}"
     if isinstance(value, (list, tuple)):
-        return ", ".join(_text(item) for item in value)
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_text(item)}" for name, item in value.items()) or "-"
+        return ", ".join(_text(item, name) for item in value)
     return "-" if value is None else str(value)
 
 
@@ -69,12 +92,13 @@ _SUMMARY = (
     ("frames", "frames", "{}"),
     ("fixes", "fixes", "{}"),
     ("availability", "availability", "{:.1%}"),
-    ("RMS", "rms_m", "{:.2f} m"),
-    ("median", "median_m", "{:.2f} m"),
-    ("R95", "r95_m", "{:.2f} m"),
-    ("largest", "max_m", "{:.2f} m"),
+    ("RMS error", "rms_m", "{:.2f} m"),
+    ("median error", "median_m", "{:.2f} m"),
+    ("95 % within", "r95_m", "{:.2f} m"),
+    ("largest error", "max_m", "{:.2f} m"),
     ("false fixes", "false_fixes", "{}"),
-    ("height RMS", "height_rms_m", "{:.2f} m"),
+    ("mean NEES (2 is honest)", "nees_mean", "{:.2f}"),
+    ("height RMS error", "height_rms_m", "{:.2f} m"),
 )
 
 
@@ -83,10 +107,13 @@ def report(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> 
     if as_json:
         print_json(summary)
         return
-    rows = [(name, form.format(summary[key])) for name, key, form in _SUMMARY if summary.get(key) is not None]
+    pairs = [(name, form.format(summary[key])) for name, key, form in _SUMMARY if summary.get(key) is not None]
     latency = summary["latency_ms"]
     if latency["p50"] is not None:
-        rows.append(("latency p50 / p95", f"{latency['p50']:.1f} / {latency['p95']:.1f} ms"))
-    rows += [(f"refused: {reason}", str(count)) for reason, count in summary["reasons"].items()]
-    print_table(title, ("what", "value"), rows)
+        shown = ", ".join(f"{name} {latency[name]:.1f}" for name in ("p50", "p95", "p99", "max"))
+        pairs.append(("latency", f"{shown} ms"))
+    if summary["deadlines_missed"]:
+        pairs.append(("deadlines missed", str(summary["deadlines_missed"])))
+    pairs += [(f"refused: {reason}", str(count)) for reason, count in summary["reasons"].items()]
+    print_pairs(title, pairs)
     say(f"written to {out}")

@@ -2,15 +2,55 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from engine import device as devices
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import parse_position
+from engine.cli.arguments import check_choice, parse_position
+from engine.cli.checks import check_place
+from engine.errors import OptionError
 from engine.formats.frames import read_image
-from engine.matcher import SceneMatcher
+from engine.matcher import METHODS, SceneMatcher
 from engine.orthomap import OrthoMap
-from engine.types import Fix, Frame
+from engine.types import Fix, Frame, NoFix
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the user knows of the picture; None where unknown.
+
+    Attributes:
+        height_agl_m: above the ground.
+        heading_deg: clockwise from true north.
+        roll_deg: right side down.
+        pitch_deg: nose up.
+        near: LAT,LON[,SIGMA_M], or None for the whole map.
+
+    Raises:
+        OptionError: a number is not finite, or the height is not above 0.
+    """
+
+    height_agl_m: float | None
+    heading_deg: float | None
+    roll_deg: float | None
+    pitch_deg: float | None
+    near: str | None
+
+    def __post_init__(self) -> None:
+        for option, value in (
+            ("--height-agl", self.height_agl_m),
+            ("--heading", self.heading_deg),
+            ("--roll", self.roll_deg),
+            ("--pitch", self.pitch_deg),
+        ):
+            if value is not None and not math.isfinite(value):
+                raise OptionError(f"{option}: expected a finite number, got {value}")
+        if self.height_agl_m is not None and self.height_agl_m <= 0:
+            raise OptionError(f"--height-agl: expected metres above 0, got {self.height_agl_m:g}")
 
 
 def run_locate(
@@ -18,54 +58,52 @@ def run_locate(
     map_path: Path,
     camera_path: Path,
     surface: Path | None,
+    known: Known,
     *,
-    attitude: tuple[float | None, float | None, float | None, float | None],
-    near: str | None,
     method: str,
     device: str,
     as_json: bool,
 ) -> bool:
-    """Match one picture and print what came of it; whether there was a fix.
-
-    Args:
-        image: the picture.
-        map_path: the map.
-        camera_path: the camera.
-        surface: a surface model, or None.
-        attitude: height above ground in m, heading, roll and pitch in degrees; None where unknown.
-        near: LAT,LON[,SIGMA_M], or None for the whole map.
-        method: "ncc", "sift" or "auto".
-        device: "cpu", "cuda" or "auto".
-        as_json: print JSON.
-    """
-    height_agl_m, heading_deg, roll_deg, pitch_deg = attitude
-    prior = parse_position("--near", near) if near is not None else None
-    frame = Frame(read_image(image), None, height_agl_m, heading_deg, roll_deg, pitch_deg)
-    matcher = SceneMatcher(OrthoMap.open(map_path, surface=surface), Camera.load(camera_path), method, device)
-    result = matcher.locate(frame, prior)
-    if isinstance(result, Fix):
-        facts = {
-            "status": "fix",
-            "lat_deg": result.lat_deg,
-            "lon_deg": result.lon_deg,
-            "east_m": result.east_m,
-            "north_m": result.north_m,
-            "up_m": result.up_m,
-            "sigma_m": result.sigma_m,
-            "score": result.score,
-            "method": result.method,
-            "map_xy_px": list(result.map_xy_px),
-        }
-    else:
-        facts = {
-            "status": "no_fix",
-            "reason": result.reason.value,
-            "detail": result.detail,
-            "score": result.score,
-            "method": result.method,
-        }
+    """Match one picture and print what came of it; whether there was a fix."""
+    check_choice("--method", method, METHODS)
+    devices.resolve(device)
+    prior = parse_position("--near", known.near)
+    site, camera = OrthoMap.open(map_path, surface=surface), Camera.load(camera_path)
+    check_place("--near", prior, site, OptionError)
+    pixels = read_image(image)
+    camera.check_size(pixels.shape)
+    frame = Frame(pixels, None, known.height_agl_m, known.heading_deg, known.roll_deg, known.pitch_deg)
+    result = SceneMatcher(site, camera, method, device).locate(frame, prior)
+    facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms
-    if not as_json and isinstance(result, Fix):  # enough decimals to see a centimetre
-        facts |= {"lat_deg": f"{result.lat_deg:.8f}", "lon_deg": f"{result.lon_deg:.8f}"}
     console.facts(facts, as_json, title=str(image))
     return isinstance(result, Fix)
+
+
+def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:
+    facts = {
+        "status": "fix",
+        "lat_deg": fix.lat_deg,
+        "lon_deg": fix.lon_deg,
+        "east_m": fix.east_m,
+        "north_m": fix.north_m,
+        "up_m": fix.up_m,
+        "sigma_m": fix.sigma_m,
+        "score": fix.score,
+        "method": fix.method,
+        "map_xy_px": list(fix.map_xy_px),
+    }
+    if as_json:
+        facts["covariance_m2"] = fix.covariance_m2.tolist()
+        facts["attitude"] = None if fix.attitude is None else asdict(fix.attitude)
+    return facts
+
+
+def _no_fix_facts(refusal: NoFix) -> dict[str, Any]:
+    return {
+        "status": "no_fix",
+        "reason": refusal.reason.value,
+        "detail": refusal.detail,
+        "score": refusal.score,
+        "method": refusal.method,
+    }

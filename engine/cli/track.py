@@ -8,21 +8,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from engine import device as devices
 from engine.budget import Budget
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import parse_position, prepare_folder
-from engine.errors import TelemetryError
-from engine.formats.flight import Flight, open_flight
+from engine.cli.arguments import check_choice, check_folder, parse_budget, parse_position, prepare_folder
+from engine.cli.checks import check_needs, check_pictures, check_place
+from engine.errors import EngineError, OptionError, TelemetryError
+from engine.formats.flight import Flight, FlightFrame, open_flight
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
 from engine.formats.truth import read_truth
-from engine.matcher import MatcherOptions, SceneMatcher
+from engine.matcher import METHODS, PROFILES, MatcherOptions, SceneMatcher
 from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
-from engine.types import Truth
+from engine.types import Fix, NoFix, Prior, Truth
+
+FIGURES = ("path.png", "position.png", "height.png", "error.png")
+OWNED = ("track.csv", "summary.json", *FIGURES)
+"""The files of an output folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,66 +50,137 @@ class Inputs:
         return beside if beside.is_file() else None
 
 
-def run_track(
-    inputs: Inputs,
-    out: Path,
-    *,
-    method: str,
-    start: str | None = None,
-    device: str = "auto",
-    budget_ms: float | None = None,
-    profile: str = "engine",
-    force: bool = False,
-) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How a flight is followed, as the command line has it.
+
+    Raises:
+        OptionError: a name or a number is none of those that are expected.
+        DeviceError: the device is missing.
+    """
+
+    method: str
+    profile: str = "engine"
+    device: str = "auto"
+    start: str | None = None
+    budget_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("--method", self.method, METHODS)
+        check_choice("--profile", self.profile, PROFILES)
+        if (self.method, self.profile) == ("auto", "paper"):
+            raise OptionError("--method: expected ncc or sift with --profile paper, got 'auto'")
+        parse_position("--start", self.start)
+        parse_budget("--budget-ms", self.budget_ms)
+        devices.resolve(self.device)
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A flight whose every part was read and found to fit the others."""
+
+    site: OrthoMap
+    camera: Camera
+    flight: Flight
+    truth_path: Path | None
+    truth: list[Truth] | None
+
+
+def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = False) -> dict[str, Any]:
     """Follow a flight and write the output folder; returns the summary.
 
     Everything that can be wrong with the input is found before the output folder is made.
     """
+    check_folder(out, force)
+    start, budget = parse_position("--start", settings.start), parse_budget("--budget-ms", settings.budget_ms)
+    opened = _open(inputs, settings, start)
+    site, flight = opened.site, opened.flight
+    options = MatcherOptions(profile=settings.profile)
+    matcher = SceneMatcher(site, opened.camera, settings.method, settings.device, options)
+    matcher.warmup()
+    prepare_folder(out, force, OWNED)
+    navigator = Navigator(matcher, start, budget)
+    what = f"{settings.method}, {settings.profile} profile"
+    follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None)
+    ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
+    record = _record(inputs, settings, opened, str(matcher.device), ground)
+    # From the rows as they stand in the file, so that evaluate gives the same figures.
+    return conclude(out, read_track(out / "track.csv"), opened.truth, site, ground, record)
+
+
+def _open(inputs: Inputs, settings: Settings, start: Prior | None) -> _Opened:
+    """Read what a run needs, and refuse what does not belong together."""
     site = OrthoMap.open(inputs.map, surface=inputs.surface)
     camera = Camera.load(inputs.camera)
-    flight = open_flight(inputs.frames, inputs.telemetry, camera)
+    flight = open_flight(inputs.frames, inputs.telemetry)
     truth_path = inputs.find_truth()
     truth = read_truth(truth_path) if truth_path is not None else None
-    prior = parse_position("--start", start) if start is not None else None
-    budget = Budget(total_ms=budget_ms) if budget_ms is not None else None
-    matcher = SceneMatcher(site, camera, method, device, MatcherOptions(profile=profile))
-    prepare_folder(out, force)
+    check_needs(flight, settings.method, settings.profile)
+    check_place("--start", start, site, OptionError)
+    if start is None:
+        first = next((row.prior for row in flight.rows if row.prior is not None), None)
+        check_place(str(inputs.telemetry or inputs.frames), first, site, TelemetryError)
+    check_pictures(flight, camera)
     if flight.unused:
-        console.say(f"{flight.unused} pictures have no row in the telemetry and are left out")
-    matcher.warmup()
-    rows = follow(flight, Navigator(matcher, prior, budget), out / "track.csv", budget, f"{profile} {method}")
-    ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
-    settings = {
-        "map": str(inputs.map.resolve()),
-        "surface": str(inputs.surface.resolve()) if inputs.surface else None,
-        "truth": str(truth_path.resolve()) if truth_path else None,
-        "method": method,
-        "profile": profile,
-        "device": str(matcher.device),
-        "origin": {"lat_deg": site.frame.lat_deg, "lon_deg": site.frame.lon_deg},
+        console.say(f"frames without a row in the telemetry, left out: {flight.unused}")
+    return _Opened(site, camera, flight, truth_path, truth)
+
+
+def _record(inputs: Inputs, settings: Settings, opened: _Opened, device: str, ground: Ground) -> dict[str, Any]:
+    """What a run was made of, for summary.json."""
+
+    def absolute(path: Path | None) -> str | None:
+        return None if path is None else str(path.resolve())
+
+    return {
+        "map": absolute(inputs.map),
+        "surface": absolute(inputs.surface),
+        "camera": absolute(inputs.camera),
+        "frames": absolute(inputs.frames),
+        "telemetry": absolute(inputs.telemetry),
+        "truth": absolute(opened.truth_path),
+        "method": settings.method,
+        "profile": settings.profile,
+        "device": device,
+        "start": settings.start,
+        "budget_ms": settings.budget_ms,
+        "origin": {"lat_deg": opened.site.frame.lat_deg, "lon_deg": opened.site.frame.lon_deg},
         "ground_m": ground.ground_m,
         "ground_amsl_m": ground.ground_amsl_m,
     }
-    return conclude(out, rows, truth, site, ground, settings)
 
 
-def follow(flight: Flight, navigator: Navigator, path: Path, budget: Budget | None, what: str) -> list[TrackRow]:
-    """Every frame through the navigator, each row on disk as soon as it is known."""
-    rows = []
-    started = False
+def follow(
+    flight: Flight, navigator: Navigator, path: Path, budget: Budget | None, what: str, *, use_priors: bool
+) -> None:
+    """Every frame through the navigator, each row on disk as soon as it is known.
+
+    Args:
+        flight: the frames.
+        navigator: fresh.
+        path: of track.csv.
+        budget: of each frame.
+        what: for the progress bar.
+        use_priors: whether the flight may begin at the telemetry's position; once it has begun, the fixes
+            carry on.
+    """
     with TrackWriter(path) as writer:
         for item in console.progress(flight, len(flight), what):
-            # Only where the flight begins is the telemetry's position used: afterwards the fixes carry on.
-            prior = None if started else item.prior
+            prior = item.prior if use_priors else None
             begin = time.perf_counter()
-            result = navigator.update(item.frame, prior)
+            result = _update(navigator, item, prior)
             latency_ms = (time.perf_counter() - begin) * 1e3
-            started = started or navigator.tracking
+            use_priors = use_priors and not navigator.tracking
             met = None if budget is None else latency_ms <= budget.total_ms
-            row = track_row(item.name, result, latency_ms=latency_ms, deadline_met=met)
-            writer.write(row)
-            rows.append(row)
-    return rows
+            writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
+
+
+def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:
+    """The frame's result; an error in the middle of a flight names its frame, and is no wrong usage."""
+    try:
+        return navigator.update(item.frame, prior)
+    except EngineError as error:
+        raise TelemetryError(f"frame {item.name}: {error}") from error
 
 
 def conclude(
@@ -112,12 +189,16 @@ def conclude(
     truth: list[Truth] | None,
     site: OrthoMap,
     ground: Ground,
-    settings: dict[str, Any],
+    record: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write summary.json and the figures."""
-    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": settings}
+    """Write summary.json and the figures, in place of older ones."""
+    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record}
+    if summary.get("scored_fixes") == 0 and summary["fixes"]:
+        console.say(f"no fix is scored: {record['truth']} says nothing of the times of this flight")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    title = f"{settings['method']} ({settings['profile']} profile)"
+    for name in FIGURES:
+        (out / name).unlink(missing_ok=True)
+    title = f"{record['method']} ({record['profile']} profile)"
     draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
     return summary
 
@@ -129,15 +210,28 @@ def run_evaluate(directory: Path, truth_path: Path | None) -> dict[str, Any]:
         TelemetryError: the folder holds no finished track, or no truth is known.
     """
     rows = read_track(directory / "track.csv")
-    try:
-        settings = json.loads((directory / "summary.json").read_text(encoding="utf-8"))["settings"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise TelemetryError(f"{directory}: expected a summary.json that track wrote, found none") from None
+    record = _read_record(directory / "summary.json")
     if truth_path is None:
-        if settings.get("truth") is None:
+        if record["truth"] is None:
             raise TelemetryError(f"{directory}: the track was made without truth; name one with --truth")
-        truth_path = Path(settings["truth"])
+        truth_path = Path(record["truth"])
     truth = read_truth(truth_path)
-    site = OrthoMap.open(settings["map"], surface=settings["surface"])
-    ground = Ground(settings["ground_m"], settings["ground_amsl_m"])
-    return conclude(directory, rows, truth, site, ground, settings | {"truth": str(truth_path.resolve())})
+    site = OrthoMap.open(record["map"], surface=record["surface"])
+    ground = Ground(record["ground_m"], record["ground_amsl_m"])
+    return conclude(directory, rows, truth, site, ground, record | {"truth": str(truth_path.resolve())})
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """The settings in a summary.json.
+
+    Raises:
+        TelemetryError: the file is missing, or is not one that track wrote.
+    """
+    needed = ("map", "surface", "truth", "method", "profile", "ground_m", "ground_amsl_m")
+    try:
+        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        return {name: record[name] for name in needed} | record
+    except FileNotFoundError:
+        raise TelemetryError(f"{path}: expected the summary of a finished track, got no such file") from None
+    except (OSError, ValueError, KeyError, TypeError):
+        raise TelemetryError(f"{path}: expected the summary that track writes, got something else") from None

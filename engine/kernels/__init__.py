@@ -7,11 +7,34 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from engine.kernels import eager
+from engine.kernels import eager, masked
+from engine.kernels.local import LocalScores
 
-__all__ = ["ncc_surface"]
+__all__ = ["LocalScores", "halved", "integrals", "masked_ncc_surface", "ncc_surface", "prepared_surface"]
 
 
 def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
     """NCC of checked input: (B, H, W) and (B, T, h, w) of one floating dtype to (B, T, H-h+1, W-w+1)."""
     return eager.ncc_surface(search, templates, zero_mean=zero_mean)
+
+
+def masked_ncc_surface(
+    search: Tensor, search_valid: Tensor, templates: Tensor, templates_valid: Tensor, *, min_overlap: float
+) -> Tensor:
+    """Zero-mean NCC over the pixels that are valid in both, same shapes as :func:`ncc_surface`."""
+    return masked.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
+
+
+def integrals(image: Tensor) -> Tensor:
+    """Running sums (2, H+1, W+1) of a picture (H, W) and of its square, float64."""
+    return eager.integrals(image)
+
+
+def prepared_surface(image: Tensor, sums: Tensor, templates: Tensor) -> Tensor:
+    """Zero-mean NCC of (T, h, w) zero-mean float32 templates with a picture whose running sums are known."""
+    return eager.prepared_surface(image, sums, templates)
+
+
+def halved(image: Tensor) -> Tensor:
+    """Means of 2 x 2 pixels of (H, W) float32; an odd last row or column is left out."""
+    return eager.halved(image)

@@ -33,10 +33,10 @@ def locate(query: Query, method: str) -> Fix | NoFix:
     heading = query.frame.heading_deg
     if method == "ncc" and heading is None:
         return query.refuse(Reason.NO_HEADING, "NCC needs the heading", method)
-    jacobian = query.jacobian()
+    jacobian = query.jacobian
     scale = height / (query.camera.focal_px * query.site.gsd_m_per_px)  # eq. 2
     extent = (scale * query.camera.width_px, scale * query.camera.height_px)
-    nadir = query.prior_px()
+    nadir = query.prior_px
     center = np.zeros(2) if nadir is None else nadir
     window = query.window(center, extent, (1.0, 1.0), margin=MARGIN)
     if window is None:
@@ -52,15 +52,15 @@ def locate(query: Query, method: str) -> Fix | NoFix:
 def _locate_ncc(
     query: Query, window: Window, search: NDArray[np.uint8], scale: float, alpha_deg: float
 ) -> Fix | NoFix:
+    height, width = query.gray.shape
+    side = int(FRACTION * scale * min(height, width))
+    if side < 8 or window.width_px < side or window.height_px < side:
+        return query.refuse(Reason.OUTSIDE_MAP, "the frame does not fit the window", "ncc", window=window)
     with query.watch.stage("align"):
-        height, width = query.gray.shape
-        side = int(FRACTION * scale * min(height, width))
         # getRotationMatrix2D turns anticlockwise; the frame's top points alpha clockwise of the map's top.
         turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -alpha_deg, scale)
         turn[:, 2] += (side - 1) / 2 - np.array([(width - 1) / 2, (height - 1) / 2])
         template = cv2.warpAffine(cv2.equalizeHist(query.gray), turn, (side, side))
-    if side < 8 or window.width_px < side or window.height_px < side:
-        return query.refuse(Reason.OUTSIDE_MAP, "the frame does not fit the window", "ncc", window=window)
     with query.watch.stage("match"):
         surface = cv2.matchTemplate(cv2.equalizeHist(search), template, cv2.TM_CCORR_NORMED)
         _, score, _, (x, y) = cv2.minMaxLoc(surface)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -65,6 +66,7 @@ class Query:
     device: torch.device
     watch: Stopwatch = field(repr=False)
 
+    @cached_property
     def prior_px(self) -> Array | None:
         """The prior's position in map pixels (x, y), or None where there is none."""
         prior = self.prior
@@ -76,9 +78,10 @@ class Query:
         assert prior.lon_deg is not None
         return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
 
+    @cached_property
     def jacobian(self) -> Array:
         """(2, 2) metres east and north per map pixel where the vehicle should be, else at the map's middle."""
-        place = self.prior_px()
+        place = self.prior_px
         if place is None:
             place = np.array([self.site.width_px - 1, self.site.height_px - 1]) / 2.0
         return self.site.enu_jacobian(place)
@@ -106,7 +109,7 @@ class Query:
         if prior is None:
             return Window(0, 0, self.site.width_px, self.site.height_px)
         moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
-        moved_px = np.abs(np.linalg.solve(self.jacobian(), moved_m))
+        moved_px = np.abs(np.linalg.solve(self.jacobian, moved_m))
         size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
         slack = 2.0 * spread_sigmas * prior.sigma_m / self.site.gsd_m_per_px
         width, height = (max(a, b + slack) for a, b in zip(size, least_px, strict=True))

@@ -73,8 +73,8 @@ def locate(query: Query, options: SiftOptions) -> Fix | NoFix:
     watch = query.watch
     with watch.stage("window"):
         window = _window(query, options)
-    if window is None:
-        return query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
+    if isinstance(window, NoFix):
+        return window
     with watch.stage("frame features"):
         frame_features, frame_scale = _frame_features(query, options)
     with watch.stage("map features"):
@@ -98,19 +98,21 @@ def locate(query: Query, options: SiftOptions) -> Fix | NoFix:
     return _fix(query, stats, window, options)
 
 
-def _window(query: Query, options: SiftOptions) -> Window | None:
+def _window(query: Query, options: SiftOptions) -> Window | NoFix:
     """The adaptive window (eq. 4, 5); the whole map where position or height is unknown."""
-    frame, nadir = query.frame, query.prior_px()
+    frame, nadir = query.frame, query.prior_px
     if nadir is None or frame.height_agl_m is None:
         return Window(0, 0, query.site.width_px, query.site.height_px)
     attitude = frame.attitude or Attitude(0.0, 0.0, 0.0)
-    view = view_of(query.camera, attitude, frame.height_agl_m, query.jacobian())
+    view = view_of(query.camera, attitude, frame.height_agl_m, query.jacobian)
     if view is None:
-        return None
+        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
+        return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", METHOD)
     width, height = view.footprint_px
     if frame.heading_deg is None:  # at any heading the footprint fits the square of its diagonal
         width = height = math.hypot(width, height)
-    return query.window(nadir + view.center_px, (width, height), (width, height), margin=options.margin)
+    window = query.window(nadir + view.center_px, (width, height), (width, height), margin=options.margin)
+    return window or query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
 
 
 def _frame_features(query: Query, options: SiftOptions) -> tuple[Features, tuple[float, float]]:

@@ -1,8 +1,8 @@
 """A town that does not exist: streets, houses, parks and fields from one seed, with its map and surface model.
 
 Convention:
-    Town coordinates (u, v) are metres from the town's centre along and across its main streets, turned against
-    the raster so that nothing is aligned with pixels. Everything is drawn twice as fine as the map.
+    Town coordinates (u, v) are those of :mod:`engine.sim.canvas`; a block is its centre and its sides du, dv.
+    Everything is drawn twice as fine as the map.
 """
 
 from __future__ import annotations
@@ -17,15 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.sim.canvas import (
+    ASPHALT,
+    CROP,
+    GRASS,
+    PAVING,
+    WATER,
+    Canvas,
+    Colour,
+    building,
+    grove,
+    tree,
+)
 from engine.sim.render import (
     LIGHTS,
     Array,
     Float32,
     Image,
-    Light,
     Sensor,
     World,
-    box_sides,
     illuminate,
     light_by_name,
     transformer,
@@ -42,24 +52,6 @@ MAP_SENSOR = Sensor(
     gamma=0.92, balance_rgb=(0.97, 0.94, 0.88), haze=8.0, vignette=0.0, exposure_sd=0.0, blur_px=0.55, noise_sd=2.2
 )
 """The camera of the map's survey: warmer and softer than the drone's."""
-
-Colour = tuple[float, float, float]
-GRASS, ASPHALT, PAVING, ROOF, CROP, WATER, CANOPY = range(7)
-_MATERIALS: tuple[tuple[float, float, float], ...] = (
-    # strength of texture at 0.3 m, 1.5 m and 12 m, as a share of the colour
-    (0.10, 0.11, 0.13),
-    (0.045, 0.05, 0.08),
-    (0.07, 0.06, 0.05),
-    (0.06, 0.06, 0.05),
-    (0.08, 0.09, 0.09),
-    (0.02, 0.03, 0.07),
-    (0.16, 0.14, 0.05),
-)
-_ROOFS: tuple[Colour, ...] = (
-    (150, 78, 58), (168, 92, 66), (128, 70, 58), (112, 84, 72), (96, 92, 92), (84, 88, 98), (142, 112, 88),
-)  # fmt: skip
-_FLATS: tuple[Colour, ...] = ((158, 156, 150), (128, 127, 124), (104, 103, 104), (176, 170, 158), (138, 128, 118))
-_WALLS: tuple[Colour, ...] = ((212, 204, 186), (196, 178, 148), (186, 186, 184), (176, 140, 116), (206, 192, 160))
 _CARS: tuple[Colour, ...] = (
     (236, 236, 236), (40, 42, 46), (150, 154, 158), (132, 44, 44), (58, 72, 104), (206, 206, 200), (90, 92, 96),
 )  # fmt: skip
@@ -86,196 +78,7 @@ class Town:
     world: World
 
 
-class _Canvas:
-    """Colour, height, walls, materials and occupied ground of a town while it is drawn."""
-
-    def __init__(self, rng: np.random.Generator, size: tuple[int, int], gsd: float, light: Light) -> None:
-        self.rng, self.gsd, self.light = rng, gsd, light
-        self.shape = size
-        self.rgb: Image = np.full((*size, 3), (104, 116, 74), np.uint8)
-        self.sides: Image = np.zeros((*size, 4), np.uint8)
-        self.height: Float32 = np.zeros(size, np.float32)
-        self.material: Image = np.full(size, GRASS, np.uint8)
-        self.busy: Image = np.zeros(size, np.uint8)
-        turn = math.radians(rng.uniform(11.0, 27.0))
-        self.turn: Array = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-        self.centre: Array = np.array([(size[1] - 1) / 2.0, (size[0] - 1) / 2.0])
-        self.reach_m = gsd * math.hypot(*size) / 2.0 + 5.0
-
-    def px(self, uv: Array) -> Array:
-        """Raster pixels (N, 2) of town coordinates (N, 2)."""
-        return self.centre + uv @ self.turn.T / self.gsd
-
-    def corners(self, u: float, v: float, length: float, width: float, angle: float = 0.0) -> Array:
-        """Town coordinates (4, 2) of a rectangle's corners; the angle is in radians from the u axis."""
-        c, s = math.cos(angle) / 2.0, math.sin(angle) / 2.0
-        along, across = np.array([c, s]) * length, np.array([-s, c]) * width
-        uv: Array = np.array([u, v]) + np.array([-along - across, along - across, along + across, across - along])
-        return uv
-
-    def fill(self, uv: Array, rgb: Colour, material: int | None = None, busy: bool = False) -> None:
-        """Paint a polygon of town coordinates."""
-        points = np.rint(self.px(uv) * 16.0).astype(np.int32)
-        cv2.fillPoly(self.rgb, [points], rgb, cv2.LINE_AA, 4)
-        if material is not None:
-            cv2.fillPoly(self.material, [points], (material,), cv2.LINE_8, 4)
-        if busy:
-            cv2.fillPoly(self.busy, [points], (255,), cv2.LINE_8, 4)
-
-    def rect(
-        self,
-        u: float,
-        v: float,
-        length: float,
-        width: float,
-        rgb: Colour,
-        angle: float = 0.0,
-        material: int | None = None,
-    ) -> None:
-        """Paint a rectangle."""
-        self.fill(self.corners(u, v, length, width, angle), rgb, material)
-
-    def tint(self, rgb: Colour, spread: float = 9.0) -> Colour:
-        """A colour near the given one."""
-        r, g, b = (float(np.clip(c, 12, 244)) for c in np.array(rgb) + self.rng.normal(0, spread, 3) * 0.25
-                   + self.rng.normal(0, spread))  # fmt: skip
-        return r, g, b
-
-    def pick(self, colours: tuple[Colour, ...]) -> Colour:
-        """One of the colours, varied a little."""
-        return self.tint(colours[int(self.rng.integers(len(colours)))])
-
-    def patch(self, u: float, v: float, radius_m: float) -> tuple[tuple[slice, slice], Array, Array] | None:
-        """Raster window about a place, with town offsets (u, v) of its pixels; None where it is cut off."""
-        x, y = np.rint(self.px(np.array([[u, v]]))[0]).astype(int)
-        r = math.ceil(radius_m / self.gsd) + 1
-        if x < r or y < r or x + r >= self.shape[1] or y + r >= self.shape[0]:
-            return None
-        window = (slice(y - r, y + r + 1), slice(x - r, x + r + 1))
-        exact = (np.mgrid[window].reshape(2, -1)[::-1].T - self.centre) * self.gsd @ self.turn - (u, v)
-        return window, exact[:, 0].reshape(2 * r + 1, -1), exact[:, 1].reshape(2 * r + 1, -1)
-
-    def texture(self) -> None:
-        """Grain the painted colours by material, at three scales."""
-        gain = np.ones(self.shape, np.float32)
-        for scale, cell_m in enumerate((self.gsd, 1.5, 12.0)):
-            cells = [max(2, math.ceil(n * self.gsd / cell_m)) for n in self.shape]
-            noise = cv2.resize(
-                self.rng.standard_normal(cells, np.float32), self.shape[::-1], interpolation=cv2.INTER_CUBIC
-            )
-            strength = np.array([m[scale] for m in _MATERIALS], np.float32)
-            gain += strength[self.material] * noise
-        for channel in range(3):
-            self.rgb[..., channel] = np.clip(self.rgb[..., channel] * gain, 0, 255)
-
-
-def _building(
-    canvas: _Canvas, u: float, v: float, length: float, width: float, eave: float, kind: str, angle: float = 0.0
-) -> bool:
-    """Put up a building where the ground is free; ``kind`` is "gable", "hip" or "flat"."""
-    found = canvas.patch(u, v, math.hypot(length, width) / 2 + 1.0)
-    if found is None:
-        return False
-    window, du, dv = found
-    a, b = du * math.cos(angle) + dv * math.sin(angle), dv * math.cos(angle) - du * math.sin(angle)
-    gap_a, gap_b = length / 2 - np.abs(a), width / 2 - np.abs(b)
-    inside = (gap_a > 0) & (gap_b > 0)
-    if canvas.busy[window][inside].any():
-        return False
-    canvas.busy[window][(gap_a > -1.2) & (gap_b > -1.2)] = 255
-    canvas.material[window][inside] = ROOF
-    draw = _flat_roof if kind == "flat" else _pitched_roof
-    rgb, rise = draw(canvas, a, b, np.minimum(gap_a, gap_b) if kind != "gable" else gap_b, length, width)
-    canvas.rgb[window][inside] = np.clip(rgb[inside], 0, 255)
-    canvas.height[window][inside] = (eave + rise)[inside]
-    canvas.sides[window][inside] = box_sides(
-        (a, b),
-        (length, width),
-        canvas.turn @ (math.cos(angle), math.sin(angle)),
-        canvas.pick(_WALLS),
-        canvas.light,
-    )[inside]
-    return True
-
-
-def _pitched_roof(
-    canvas: _Canvas, a: Array, b: Array, gap: Array, length: float, width: float
-) -> tuple[Array, Array]:
-    """Tiles in rows, a light ridge, skylights, a chimney: colours and rise above the eave."""
-    rng = canvas.rng
-    slope = rng.uniform(0.45, 0.8)
-    rise = np.maximum(gap, 0.0) * slope
-    rgb = np.array(canvas.pick(_ROOFS)) * (1.0 + 0.05 * np.sign(np.sin(b * 2 * math.pi / 1.1)))[..., None]
-    rgb[gap > width / 2 - 0.3] *= 1.25
-    for _ in range(int(rng.integers(0, 2 + int(length / 7)))):
-        at_a, at_b = rng.uniform(-0.42, 0.42) * length, rng.choice([-1, 1]) * rng.uniform(0.14, 0.34) * width
-        light = (np.abs(a - at_a) < 0.55) & (np.abs(b - at_b) < 0.75)
-        rgb[light] = (70, 84, 104) if rng.random() < 0.6 else (196, 204, 210)
-    if rng.random() < 0.3:
-        panels = (np.abs(a - rng.uniform(-0.2, 0.2) * length) < length * 0.2) & (b > 0.8) & (b < width * 0.4)
-        rgb[panels] = (36, 44, 70)
-    chimney = (np.abs(a - rng.uniform(-0.3, 0.3) * length) < 0.5) & (np.abs(b - 0.12 * width) < 0.5)
-    rgb[chimney] = (92, 74, 66)
-    return rgb, rise + 1.3 * chimney
-
-
-def _flat_roof(
-    canvas: _Canvas, a: Array, b: Array, gap: Array, length: float, width: float
-) -> tuple[Array, Array]:
-    """A parapet, sheets of roofing, machines, skylights in rows: colours and rise above the roof."""
-    rng = canvas.rng
-    base = np.array(canvas.pick(_FLATS))
-    rgb = np.broadcast_to(base, (*a.shape, 3)).copy()
-    cut_a, cut_b = rng.uniform(-0.35, 0.35) * length, rng.uniform(-0.35, 0.35) * width
-    rgb[(a > cut_a) & (b > cut_b)] *= rng.uniform(0.72, 0.92)
-    rgb[(a < cut_a) & (b < cut_b)] *= rng.uniform(0.9, 1.12)
-    rgb *= (1.0 - 0.06 * (np.mod(a, 3.0) < 0.3))[..., None]
-    rise = np.where(gap < 0.45, 0.5, 0.0)
-    rgb[gap < 0.45] = np.minimum(base * 1.22, 235)
-    if length * width > 260 and rng.random() < 0.6:
-        row = (np.mod(a, 5.5) < 1.7) & (np.abs(b - rng.uniform(-0.2, 0.2) * width) < 1.1) & (gap > 2.5)
-        rgb[row] = (188, 198, 206)
-    for _ in range(int(rng.integers(1, 4 + int(length * width / 160)))):
-        at_a, at_b = rng.uniform(-0.4, 0.4) * length, rng.uniform(-0.36, 0.36) * width
-        half_a, half_b = rng.uniform(0.6, 2.0), rng.uniform(0.6, 1.5)
-        box = (np.abs(a - at_a) < half_a) & (np.abs(b - at_b) < half_b) & (gap > 0.8)
-        rgb[box] = canvas.tint((178, 178, 176), 22)
-        rise[box] = rng.uniform(1.0, 2.6)
-    return rgb, rise
-
-
-def _tree(canvas: _Canvas, u: float, v: float, radius: float) -> None:
-    """A crown, where neither road nor house stands."""
-    found = canvas.patch(u, v, radius)
-    if found is None:
-        return
-    window, du, dv = found
-    centre = du.shape[0] // 2
-    if canvas.busy[window][centre, centre]:
-        return
-    ripple = 1.0 + 0.13 * np.sin(5 * np.arctan2(dv, du) + u) + 0.09 * np.sin(9 * np.arctan2(dv, du) + v)
-    share = 1.0 - (du**2 + dv**2) / (radius * ripple) ** 2
-    top = radius * canvas.rng.uniform(1.7, 2.3)
-    crown = top * (0.4 + 0.6 * np.sqrt(np.maximum(share, 0.0)))
-    crown += canvas.rng.uniform(-0.5, 0.5, crown.shape)
-    inside = (share > 0) & (crown > canvas.height[window]) & (canvas.material[window] != ROOF)
-    green = np.array(canvas.tint((68, 88, 44), 13))
-    canvas.rgb[window][inside] = np.clip(green, 10, 200)
-    canvas.height[window][inside] = crown[inside]
-    canvas.material[window][inside] = CANOPY
-    canvas.sides[window][inside] = (*(green * 0.5).astype(int), 0)
-
-
-def _grove(
-    canvas: _Canvas, u: float, v: float, du: float, dv: float, per_m2: float, radius: tuple[float, float]
-) -> None:
-    """Trees anywhere in a block."""
-    rng = canvas.rng
-    for _ in range(int(du * dv / per_m2)):
-        _tree(canvas, u + rng.uniform(-0.5, 0.5) * du, v + rng.uniform(-0.5, 0.5) * dv, rng.uniform(*radius))
-
-
-def _streets(canvas: _Canvas) -> tuple[list[float], list[float], list[tuple[Array, float]]]:
+def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array, float]]]:
     """Draw the streets: edges of the blocks along u and v, and every street as (centre line, width)."""
     rng, reach = canvas.rng, canvas.reach_m
     edges: list[list[float]] = []
@@ -318,17 +121,11 @@ def _stations(line: Array, pitch_m: float) -> list[tuple[float, float, float]]:
     return list(zip(u.tolist(), v.tolist(), angle.tolist(), strict=True))
 
 
-def _at(canvas: _Canvas, raster: NDArray[np.generic], u: float, v: float) -> float:
-    """The raster's value at a place, -1 outside."""
-    x, y = np.rint(canvas.px(np.array([[u, v]]))[0]).astype(int)
-    return float(raster[y, x]) if 0 <= x < raster.shape[1] and 0 <= y < raster.shape[0] else -1.0
-
-
-def _markings(canvas: _Canvas, line: Array, width: float, crossings: Image) -> None:
+def _markings(canvas: Canvas, line: Array, width: float, crossings: Image) -> None:
     """A dashed centre line, zebra crossings where streets meet, and patches of newer asphalt."""
     white, last = (214, 214, 208), 1.0
     for u, v, angle in _stations(line, 3.0):
-        count = _at(canvas, crossings, u, v)
+        count = canvas.value(crossings, u, v)
         along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
         if count == 1 and round((u * along[0] + v * along[1]) / 3.0) % 2:
             canvas.rect(u, v, 3.0, 0.22, white, angle)
@@ -342,7 +139,7 @@ def _markings(canvas: _Canvas, line: Array, width: float, crossings: Image) -> N
         last = count
 
 
-def _houses(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _houses(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """Detached houses with paths, sheds and trees."""
     rng = canvas.rng
     for row, turn in ((-dv / 2 + 10.5, 1), (dv / 2 - 10.5, -1)):
@@ -362,16 +159,16 @@ def _houses(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
                 str(rng.choice(["gable", "hip", "gable"])),
                 rng.choice([0, math.pi / 2]) + rng.normal(0, 0.05),
             )
-            _building(
+            building(
                 canvas, u + at, v + row + rng.uniform(-1.5, 1.5), length, width, rng.uniform(5, 8), kind, angle
             )
             if rng.random() < 0.7:
-                _building(canvas, u + at + rng.uniform(-5, 5), v + row + turn * 12, 5.5, 3.5, 2.4, "flat")
+                building(canvas, u + at + rng.uniform(-5, 5), v + row + turn * 12, 5.5, 3.5, 2.4, "flat")
             at += rng.uniform(15.5, 20)
-    _grove(canvas, u, v, du, dv, 170, (1.2, 3.4))
+    grove(canvas, u, v, du, dv, 170, (1.2, 3.4))
 
 
-def _bars(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _bars(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """Blocks of flats, 12 to 25 m high, on lawns with paths."""
     rng = canvas.rng
     for _ in range(2):
@@ -380,11 +177,11 @@ def _bars(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
         )
     for at in np.arange(-du / 2 + 14, du / 2 - 8, rng.uniform(25, 31)):
         length = (dv - 9) * rng.uniform(0.5, 0.95)
-        _building(canvas, u + at, v, rng.uniform(11, 15), length, rng.uniform(12, 25), "flat", rng.normal(0, 0.03))
-    _grove(canvas, u, v, du, dv, 130, (1.8, 4.2))
+        building(canvas, u + at, v, rng.uniform(11, 15), length, rng.uniform(12, 25), "flat", rng.normal(0, 0.03))
+    grove(canvas, u, v, du, dv, 130, (1.8, 4.2))
 
 
-def _perimeter(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _perimeter(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """Old town houses wall to wall around a court."""
     rng = canvas.rng
     canvas.rect(u, v, du - 6, dv - 6, canvas.tint((150, 142, 130)), material=PAVING)
@@ -397,23 +194,23 @@ def _perimeter(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> Non
                 uv = (u + place[0], v + place[1]) if not turn else (u + place[1], v + place[0])
                 kind = "flat" if rng.random() < 0.2 else "gable"
                 # Neighbours share a wall: the gap that keeps houses apart is a metre and a half of alley here.
-                _building(canvas, *uv, length - 1.3, rng.uniform(11, 13), rng.uniform(9, 17), kind, turn)
+                building(canvas, *uv, length - 1.3, rng.uniform(11, 13), rng.uniform(9, 17), kind, turn)
                 at += length
-    _grove(canvas, u, v, 0.6 * du, 0.6 * dv, 160, (1.5, 3.5))
+    grove(canvas, u, v, 0.6 * du, 0.6 * dv, 160, (1.5, 3.5))
 
 
-def _commerce(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _commerce(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """A hall with a car park: bays in white."""
     rng = canvas.rng
     canvas.rect(u, v, du, dv, canvas.tint((112, 112, 114), 7), material=ASPHALT)
     for row in np.arange(-dv / 2 + 6, dv / 2 - 4, 15.0):
         for at in np.arange(-du / 2 + 3, du * 0.1, 2.7):
             canvas.rect(u + at, v + row, 0.2, 5.0, (206, 206, 202))
-    _building(canvas, u + du * 0.28, v, du * 0.38, dv - 8, rng.uniform(6, 11), "flat")
-    _building(canvas, u - du * 0.2, v + dv * 0.32, du * 0.3, dv * 0.22, rng.uniform(5, 8), "flat")
+    building(canvas, u + du * 0.28, v, du * 0.38, dv - 8, rng.uniform(6, 11), "flat")
+    building(canvas, u - du * 0.2, v + dv * 0.32, du * 0.3, dv * 0.22, rng.uniform(5, 8), "flat")
 
 
-def _park(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _park(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """Lawns, winding paths, a pond, trees."""
     rng = canvas.rng
     canvas.rect(u, v, du + 2, dv + 2, canvas.tint((100, 120, 66), 8), material=GRASS)
@@ -429,10 +226,10 @@ def _park(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
     radius = dv * 0.19 * (1 + 0.2 * np.sin(2 * around + rng.uniform(0, 6)) + 0.1 * np.sin(5 * around))
     shore = np.column_stack([u + du * 0.2 + 1.5 * radius * np.cos(around), v + radius * np.sin(around)])
     canvas.fill(shore, (62, 82, 84), WATER, busy=True)
-    _grove(canvas, u, v, du, dv, 75, (1.5, 5.0))
+    grove(canvas, u, v, du, dv, 75, (1.5, 5.0))
 
 
-def _fields(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _fields(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """Allotments: strips of different crops in rows."""
     rng, at = canvas.rng, -du / 2
     while at < du / 2 - 4:
@@ -445,11 +242,11 @@ def _fields(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
             dark = (colour[0] * 0.8, colour[1] * 0.82, colour[2] * 0.8)
             canvas.rect(u + row, v + rng.uniform(-1, 1), 0.6, dv * rng.uniform(0.86, 1.0), dark)
         if rng.random() < 0.5:
-            _building(canvas, u + at + wide / 2, v + rng.uniform(-0.4, 0.4) * dv, 5.0, 4.0, 2.8, "gable")
+            building(canvas, u + at + wide / 2, v + rng.uniform(-0.4, 0.4) * dv, 5.0, 4.0, 2.8, "gable")
         at += wide
 
 
-def _square(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _square(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """An open square: paving in a pattern, a fountain, a tower, rows of trees."""
     rng = canvas.rng
     canvas.rect(u, v, du, dv, (176, 166, 150), material=PAVING)
@@ -459,13 +256,13 @@ def _square(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
     ring = np.linspace(0, 2 * math.pi, 40)
     for radius, colour in ((8.0, (132, 116, 104)), (6.0, (204, 198, 186)), (5.0, (74, 108, 118))):
         canvas.fill(np.column_stack([u - du * 0.15 + radius * np.cos(ring), v + radius * np.sin(ring)]), colour)
-    _building(canvas, u + du * 0.3, v + dv * 0.1, 9, 9, 25.0, "hip")
-    _building(canvas, u + du * 0.3, v - dv * 0.25, 24, 13, 12.0, "gable")
+    building(canvas, u + du * 0.3, v + dv * 0.1, 9, 9, 25.0, "hip")
+    building(canvas, u + du * 0.3, v - dv * 0.25, 24, 13, 12.0, "gable")
     for at in np.arange(-0.44, 0.45, 0.09):
-        _tree(canvas, u + at * du, v + dv * 0.44, rng.uniform(2.2, 2.8))
+        tree(canvas, u + at * du, v + dv * 0.44, rng.uniform(2.2, 2.8))
 
 
-def _pitch(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
+def _pitch(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     """A football pitch, a hard court and a gymnasium."""
     long, wide = du * 0.62, dv * 0.74
     u0 = u - du * 0.14
@@ -480,14 +277,14 @@ def _pitch(canvas: _Canvas, u: float, v: float, du: float, dv: float) -> None:
     for x, y, dx, dy in lines:
         canvas.rect(u0 + x * long, v + y * wide, dx * long + 0.3, dy * wide + 0.3, (228, 230, 224))
     canvas.rect(u + du * 0.36, v - dv * 0.24, du * 0.2, dv * 0.4, (52, 98, 122), material=PAVING)
-    _building(canvas, u + du * 0.36, v + dv * 0.25, du * 0.2, dv * 0.36, 9.0, "flat")
+    building(canvas, u + du * 0.36, v + dv * 0.25, du * 0.2, dv * 0.36, 9.0, "flat")
 
 
 _KINDS = (_houses, _bars, _perimeter, _commerce, _park, _fields, _square, _pitch)
 _SHARES = np.array([0.31, 0.17, 0.22, 0.13, 0.09, 0.05, 0.01, 0.02])
 
 
-def _blocks(canvas: _Canvas, edges_u: list[float], edges_v: list[float]) -> None:
+def _blocks(canvas: Canvas, edges_u: list[float], edges_v: list[float]) -> None:
     """Fill the blocks between the streets; those near the centre hold one of the rarer kinds each."""
     rng, road, before = canvas.rng, canvas.busy > 0, (canvas.rgb.copy(), canvas.material.copy())
     cells = [
@@ -505,7 +302,7 @@ def _blocks(canvas: _Canvas, edges_u: list[float], edges_v: list[float]) -> None
     canvas.rgb[road], canvas.material[road] = before[0][road], before[1][road]
 
 
-def _park_cars(canvas: _Canvas, roads: list[tuple[Array, float]]) -> tuple[Image, Image]:
+def _park_cars(canvas: Canvas, roads: list[tuple[Array, float]]) -> tuple[Image, Image]:
     """Colours on the day of the map and on the day of the flight: a third of the cars have moved."""
     rng = canvas.rng
     slots = []
@@ -518,7 +315,7 @@ def _park_cars(canvas: _Canvas, roads: list[tuple[Array, float]]) -> tuple[Image
     for u, v, angle in slots:
         parked, stays, other = rng.random(), rng.random() < 0.67, rng.random()
         colour, angle = canvas.pick(_CARS), angle + rng.normal(0, 0.02)
-        if _at(canvas, canvas.height, u, v) != 0.0 or _at(canvas, canvas.material, u, v) != ASPHALT:
+        if canvas.value(canvas.height, u, v) != 0.0 or canvas.value(canvas.material, u, v) != ASPHALT:
             continue
         for rgb, there in zip(days, (parked < 0.3, (parked if stays else other) < 0.3), strict=True):
             if there:
@@ -580,7 +377,7 @@ def build_town(
     fine = max(1, round(gsd_m_per_px / 0.265))
     margin = math.ceil(MARGIN_M / gsd_m_per_px)
     size = ((height_px + 2 * margin) * fine, (width_px + 2 * margin) * fine)
-    canvas = _Canvas(rng, size, gsd_m_per_px / fine, flight_light)
+    canvas = Canvas(rng, size, gsd_m_per_px / fine, flight_light)
     edges_u, edges_v, roads = _streets(canvas)
     _blocks(canvas, edges_u, edges_v)
     canvas.texture()

@@ -1,0 +1,85 @@
+"""What can be wrong with a flight as a whole: found before a run begins and before its folder is made."""
+
+from __future__ import annotations
+
+import math
+
+from engine.camera import Camera
+from engine.cli import console
+from engine.errors import CalibrationError, OptionError, TelemetryError
+from engine.formats.flight import Flight
+from engine.formats.frames import PictureFolder
+from engine.orthomap import OrthoMap
+from engine.types import Prior
+
+
+def check_pictures(flight: Flight, camera: Camera) -> None:
+    """Every picture decodes and is of the camera's size; of a video only the first frame is looked at.
+
+    Raises:
+        TelemetryError: a picture is empty, truncated or none.
+        CalibrationError: a picture is of another size.
+    """
+    source = flight.source
+    if not isinstance(source, PictureFolder):
+        camera.check_size(source.read(flight.names[0]).shape)
+        return
+    for name in console.progress(flight.names, len(flight), "checking pictures"):
+        path = source.path / name
+        size = _decoded_size(str(path))
+        try:
+            camera.check_size((size[1], size[0]))
+        except CalibrationError as error:
+            raise CalibrationError(f"{path}: {error}") from None
+
+
+def _decoded_size(path: str) -> tuple[int, int]:
+    """Width and height; a JPEG is decoded at an eighth, of a PNG the checksums are read, others are decoded."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as picture:
+            size = picture.size
+            if picture.format == "PNG":
+                picture.verify()
+            else:
+                picture.draft("L", (1, 1))
+                picture.load()
+            return size
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = "it is no picture" if isinstance(error, UnidentifiedImageError) else str(error)
+        raise TelemetryError(f"{path}: expected a readable picture: {' '.join(reason.split())}") from None
+
+
+def check_needs(flight: Flight, method: str, profile: str) -> None:
+    """Refuse a method to which no frame gives what it needs.
+
+    Raises:
+        TelemetryError: every frame would be refused.
+    """
+    needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
+    needs += ["heading_deg"] if method == "ncc" else []
+    if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
+        other = "" if profile == "paper" else "; sift and auto do without"
+        asked = " and ".join(needs)
+        raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}")
+
+
+def check_place(name: str, place: Prior | None, site: OrthoMap, error: type[OptionError | TelemetryError]) -> None:
+    """Refuse a position in latitude and longitude that has nothing to do with the map.
+
+    Raises:
+        OptionError, TelemetryError: as asked; it lies further off than the map is large.
+    """
+    from pyproj import Geod
+
+    if place is None or place.lat_deg is None or place.lon_deg is None:
+        return
+    middle = site.frame
+    distance_m = Geod(ellps="WGS84").inv(middle.lon_deg, middle.lat_deg, place.lon_deg, place.lat_deg)[2]
+    extent_m = math.hypot(site.width_px, site.height_px) * site.gsd_m_per_px
+    if distance_m > extent_m + 3.0 * place.sigma_m:
+        raise error(
+            f"{name}: expected a place on the map {site.name}, got {place.lat_deg:g},{place.lon_deg:g}, "
+            f"{distance_m / 1000.0:,.1f} km from its middle ({middle.lat_deg:.5f},{middle.lon_deg:.5f})"
+        )

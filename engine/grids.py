@@ -1,0 +1,207 @@
+"""Where pixels lie on the Earth: coordinate systems, affine transforms, grids and the smooth maps between them.
+
+Convention:
+    ``pixel_to_crs`` is a (2, 3) affine matrix that takes pixels (x, y), centres at integers, to coordinates
+    (easting, northing) or (longitude, latitude).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import MapError
+from engine.geo import LocalFrame
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+Array = NDArray[np.float64]
+Function = Callable[[Array], Array]
+
+WARP_MARGIN = 0.5
+"""Fast transforms reach this share of the map's longer side beyond its edges; further out they are exact."""
+
+
+class Warp:
+    """A smooth map of the plane by polynomials that were checked against the exact function.
+
+    PROJ and the way from the tangent plane to the ellipsoid take a fraction of a millisecond a call. Over one
+    map both are so smooth that polynomials of degree 5 follow them to micrometres. Points outside ``box``, and
+    all points where the fit misses ``tolerance``, take the exact function.
+    """
+
+    def __init__(self, exact: Function, box: Array, tolerance: float) -> None:
+        self._exact = exact
+        self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
+        nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev's keep the error even
+        terms = (_powers(nodes[:, 0])[:, :, None] * _powers(nodes[:, 1])[:, None, :]).reshape(len(nodes), 36)
+        values = exact(self._centre + self._half * nodes)
+        self._coefficients: Array = np.zeros((6, 12))
+        self.fitted = bool(np.isfinite(values).all())
+        if self.fitted:
+            self._coefficients[:] = np.linalg.lstsq(terms, values, rcond=None)[0].reshape(6, 12)
+            check = _lattice(np.linspace(-1.0, 1.0, 17))
+            error = self._polynomial(check) - exact(self._centre + self._half * check)
+            self.fitted = bool(np.abs(error).max() <= tolerance)  # NaN compares as not fitted
+
+    def _polynomial(self, unit: Array) -> Array:
+        over_y = (_powers(unit[..., 0]) @ self._coefficients).reshape(*unit.shape[:-1], 6, 2)
+        return np.asarray((over_y * _powers(unit[..., 1])[..., None]).sum(axis=-2))
+
+    def __call__(self, points: Array) -> Array:
+        """The images (..., 2) of points (..., 2)."""
+        unit = (points - self._centre) / self._half
+        if self.fitted and (np.abs(unit) <= 1.0).all():
+            return self._polynomial(unit)
+        return self._exact(points)
+
+    def on_grid(self, x: Array, y: Array) -> Array:
+        """The images (len(y), len(x), 2) of all pairs of columns and rows."""
+        if not self.fitted:
+            return self._exact(np.stack(np.meshgrid(x, y), axis=-1))
+        in_x, in_y = (_powers((v - c) / h) for v, c, h in zip((x, y), self._centre, self._half, strict=True))
+        cubes = self._coefficients.reshape(6, 6, 2)
+        return np.stack([in_y @ cubes[..., k].T @ in_x.T for k in (0, 1)], axis=-1)
+
+
+def _powers(x: Array) -> Array:
+    powers = np.ones((*np.shape(x), 6))
+    for k in range(1, 6):  # products: ten times as fast as ** on some hundred points, a little slower on one
+        np.multiply(powers[..., k - 1], x, out=powers[..., k])
+    return powers
+
+
+def _lattice(x: Array) -> Array:
+    return np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+
+
+def apply_affine(matrix: Array, points: Array) -> Array:
+    """M (2, 3) on points (..., 2)."""
+    return np.asarray(points @ matrix[:, :2].T + matrix[:, 2])
+
+
+def invert_affine(matrix: Array) -> Array:
+    """The (2, 3) matrix that undoes another."""
+    linear = np.linalg.inv(matrix[:, :2])
+    return np.column_stack([linear, -linear @ matrix[:, 2]])
+
+
+def earth_crs(value: Any, argument: str) -> CRS:
+    """The horizontal part of whatever pyproj takes for a coordinate reference system of the Earth.
+
+    Raises:
+        MapError: it is none, or is not tied to the Earth.
+    """
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        crs = CRS.from_user_input(value)
+        crs = crs.sub_crs_list[0] if crs.is_compound else crs
+        if not (crs.is_geographic or crs.is_projected):
+            raise MapError(f"{argument}: expected a CRS on the Earth, got {crs.type_name} {crs.name!r}")
+        crs = crs.to_2d() if len(crs.axis_info) > 2 else crs
+        Transformer.from_crs(crs, 4326)
+    except ProjError as error:
+        reason = str(error).splitlines()[0]
+        raise MapError(f"{argument}: expected a coordinate reference system of the Earth: {reason}") from None
+    return crs
+
+
+def wgs84() -> CRS:
+    """Longitude and latitude in degrees on the ellipsoid of GNSS, EPSG:4326."""
+    from pyproj import CRS
+
+    return CRS.from_epsg(4326)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Pixels and where they lie.
+
+    Attributes:
+        width_px: columns.
+        height_px: rows.
+        pixel_to_crs: (2, 3), integer pixels are centres.
+        crs: what the coordinates mean.
+    """
+
+    width_px: int
+    height_px: int
+    pixel_to_crs: Array
+    crs: CRS
+
+    @property
+    def centre_px(self) -> Array:
+        """Middle of the picture."""
+        return np.array([(self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0])
+
+    def pixels_of(self, other: CRS) -> tuple[Function, Function]:
+        """Exact functions: coordinates (x, y) of another CRS from pixels, and pixels from those coordinates."""
+        from pyproj import Transformer
+
+        forward = Transformer.from_crs(self.crs, other, always_xy=True)
+        backward = Transformer.from_crs(other, self.crs, always_xy=True)
+        crs_to_pixel = invert_affine(self.pixel_to_crs)
+        centre_x = apply_affine(self.pixel_to_crs, self.centre_px)[0]
+
+        def there(pixels: Array) -> Array:
+            at = apply_affine(self.pixel_to_crs, pixels)
+            return np.asarray(np.stack(forward.transform(at[..., 0], at[..., 1]), axis=-1), np.float64)
+
+        def back(points: Array) -> Array:
+            x, y = backward.transform(points[..., 0], points[..., 1])
+            if self.crs.is_geographic:  # a map across the antimeridian counts on beyond 180 degrees
+                x = centre_x + (np.asarray(x) - centre_x + 180.0) % 360.0 - 180.0
+            return apply_affine(crs_to_pixel, np.stack([x, y], axis=-1))
+
+        return there, back
+
+    def box(self, margin: float = 0.0) -> Array:
+        """Corners (2, 2), low and high, of the outer edges widened by a share of the longer side."""
+        grow = 0.5 + margin * max(self.width_px, self.height_px)
+        return np.array([[-grow, -grow], [self.width_px - 1 + grow, self.height_px - 1 + grow]])
+
+    def lattice(self, count: int = 33) -> Array:
+        """Points (count ** 2, 2) spread over the picture, its outer edges included."""
+        low, high = self.box()
+        unit = _lattice(np.linspace(-1.0, 1.0, count))
+        return np.asarray((low + high) / 2.0 + (high - low) / 2.0 * unit)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether it can serve as a map as it is: projected, rows to the north, square on the ground to 1 %."""
+        linear = self.pixel_to_crs[:, :2]
+        step = np.abs(linear).max()
+        upright = linear[0, 0] > 0 and linear[1, 1] < 0 and abs(linear[[0, 1], [1, 0]]).max() < 1e-3 * step
+        if self.crs.is_geographic or not upright:
+            return False
+        lon, lat = np.moveaxis(
+            self.pixels_of(wgs84())[0](self.centre_px + np.array([[0, 0], [1, 0], [0, 1]])), -1, 0
+        )
+        with np.errstate(invalid="ignore"):
+            steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
+        return bool(steps_m.max() <= 1.01 * steps_m.min())
+
+
+def warp_between(grid: Grid, other: Grid) -> Warp:
+    """Pixels of another grid from pixels of a grid, to a hundredth of a pixel."""
+    to_crs = grid.pixels_of(other.crs)[0]
+    to_pixel = invert_affine(other.pixel_to_crs)
+    return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
+
+
+def overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First pixel (x, y), and the one past the last, of another grid under a grid, widened by two."""
+    points = warp_between(grid, other)(grid.lattice())
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        return np.zeros(2, np.intp), np.zeros(2, np.intp)
+    limit = np.array([other.width_px, other.height_px])
+    low = np.clip(np.floor(points.min(axis=0)) - 2, 0, limit).astype(np.intp)
+    return low, np.clip(np.ceil(points.max(axis=0)) + 3, 0, limit).astype(np.intp)

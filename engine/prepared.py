@@ -1,0 +1,123 @@
+"""The map as the NCC method searches it, prepared once: enhanced, with running sums and half-resolution levels.
+
+A small level of the map is prepared as a whole; of a large one, regions on a fixed grid as the flight touches
+them, of which the least recently used are given up.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from engine.align import enhance
+from engine.ncc_fft import Search, prepare
+from engine.orthomap import OrthoMap
+from engine.types import Window
+
+CELL_PX = 512
+"""Regions begin and end on multiples of this, so that neighbouring windows share one."""
+WHOLE_LEVEL_PX = 1 << 23
+"""Levels of at most this many pixels are prepared as a whole."""
+MAX_REGIONS = 24
+"""Regions that are kept; one of 1024 x 1024 pixels takes 27 MB."""
+_HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A prepared part of one pyramid level.
+
+    Attributes:
+        window: where it lies, in pixels of the level.
+        search: what is matched against.
+        valid: (H, W) False on nodata; None where all of it is map.
+    """
+
+    window: Window
+    search: Search
+    valid: torch.Tensor | None
+
+
+class PreparedMap:
+    """Prepared regions of one map, on one device.
+
+    Args:
+        site: the map.
+        device: where the regions live.
+        radius_px: of the local normalisation, see :func:`engine.align.enhance`.
+    """
+
+    def __init__(self, site: OrthoMap, device: torch.device, radius_px: int) -> None:
+        self._site, self._device, self._radius_px = site, device, radius_px
+        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()
+
+    def cut(self, window: Window, level: int) -> Region:
+        """The prepared part of a level that holds a window, cut to it.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: of the map's pyramid.
+
+        Returns:
+            Region: begins up to 7 pixels before the window and ends with it.
+        """
+        x0, y0 = window.x0 & -_HALVING_PX, window.y0 & -_HALVING_PX
+        grown = Window(x0, y0, window.x0 + window.width_px - x0, window.y0 + window.height_px - y0)
+        region = self._region(grown, level)
+        i, j = grown.x0 - region.window.x0, grown.y0 - region.window.y0
+        search = region.search.crop(i, j, grown.width_px, grown.height_px)
+        valid = None
+        if region.valid is not None:
+            valid = region.valid[j : j + grown.height_px, i : i + grown.width_px]
+            if bool(valid.all()):
+                valid = None
+        return Region(grown, search, valid)
+
+    def _region(self, window: Window, level: int) -> Region:
+        rows, columns = self._site.level_shape(level)
+        if rows * columns <= WHOLE_LEVEL_PX:
+            wanted = Window(0, 0, columns, rows)
+        else:
+            wanted = _on_grid(window, columns, rows)
+        region = self._regions.get((level, wanted))
+        if region is None:
+            region = self._prepare(wanted, level)
+            self._regions[level, wanted] = region
+            if len(self._regions) > MAX_REGIONS:
+                self._regions.popitem(last=False)
+        self._regions.move_to_end((level, wanted))
+        return region
+
+    def _prepare(self, window: Window, level: int) -> Region:
+        """Enhance with the neighbourhood that the map has beyond the region, so that regions join seamlessly."""
+        rows, columns = self._site.level_shape(level)
+        margin = self._radius_px + 1
+        x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
+        x1 = min(columns, window.x0 + window.width_px + margin)
+        y1 = min(rows, window.y0 + window.height_px + margin)
+        wide = Window(x0, y0, x1 - x0, y1 - y0)
+        mask: NDArray[np.bool_] | None = None
+        if not self._site.fully_valid:
+            mask = self._site.valid(wide, level)
+            mask = None if mask.all() else mask
+        picture = enhance(self._site.gray(wide, level), radius_px=self._radius_px, valid=mask)
+        inner = np.s_[
+            window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
+        ]
+        image = torch.from_numpy(np.ascontiguousarray(picture[inner])).to(self._device)
+        valid = None
+        if mask is not None and not mask[inner].all():
+            valid = torch.from_numpy(np.ascontiguousarray(mask[inner])).to(self._device)
+        return Region(window, prepare(image), valid)
+
+
+def _on_grid(window: Window, columns: int, rows: int) -> Window:
+    """The window grown to whole cells, and cut off where the level ends."""
+    x0, y0 = window.x0 // CELL_PX * CELL_PX, window.y0 // CELL_PX * CELL_PX
+    x1 = min(columns, -(-(window.x0 + window.width_px) // CELL_PX) * CELL_PX)
+    y1 = min(rows, -(-(window.y0 + window.height_px) // CELL_PX) * CELL_PX)
+    return Window(x0, y0, x1 - x0, y1 - y0)

@@ -1,0 +1,133 @@
+"""The documentation tells the truth: its snippets run, its links resolve, its lists are those of the code."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from engine.cli.app import app
+from engine.cli.demo import write_flight
+from engine.formats.track import COLUMNS
+from engine.integrity import AssumedErrors, PeakRule
+from engine.methods.sift import SiftOptions
+from engine.navigator import NavigatorOptions
+from engine.pose import PoseOptions
+from engine.sim import plan_flight
+from engine.types import Reason
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+FENCE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def page_name(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+def read(name):
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """The folder in which a reader would try the snippets."""
+    folder = tmp_path_factory.mktemp("docs")
+    write_flight(folder, plan_flight(frames=3))
+    return folder
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if FENCE.search(p.read_text(encoding="utf-8"))], ids=page_name)
+def test_snippets_run_as_they_stand(page, flight, monkeypatch):
+    monkeypatch.chdir(flight)
+    names = {"__name__": page.stem}  # the snippets of a page follow each other
+    for number, snippet in enumerate(FENCE.findall(page.read_text(encoding="utf-8"))):
+        exec(compile(snippet, f"{page.name}, snippet {number + 1}", "exec"), names)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_resolve(page):
+    text = CODE.sub("", page.read_text(encoding="utf-8"))
+    for link in LINK.findall(text):
+        if not link.startswith(("https://", "#")):
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve()
+            assert target.exists(), f"{page.name}: {link}"
+            assert not anchor or anchor in headings(target), f"{page.name}: {link}"
+
+
+def headings(page):
+    titles = re.findall(r"^#+ (.+)$", CODE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_every_page_is_reached_from_the_readme():
+    linked = {(ROOT / link).resolve() for link in LINK.findall(read("README.md")) if "://" not in link}
+    assert {page.resolve() for page in PAGES} - {ROOT / "README.md"} <= linked
+
+
+def test_pages_fit_the_line():
+    for page in PAGES:
+        prose = CODE.sub("", page.read_text(encoding="utf-8"))
+        long = [line for line in prose.splitlines() if len(line) > 120 and not line.startswith(("|", "`"))]
+        assert not long, f"{page.name}: {long}"
+
+
+# ------------------------------------------------------------------------------------------- architecture
+
+
+def rows(name, heading):
+    """Cells of the table below a heading, without its head."""
+    section = read(name).split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_floors_are_those_that_import_linter_keeps():
+    contract = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"][0]
+    kept = [{part.strip().removeprefix("engine.") for part in layer.split("|")} for layer in contract["layers"]]
+    told = [set(re.findall(r"`([a-z_0-9]+)`", cells[0])) for cells in rows("docs/architecture.md", "Floors")]
+    assert told == kept
+
+
+def test_every_file_has_its_line_and_every_line_its_file():
+    files = {path.relative_to(ROOT / "engine").as_posix() for path in (ROOT / "engine").rglob("*.py")}
+    files -= {file for file in files if file.endswith("__init__.py") and file != "__init__.py"}
+    told = [cells[0].strip("`") for cells in rows("docs/architecture.md", "Files")]
+    assert sorted(set(told)) == sorted(told)
+    assert set(told) == files
+
+
+# ------------------------------------------------------------------------------------------ lists and values
+
+
+def test_every_reason_is_explained():
+    told = set(re.findall(r"`(\w+)`", " ".join(line for line in read("docs/integrity.md").split("\n\n")[2:3])))
+    assert {reason.value for reason in Reason} <= told
+
+
+def test_defaults_are_those_of_the_code():
+    owners = {cls.__name__: cls() for cls in (PeakRule, PoseOptions, SiftOptions, NavigatorOptions, AssumedErrors)}
+    found = re.findall(r"^\| `(\w+)\.(\w+)` \| (\S+) \|", read("docs/integrity.md"), re.MULTILINE)
+    assert len(found) > 10
+    for owner, name, value in found:
+        assert float(value) == getattr(owners[owner], name), f"{owner}.{name}"
+    assumed = {name for owner, name, _ in found if owner == "AssumedErrors"}
+    assert assumed == set(AssumedErrors.__dataclass_fields__)
+
+
+def test_columns_of_the_track_are_listed():
+    assert f"`{','.join(COLUMNS)}`" in read("docs/map-and-flight-files.md")
+
+
+def test_every_command_has_its_section():
+    told = set(re.findall(r"^## (.+)$", read("docs/command-line.md"), re.MULTILINE))
+    commands = {(info.callback.__name__ if info.callback else "") for info in app.registered_commands}
+    assert told == commands | {"map info"}
+
+
+def test_the_changelog_names_the_version():
+    version = tomllib.loads(read("pyproject.toml"))["project"]["version"]
+    assert re.search(rf"^## .*{re.escape(version)}", read("CHANGELOG.md"), re.MULTILINE)

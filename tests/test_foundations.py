@@ -1,0 +1,323 @@
+"""The ground floor: budget and clock, the device switch, the values that travel, the tree of errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+import engine.errors
+from engine import (
+    Attitude,
+    BackendError,
+    Budget,
+    CalibrationError,
+    DeviceError,
+    DtypeError,
+    EngineError,
+    Fix,
+    Frame,
+    MapError,
+    NavigatorOptions,
+    NoFix,
+    OptionError,
+    Prior,
+    Reason,
+    ShapeError,
+    TelemetryError,
+    Timings,
+    Window,
+)
+from engine.budget import Deadline
+from engine.device import resolve, set_threads, synchronise
+from engine.types import Peak, options_from_mapping
+
+IMAGE = np.zeros((4, 6), np.uint8)
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self):
+        self.now_ns = 5_000
+
+    def __call__(self):
+        return self.now_ns
+
+    def wait_ms(self, ms):
+        self.now_ns += round(ms * 1e6)
+
+
+# Budget and deadline
+
+
+@pytest.mark.parametrize("total_ms", [0.0, -1.0, float("nan"), float("-inf")])
+def test_a_budget_is_above_zero(total_ms):
+    with pytest.raises(OptionError, match=r"^total_ms: expected more than 0 ms, got "):
+        Budget(total_ms=total_ms)
+
+
+def test_a_budget_is_a_value():
+    assert Budget(total_ms=40.0) == Budget(total_ms=40.0)
+    assert Budget().total_ms == math.inf
+    with pytest.raises(TypeError):
+        Budget(40.0)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Budget().total_ms = 3.0
+
+
+def test_a_deadline_runs_from_its_start_to_its_budget():
+    clock = Clock()
+    deadline = Deadline(Budget(total_ms=40.0), clock)
+    assert (deadline.elapsed_ms, deadline.remaining_ms, deadline.met) == (0.0, 40.0, True)
+    clock.wait_ms(30.0)
+    assert (deadline.elapsed_ms, deadline.remaining_ms) == (pytest.approx(30.0), pytest.approx(10.0))
+    clock.wait_ms(10.0)
+    assert deadline.met  # the last moment is in time
+    clock.wait_ms(0.001)
+    assert not deadline.met
+    assert deadline.remaining_ms == pytest.approx(-0.001)
+
+
+def test_a_deadline_of_nobody_is_always_met():
+    clock = Clock()
+    deadline = Deadline(Budget(), clock)
+    clock.wait_ms(1e12)
+    assert deadline.met
+    assert deadline.remaining_ms == math.inf
+
+
+def test_two_deadlines_do_not_share_their_start():
+    clock = Clock()
+    first = Deadline(Budget(total_ms=10.0), clock)
+    clock.wait_ms(8.0)
+    second = Deadline(Budget(total_ms=10.0), clock)
+    clock.wait_ms(5.0)
+    assert (first.met, second.met) == (False, True)
+
+
+def test_the_clock_of_a_deadline_is_monotonic():
+    deadline = Deadline(Budget(total_ms=60_000.0))
+    seen = [deadline.elapsed_ms for _ in range(100)]
+    assert seen == sorted(seen)
+    assert seen[0] >= 0.0
+
+
+# Device
+
+
+def test_a_device_is_resolved_by_name():
+    assert resolve("cpu") == torch.device("cpu")
+    assert resolve(torch.device("cpu")).type == "cpu"
+    assert resolve("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert resolve().type == resolve("auto").type
+
+
+@pytest.mark.parametrize("name", ["gpu", "", "cpuu", "tpu:0", "mps", "meta", "cuda:x"])
+def test_a_name_that_is_no_device_is_an_option_error(name):
+    with pytest.raises(OptionError, match=r"^device: expected cpu, cuda or auto, got "):
+        resolve(name)
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:0", "cuda:7"])
+def test_a_device_that_is_missing_is_a_device_error(name):
+    if torch.cuda.is_available() and torch.cuda.device_count() > int(name[5:] or 0):
+        pytest.skip("this machine has that device")
+    with pytest.raises(DeviceError, match=rf"^device: {name} was asked for, but this machine offers \d"):
+        resolve(name)
+
+
+def test_waiting_for_the_cpu_is_no_work():
+    synchronise(torch.device("cpu"))
+
+
+def test_threads_are_set_for_torch_and_opencv():
+    try:
+        set_threads(2)
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (2, 2)
+    finally:
+        set_threads(1)
+    assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
+    with pytest.raises(OptionError, match=r"^threads: expected 1 or more, got 0"):
+        set_threads(0)
+
+
+# Frames
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 6, 1), (4, 6, 4), (0, 6), (4, 0, 3), (1, 4, 6, 3), ()])
+@pytest.mark.parametrize("make", [np.zeros, torch.zeros])
+def test_a_frame_is_grey_or_rgb(make, shape):
+    dtype = np.uint8 if make is np.zeros else torch.uint8
+    with pytest.raises(ShapeError, match=r"^image: expected \(H, W\) or \(H, W, 3\) with .+, got "):
+        Frame(make(shape, dtype=dtype))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [IMAGE.astype(np.float32), IMAGE.astype(np.int8), torch.zeros(4, 6), torch.zeros(4, 6, dtype=torch.int8)],
+)
+def test_a_frame_is_uint8(image):
+    with pytest.raises(DtypeError, match=r"^image: expected uint8, got "):
+        Frame(image)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps"],
+)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_numbers_of_a_frame_are_finite_or_unknown(name, value):
+    with pytest.raises(TelemetryError, match=rf"^{name}: expected a finite number or None, got "):
+        Frame(IMAGE, **{name: value})
+    assert getattr(Frame(IMAGE, **{name: None}), name) is None
+
+
+@pytest.mark.parametrize("height", [0.0, -3.0])
+def test_the_height_of_a_frame_is_above_the_ground(height):
+    with pytest.raises(TelemetryError, match=r"^height_agl_m: expected a height above 0 m, got "):
+        Frame(IMAGE, height_agl_m=height)
+
+
+def test_the_attitude_of_a_frame_takes_unknown_tilt_as_level():
+    assert Frame(IMAGE).attitude is None
+    assert Frame(IMAGE, roll_deg=3.0, pitch_deg=2.0).attitude is None
+    assert Frame(IMAGE, heading_deg=-90.0).attitude == Attitude(0.0, 0.0, 270.0)
+    assert Frame(IMAGE, heading_deg=5.0, roll_deg=3.0).attitude == Attitude(3.0, 0.0, 5.0)
+
+
+@given(heading=st.floats(-1e4, 1e4) | st.sampled_from([-1e-17, -5e-324, 360.0, -360.0]))
+def test_a_heading_lies_in_the_half_open_circle(heading):
+    wrapped = Frame(IMAGE, heading_deg=heading).attitude.heading_deg
+    assert 0.0 <= wrapped < 360.0
+    turned = math.remainder(wrapped - heading, 360.0)
+    assert turned == pytest.approx(0.0, abs=1e-9)
+
+
+# Priors
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        {},
+        {"lat_deg": 1.0},
+        {"east_m": 1.0},
+        {"lat_deg": 1.0, "east_m": 1.0},
+        {"lat_deg": 1.0, "lon_deg": 1.0, "east_m": 1.0},
+        {"lat_deg": 1.0, "lon_deg": 1.0, "east_m": 1.0, "north_m": 1.0},
+    ],
+)
+def test_a_prior_has_one_position(where):
+    with pytest.raises(OptionError, match=r"^prior: expected either lat_deg and lon_deg or east_m and north_m"):
+        Prior(**where, sigma_m=1.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ({"lat_deg": 91.0, "lon_deg": 0.0}, "lat_deg"),
+        ({"lat_deg": 0.0, "lon_deg": 361.0}, "lon_deg"),
+        ({"east_m": math.nan, "north_m": 0.0}, "prior"),
+        ({"lat_deg": math.inf, "lon_deg": 0.0}, "prior"),
+        ({"east_m": 0.0, "north_m": 0.0, "sigma_m": -1.0}, "sigma_m"),
+        ({"east_m": 0.0, "north_m": 0.0, "sigma_m": math.nan}, "sigma_m"),
+        ({"east_m": 0.0, "north_m": 0.0, "moved_east_m": math.inf}, "moved"),
+    ],
+)
+def test_a_prior_is_refused_by_name(values, names):
+    with pytest.raises(OptionError, match=rf"^{names}: expected .+, got "):
+        Prior(**{"sigma_m": 1.0, **values})
+
+
+def test_a_prior_always_says_how_sure_it_is():
+    with pytest.raises(TypeError, match="sigma_m"):
+        Prior(east_m=0.0, north_m=0.0)
+
+
+# Other values
+
+
+@pytest.mark.parametrize(
+    "cls", [Attitude, Fix, Frame, NoFix, Peak, Prior, Timings, Window, Budget, NavigatorOptions]
+)
+def test_values_are_frozen_and_slotted(cls):
+    assert dataclasses.is_dataclass(cls)
+    assert cls.__dataclass_params__.frozen
+    assert "__slots__" in vars(cls)
+
+
+def test_timings_add_up():
+    assert Timings().total_ms == 0
+    assert Timings({"align": 1.5, "match": 3.0}).total_ms == 4.5
+
+
+def test_the_sigma_of_a_fix_is_the_longer_axis_of_its_ellipse():
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    covariance = turn @ np.diag([9.0, 4.0, 100.0]) @ turn.T
+    fix = Fix(
+        timestamp_ns=1,
+        lat_deg=0.0,
+        lon_deg=0.0,
+        east_m=0.0,
+        north_m=0.0,
+        up_m=None,
+        covariance_m2=covariance,
+        attitude=None,
+        score=1.0,
+        method="ncc",
+        window=Window(2, 3, 4, 5),
+        timings=Timings(),
+        map_xy_px=(0.0, 0.0),
+    )
+    assert fix.sigma_m == pytest.approx(3.0)
+    assert fix.window.area_px == 20
+
+
+def test_reasons_are_an_enum_of_their_own_names():
+    assert issubclass(Reason, enum.Enum)
+    assert all(reason.value == reason.name.lower() for reason in Reason)
+
+
+def test_options_come_from_mappings_and_unknown_names_are_refused():
+    assert options_from_mapping(NavigatorOptions, {"growth": 1.2}) == NavigatorOptions(growth=1.2)
+    with pytest.raises(OptionError, match=r"^grwoth: not an option of NavigatorOptions; known are .*growth"):
+        options_from_mapping(NavigatorOptions, {"grwoth": 1.2})
+    with pytest.raises(OptionError, match=r"^growth: "):
+        options_from_mapping(NavigatorOptions, {"growth": 0.1})
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("error", "base"),
+    [
+        (ShapeError, ValueError),
+        (DtypeError, TypeError),
+        (OptionError, ValueError),
+        (DeviceError, Exception),
+        (MapError, Exception),
+        (CalibrationError, Exception),
+        (TelemetryError, Exception),
+        (BackendError, Exception),
+    ],
+)
+def test_every_error_is_an_engine_error(error, base):
+    assert issubclass(error, EngineError)
+    assert issubclass(error, base)
+    assert error.__name__ in engine.errors.__doc__  # the tree is drawn there
+
+
+def test_the_tree_of_errors_is_whole():
+    drawn = engine.errors.__doc__
+    for name, value in vars(engine.errors).items():
+        if isinstance(value, type):
+            assert name in drawn
