@@ -41,7 +41,7 @@ def to_gray(frame: Frame) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
-def enhance(gray: NDArray[np.uint8], *, radius_px: int = 6, valid: NDArray[np.bool_] | None = None) -> Image:
+def enhance(gray: NDArray[np.uint8], *, radius_px: int = 8, valid: NDArray[np.bool_] | None = None) -> Image:
     """Local normalisation, (H, W) to (H, W): each pixel less its neighbourhood's mean, over its deviation.
 
     This is the paper's "enhance" step: shadows, haze and exposure change the local mean and contrast, streets

@@ -60,10 +60,10 @@ class Features:
             The first two columns are the images of the patch's x and y axes, the third is the centre.
             kornia's own angles turn the other way, so ``kornia.feature.get_laf_orientation`` gives -angle_deg.
         """
-        angle = torch.deg2rad(self.angle_deg)
-        cos, sin = (magnification * self.scale_px * f for f in (angle.cos(), angle.sin()))
-        axes = torch.stack([cos, -sin, sin, cos], dim=-1).unflatten(-1, (2, 2))
-        return torch.cat([axes, self.xy_px.unsqueeze(-1)], dim=-1)
+        from kornia.feature import laf_from_center_scale_ori
+
+        scale = (magnification * self.scale_px)[..., None, None]
+        return laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
 
 
 def sift(

@@ -82,7 +82,7 @@ class PeakRule:
     """
 
     min_sigmas: float = 4.0
-    min_margin_sigmas: float = 1.75
+    min_margin_sigmas: float = 1.4
     min_margin_sigmas_whole_map: float = 2.5
     min_deviation: float = 3.0
     exclusion_m: float = 6.0

@@ -8,6 +8,7 @@ Convention:
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,8 +170,15 @@ def surface(search: Search, templates: Tensor) -> Tensor:
     (H, W), (h, w) = search.image.shape, templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
-    centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    return kernels.prepared_surface(search.image, search.sums, centred)
+    return next(surfaces(search, templates, group=templates.shape[0]))
+
+
+def surfaces(search: Search, templates: Tensor, *, group: int) -> Iterator[Tensor]:
+    """The same for ``group`` templates at a time, which bounds the memory of many templates on a large map."""
+    inverse_norms = kernels.inverse_norm(search.sums, *templates.shape[-2:])
+    for part in templates.split(group):
+        centred = part - part.mean(dim=(-2, -1), keepdim=True)
+        yield kernels.prepared_surface(search.image, inverse_norms, centred)
 
 
 def match_template(search: Search, template: Tensor, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
@@ -211,7 +219,8 @@ def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Pe
     if len(levels) == 1:
         return None  # nothing to gain
     (coarse, model), scale = levels[-1], 2 ** (len(levels) - 1)
-    scores = kernels.prepared_surface(coarse.image, coarse.sums, model[None])[0]
+    inverse_norms = kernels.inverse_norm(coarse.sums, *model.shape)
+    scores = kernels.prepared_surface(coarse.image, inverse_norms, model[None])[0]
     places = best_places(scores, _SEPARATION_PX, _CANDIDATES + 1)
     best: Peak | None = None
     doubt, others = 0.0, []
@@ -259,16 +268,45 @@ def _refined(levels: list[tuple[Search, Tensor]], scores: Tensor, x: int, y: int
 
 
 def best_places(scores: Tensor, separation: int, count: int) -> list[tuple[int, int, float]]:
-    """The ``count`` highest places (x, y, score) of (H, W) that are more than ``separation`` apart."""
-    left, places = scores.clone(), []
+    """The ``count`` highest places (x, y, score) of (H, W) that are more than ``separation`` apart.
+
+    Of every tile of a large surface only the highest place is a candidate.
+    """
+    values = scores.cpu().numpy()
+    if values.size > _TILED_PX:
+        return _best_of_tiles(values, separation, count)
+    left, places = values.copy(), []
     for _ in range(count):
-        index = int(left.argmax())
-        y, x = divmod(index, left.shape[1])
+        y, x = divmod(int(left.argmax()), left.shape[1])
         score = float(left[y, x])
         if score <= -1.0:
             break
         places.append((x, y, score))
         left[max(0, y - separation) : y + separation + 1, max(0, x - separation) : x + separation + 1] = -1.0
+    return places
+
+
+_TILED_PX = 1 << 18
+_TILE_PX = 16
+
+
+def _best_of_tiles(values: NDArray[np.float32], separation: int, count: int) -> list[tuple[int, int, float]]:
+    height, width = (-(-n // _TILE_PX) for n in values.shape)
+    padded = np.full((height * _TILE_PX, width * _TILE_PX), -1.0, np.float32)
+    padded[: values.shape[0], : values.shape[1]] = values
+    tiles = padded.reshape(height, _TILE_PX, width, _TILE_PX).max(axis=(1, 3)).ravel()
+    wanted = min(tiles.size, 16 * count)  # neighbouring tiles share one summit
+    order = np.argpartition(-tiles, wanted - 1)[:wanted]
+    places: list[tuple[int, int, float]] = []
+    for index in order[np.argsort(-tiles[order], kind="stable")]:
+        j, i = divmod(int(index), width)
+        tile = padded[j * _TILE_PX : (j + 1) * _TILE_PX, i * _TILE_PX : (i + 1) * _TILE_PX]
+        y, x = divmod(int(tile.argmax()), _TILE_PX)
+        y, x, score = y + j * _TILE_PX, x + i * _TILE_PX, float(tile[y, x])
+        if score > -1.0 and all(max(abs(x - u), abs(y - v)) > separation for u, v, _ in places):
+            places.append((x, y, score))
+        if len(places) == count:
+            break
     return places
 
 

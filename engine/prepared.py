@@ -22,8 +22,8 @@ CELL_PX = 512
 """Regions begin and end on multiples of this, so that neighbouring windows share one."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
-MAX_REGIONS = 24
-"""Regions that are kept; one of 1024 x 1024 pixels takes 27 MB."""
+MAX_REGION_PX = 12 << 20
+"""Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 27 bytes."""
 _HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
 
 
@@ -87,10 +87,21 @@ class PreparedMap:
         if region is None:
             region = self._prepare(wanted, level)
             self._regions[level, wanted] = region
-            if len(self._regions) > MAX_REGIONS:
-                self._regions.popitem(last=False)
+            self._forget()
         self._regions.move_to_end((level, wanted))
         return region
+
+    def _forget(self) -> None:
+        """Give up the regions that were used least recently; the newest and whole levels stay."""
+        parts = [
+            key for key in self._regions if (key[1].height_px, key[1].width_px) != self._site.level_shape(key[0])
+        ]
+        used = sum(window.area_px for _, window in parts)
+        for key in parts[:-1]:
+            if used <= MAX_REGION_PX:
+                break
+            used -= key[1].area_px
+            del self._regions[key]
 
     def _prepare(self, window: Window, level: int) -> Region:
         """Enhance with the neighbourhood that the map has beyond the region, so that regions join seamlessly."""

@@ -13,13 +13,21 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from engine import Camera, Frame, OptionError, Reason
-from engine.integrity import AssumedErrors, PeakRule, judge_peak, ncc_covariance_m2, peak_covariance_px
+from engine.integrity import (
+    AssumedErrors,
+    PeakRule,
+    judge_peak,
+    ncc_covariance_m2,
+    peak_covariance_px,
+    score_sigma,
+)
 from engine.ncc_fft import find_peak, ncc
 from engine.types import Peak
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 BLANK = np.zeros((300, 300), np.uint8)
-RULE = PeakRule(min_score=0.2, min_margin=0.05, min_margin_whole_map=0.1)
+PIXELS = 2500  # 100 blocks of 5 x 5: one sigma of chance is 0.1
+RULE = PeakRule(min_sigmas=2.0, min_margin_sigmas=0.5, min_margin_sigmas_whole_map=1.0)
 
 
 def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
@@ -30,7 +38,7 @@ def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
     ("score", "second", "whole_map", "reason"),
     [
         (0.8, 0.2, False, None),
-        (0.2, -0.3, False, None),
+        (0.201, -0.3, False, None),
         (0.199, -0.3, False, Reason.LOW_SCORE),
         (0.0, 0.0, False, Reason.LOW_SCORE),
         (-1.0, -1.0, True, Reason.LOW_SCORE),
@@ -43,10 +51,33 @@ def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
     ],
 )
 def test_a_peak_is_believed_when_it_is_high_and_alone(score, second, whole_map, reason):
-    verdict = judge_peak(peak(score, second), RULE, whole_map=whole_map)
+    verdict = judge_peak(peak(score, second), PIXELS, RULE, whole_map=whole_map)
     assert (verdict and verdict[0]) is reason
     if verdict:
         assert f"{score:.3f}" in verdict[1]  # the figures behind the reason
+
+
+def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
+    verdict = judge_peak(peak(0.9, -1.0, bend=np.zeros((2, 2))), PIXELS, RULE, whole_map=False)
+    assert verdict
+    assert verdict[0] is Reason.AMBIGUOUS
+
+
+def test_the_same_score_is_worth_more_over_a_larger_patch():
+    weak = peak(0.3, 0.2)
+    assert judge_peak(weak, 4 * PIXELS, PeakRule(), whole_map=False) is None
+    assert judge_peak(weak, PIXELS, PeakRule(), whole_map=False)[0] is Reason.LOW_SCORE
+
+
+def test_a_score_of_chance_scatters_by_its_sigma():
+    """Pictures of 100 blocks of 5 x 5 equal pixels that have nothing to do with each other."""
+    rng = np.random.default_rng(6)
+    first, second = rng.normal(size=(2, 3000, 10, 10))
+    search, templates = (torch.from_numpy(np.kron(values, np.ones((5, 5)))) for values in (first, second))
+    scores = ncc(search, templates[:, None])
+    assert score_sigma(PIXELS) == pytest.approx(0.1)
+    assert float(scores.std()) == pytest.approx(0.1, rel=0.05)
+    assert score_sigma(1) == 1.0
 
 
 @pytest.mark.parametrize("options", [PeakRule, AssumedErrors])
@@ -96,7 +127,7 @@ def test_along_a_ridge_the_place_is_known_to_pixels_and_not_infinitely_badly():
 
 
 def test_the_covariance_of_a_peak_is_what_white_noise_does():
-    """Cramer-Rao: with noise that is independent from pixel to pixel the figure is the scatter itself."""
+    """Cramer-Rao: where every pixel counts, and not one in 5 x 5, the figure is the scatter itself."""
     rng = np.random.default_rng(3)
     picture = gaussian_filter(rng.normal(size=(72, 72)), 2.5)
     picture = torch.from_numpy(picture / picture.std())
@@ -105,7 +136,7 @@ def test_the_covariance_of_a_peak_is_what_white_noise_does():
         noisy = picture[16:56, 16:56] + 2.0 * torch.from_numpy(rng.normal(size=(40, 40)))
         found = find_peak(ncc(picture[None], noisy[None, None])[0], exclusion_px=6.0)
         places.append((found.x, found.y))
-        claimed.append(np.trace(peak_covariance_px(found, 1600, correlation_px=1.0)))
+        claimed.append(np.trace(peak_covariance_px(found, 25 * 1600)))
     spread = np.sum((np.array(places) - 16.0) ** 2, axis=1).mean()
     assert 0.6 < np.mean(claimed) / spread < 1.7
 

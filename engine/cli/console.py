@@ -107,7 +107,9 @@ def report(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> 
     if as_json:
         print_json(summary)
         return
-    pairs = [(name, form.format(summary[key])) for name, key, form in _SUMMARY if summary.get(key) is not None]
+    known = [(name, form, summary[key]) for name, key, form in _SUMMARY if summary.get(key) is not None]
+    # A wild value keeps to its column.
+    pairs = [(name, form.replace(".2f", ".1e" if abs(v) >= 1e5 else ".2f").format(v)) for name, form, v in known]
     latency = summary["latency_ms"]
     if latency["p50"] is not None:
         shown = ", ".join(f"{name} {latency[name]:.1f}" for name in ("p50", "p95", "p99", "max"))

@@ -10,7 +10,15 @@ from torch import Tensor
 from engine.kernels import eager, masked
 from engine.kernels.local import LocalScores
 
-__all__ = ["LocalScores", "halved", "integrals", "masked_ncc_surface", "ncc_surface", "prepared_surface"]
+__all__ = [
+    "LocalScores",
+    "halved",
+    "integrals",
+    "inverse_norm",
+    "masked_ncc_surface",
+    "ncc_surface",
+    "prepared_surface",
+]
 
 
 def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
@@ -30,9 +38,14 @@ def integrals(image: Tensor) -> Tensor:
     return eager.integrals(image)
 
 
-def prepared_surface(image: Tensor, sums: Tensor, templates: Tensor) -> Tensor:
-    """Zero-mean NCC of (T, h, w) zero-mean float32 templates with a picture whose running sums are known."""
-    return eager.prepared_surface(image, sums, templates)
+def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
+    """One over the norm about its mean of every h x w patch, from running sums; 0 where a patch is flat."""
+    return eager.inverse_norm(sums, h, w)
+
+
+def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
+    """Zero-mean NCC of (T, h, w) zero-mean float32 templates with a picture whose patches' norms are known."""
+    return eager.prepared_surface(image, inverse_norms, templates)
 
 
 def halved(image: Tensor) -> Tensor:

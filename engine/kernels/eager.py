@@ -67,21 +67,26 @@ def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
     return correlate(search.to(work), normal).mul_(energy.to(work).rsqrt_()).clamp_(-1.0, 1.0)
 
 
-def prepared_surface(image: Tensor, sums: Tensor, templates: Tensor) -> Tensor:
+def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
     """Zero-mean NCC of zero-mean float32 templates (T, h, w) with a picture (H, W) of small mean.
 
     Args:
         image: (H, W) float32.
-        sums: (2, H+1, W+1) its running sums, or a crop of those of the picture that it was cut from.
+        inverse_norms: (H-h+1, W-w+1) from :func:`inverse_norm`.
         templates: (T, h, w) float32 of zero mean.
     """
-    h, w = templates.shape[-2:]
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True).clamp_min_(_TINY)
-    return correlate(image, templates / norm).mul_(_inverse_norm(sums, h, w)).clamp_(-1.0, 1.0)
+    return correlate(image, templates / norm).mul_(inverse_norms).clamp_(-1.0, 1.0)
 
 
-def _inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
-    """One over the norm of every h x w patch about its mean, float32; 0 where the patch is flat."""
+def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
+    """One over the norm of every h x w patch about its mean, float32; 0 where the patch is flat.
+
+    Args:
+        sums: (2, H+1, W+1) running sums of a picture, or a crop of those of a larger one.
+        h: rows of a patch.
+        w: columns of a patch.
+    """
     floor = _FLAT_SHARE * (sums[1, -1, -1] - sums[1, 0, 0])  # no less than the window's own energy
     if (
         sums.device.type == "cpu" and sums[0].numel() <= _SMALL_PX

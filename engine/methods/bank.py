@@ -9,47 +9,59 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.errors import OptionError
 from engine.methods import laid
 from engine.methods.laid import Aligned, NccOptions
 from engine.methods.query import Query, level_crop
-from engine.ncc_fft import best_places, surface
-from engine.prepared import PreparedMap
+from engine.ncc_fft import best_places, surfaces
+from engine.prepared import PreparedMap, Region
 from engine.types import Frame, NoFix, Peak, Window
 
 Array = NDArray[np.float64]
 
 # Levels are gone up until hypotheses times places are no more than this, or the template gets too small.
 _COARSE_PLACES = 4_000_000
-_COARSE_TEMPLATE_PX = 28
+_COARSE_TEMPLATE_PX = 20
 _CANDIDATES = 8
-_GROUP = 8  # templates in one batch, which bounds the memory of their surfaces
-_SLACK_PX = 3  # by which a coarse place may be wrong, in pixels of its level
-_REFINEMENTS = 3
+_FINALISTS = 3
+_GROUP = 4  # templates in one batch, which bounds the memory of their surfaces
+_SLACK_PX = 3  # by which a place that was found on a level may be wrong, in pixels of that level
+_EDGE_PX = 1.5  # by which a hypothesis may move the corner of the patch
+_MIDDLE_ROUNDS = 2
+_FINE_ROUNDS = 3
 
 
-def hypotheses(frame: Frame, options: NccOptions) -> list[Frame]:
-    """The frame under every heading and height to be tried, the likeliest first; itself where both are trusted."""
-    heading, height = frame.heading_deg, frame.height_agl_m
-    if height is None:
-        raise OptionError("frame: expected a height")
-    half_turn = options.heading_search_deg
-    turns = _steps(half_turn, options.heading_step_deg)
-    if half_turn == 180.0:
-        turns = turns[:-1] if len(turns) > 1 else turns  # -180 and 180 are one heading
-    shares = _steps(options.height_search_share, options.height_step_share)
-    if len(turns) == len(shares) == 1 and heading is not None:
-        return [frame]
-    base = heading or 0.0
+def is_trusted(frame: Frame, options: NccOptions) -> bool:
+    """Whether the frame's own heading and height are the only hypothesis."""
+    return frame.heading_deg is not None and options.heading_search_deg == options.height_search_share == 0.0
+
+
+def _hypotheses(frame: Frame, options: NccOptions, reach_px: float) -> list[Frame]:
+    """The frame under headings and heights that leave no edge of a patch further off than :data:`_EDGE_PX`.
+
+    Args:
+        frame: as it came.
+        options: how far its heading and height may be off.
+        reach_px: from the patch's middle to its corner, on the level where the hypotheses are scored.
+    """
+    assert frame.height_agl_m is not None
+    step = 2.0 * _EDGE_PX / reach_px  # radians, or a share of the height: both move the corner by step * reach
+    turns = _steps(options.heading_search_deg, math.degrees(step))
+    if options.heading_search_deg == 180.0:
+        turns = turns[:-1]  # -180 and 180 are one heading
     return [
-        replace(frame, heading_deg=(base + turn) % 360.0, height_agl_m=height * (1.0 + share))
-        for turn, share in sorted(itertools.product(turns, shares), key=lambda p: (abs(p[0]), abs(p[1])))
+        replace(
+            frame,
+            heading_deg=((frame.heading_deg or 0.0) + turn) % 360.0,
+            height_agl_m=frame.height_agl_m * (1.0 + share),
+        )
+        for turn, share in itertools.product(turns, _steps(options.height_search_share, step))
     ]
 
 
@@ -60,45 +72,64 @@ def _steps(reach: float, step: float) -> list[float]:
 
 
 def search(
-    query: Query,
-    prepared: PreparedMap,
-    first: Aligned,
-    frames: list[Frame],
-    window: Window,
-    options: NccOptions,
+    query: Query, prepared: PreparedMap, first: Aligned, window: Window, options: NccOptions
 ) -> tuple[Peak | None, Aligned]:
     """The best peak over all hypotheses in the window, at the level of ``first``, and whose it is."""
-    level = _coarse_level(query, first, window, len(frames))
+    level, frames = _coarse_level(query, first, window, options)
     if level == first.level and len(frames) == 1:
         return laid.search(query, prepared, first, window, options), first
-    places = _coarse(query, prepared, frames, window, level, options)
     found: list[tuple[Peak, Aligned]] = []
-    for frame, nadir in places:
-        aligned = laid.align(query, frame, first.level, options)
-        if isinstance(aligned, NoFix):
-            continue
-        peak = laid.search(query, prepared, aligned, _around(query, aligned, nadir, level), options)
-        if peak is not None:
+    middle = max(first.level, level - 1)
+    for frame, nadir in _coarse(query, prepared, frames, window, level, options):
+        aligned = laid.align(query, frame, middle, options)
+        peak = None if isinstance(aligned, NoFix) else _near(query, prepared, aligned, nadir, level, options)
+        if peak is not None and isinstance(aligned, Aligned):
+            if len(frames) > 1:
+                peak, aligned = _refine(query, prepared, peak, aligned, options, _MIDDLE_ROUNDS)
             found.append((peak, aligned))
     if not found:
         return None, first
     found.sort(key=lambda pair: -pair[0].score)
-    best, aligned = found[0]
-    rival = _best_elsewhere(query, found, options.rule.exclusion_m)
-    if len(frames) > 1:
-        best, aligned = _refine(query, prepared, best, aligned, options)
+    return _finish(query, prepared, found, first.level, len(frames) > 1, options) or (None, first)
+
+
+def _finish(
+    query: Query,
+    prepared: PreparedMap,
+    found: list[tuple[Peak, Aligned]],
+    level: int,
+    refine: bool,
+    options: NccOptions,
+) -> tuple[Peak, Aligned] | None:
+    """The best few places at full resolution; the rival is the best of the others."""
+    final: list[tuple[Peak, Aligned]] = []
+    for peak, aligned in found[:_FINALISTS]:
+        fine = laid.align(query, aligned.frame, level, options)
+        if isinstance(fine, NoFix):
+            continue
+        better = _near(query, prepared, fine, _nadir_px(query, peak, aligned), aligned.level + 1, options)
+        if better is not None:
+            final.append((better, fine))
+    if not final:
+        return None
+    final.sort(key=lambda pair: -pair[0].score)
+    best, aligned = final[0]
+    rival = _best_elsewhere(query, final, options.rule.exclusion_m)
+    if refine:
+        best, aligned = _refine(query, prepared, best, aligned, options, _FINE_ROUNDS)
     return replace(best, second_score=max(rival, best.second_score)), aligned
 
 
-def _coarse_level(query: Query, first: Aligned, window: Window, count: int) -> int:
-    level, places = first.level, count * window.area_px / 4**first.level
-    while (
-        level + 1 < query.site.levels
-        and places > _COARSE_PLACES
-        and min(first.template.shape) >> (level + 1 - first.level) >= _COARSE_TEMPLATE_PX
-    ):
-        level, places = level + 1, places / 4
-    return level
+def _coarse_level(query: Query, first: Aligned, window: Window, options: NccOptions) -> tuple[int, list[Frame]]:
+    """The level on which all hypotheses are scored, and the hypotheses, whose number falls with the resolution."""
+    level = first.level
+    while True:
+        h, w = (n >> (level - first.level) for n in first.template.shape)
+        frames = _hypotheses(query.frame, options, math.hypot(h, w) / 2.0)
+        places = len(frames) * window.area_px / 4**level
+        if places <= _COARSE_PLACES or level + 1 == query.site.levels or min(h, w) >> 1 < _COARSE_TEMPLATE_PX:
+            return level, frames
+        level += 1
 
 
 def _coarse(
@@ -107,30 +138,34 @@ def _coarse(
     """The best places of all hypotheses on a coarse level: (hypothesis, nadir in map pixels), falling scores."""
     with query.watch.stage("map"):
         region = prepared.cut(level_crop(query.site, window, level), level)
-    found: list[tuple[float, Frame, Array]] = []
+    with query.watch.stage("align"):
+        tried = [laid.align(query, frame, level, options) for frame in frames]
+    fitting = [aligned for aligned in tried if isinstance(aligned, Aligned)]
+    if not fitting:
+        return []
+    templates, trims = _same_size(fitting)
+    if templates.shape[1] > region.window.height_px or templates.shape[2] > region.window.width_px:
+        return []
     separation = max(2, round(options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**level)))
-    for start in range(0, len(frames), _GROUP):
-        with query.watch.stage("align"):
-            group = [laid.align(query, frame, level, options) for frame in frames[start : start + _GROUP]]
-        fitting = [aligned for aligned in group if isinstance(aligned, Aligned)]
-        if not fitting:
-            continue
-        with query.watch.stage("match"):
-            templates, trims = _same_size(fitting)
-            h, w = templates.shape[-2:]
-            if h > region.window.height_px or w > region.window.width_px:
-                continue
-            if region.valid is None:
-                scores = surface(region.search, templates)
-            else:
-                scores = laid.masked_scores(region, templates, options)
-            for aligned, trim, own in zip(fitting, trims, scores, strict=True):
-                for x, y, score in best_places(own, separation, _CANDIDATES):
-                    place = np.array([x + region.window.x0, y + region.window.y0], dtype=np.float64) - trim
-                    nadir = query.site.full_from_level(place - aligned.patch.offset_px, level)
-                    found.append((score, aligned.frame, nadir))
+    found: list[tuple[float, Frame, Array]] = []
+    with query.watch.stage("match"):
+        for aligned, trim, scores in zip(fitting, trims, _all_scores(region, templates, options), strict=True):
+            for x, y, score in best_places(scores, separation, _CANDIDATES):
+                place = np.array([x + region.window.x0, y + region.window.y0], dtype=np.float64) - trim
+                nadir = query.site.full_from_level(place - aligned.patch.offset_px, level)
+                found.append((score, aligned.frame, nadir))
     found.sort(key=lambda item: -item[0])
     return _apart(found, separation * 2.0**level)
+
+
+def _all_scores(region: Region, templates: torch.Tensor, options: NccOptions) -> Iterator[torch.Tensor]:
+    """One surface (H', W') after the other, of which only a few are in memory."""
+    if region.valid is None:
+        for group in surfaces(region.search, templates, group=_GROUP):
+            yield from group
+    else:
+        for template in templates:
+            yield laid.masked_scores(region, template[None], options)[0]
 
 
 def _same_size(fitting: list[Aligned]) -> tuple[torch.Tensor, list[Array]]:
@@ -153,15 +188,18 @@ def _apart(found: list[tuple[float, Frame, Array]], distance_px: float) -> list[
     return kept
 
 
-def _around(query: Query, aligned: Aligned, nadir_px: Array, level: int) -> Window:
-    """A window for a nadir that was found on a coarse level, which forgives it a few pixels of that level."""
+def _near(
+    query: Query, prepared: PreparedMap, aligned: Aligned, nadir_px: Array, level: int, options: NccOptions
+) -> Peak | None:
+    """The peak near a nadir that was found on some level, which is forgiven a few pixels of that level."""
     scale, slack = 2**aligned.level, _SLACK_PX * 2**level
     height, width = aligned.template.shape
     x0, y0 = (int(v) - slack for v in np.round(nadir_px + aligned.patch.offset_px * scale))
     x1 = min(query.site.width_px, x0 + width * scale + 2 * slack)
     y1 = min(query.site.height_px, y0 + height * scale + 2 * slack)
     x0, y0 = max(0, x0), max(0, y0)
-    return Window(x0, y0, max(1, x1 - x0), max(1, y1 - y0))
+    window = Window(x0, y0, max(1, x1 - x0), max(1, y1 - y0))
+    return laid.search(query, prepared, aligned, window, options)
 
 
 def _nadir_px(query: Query, peak: Peak, aligned: Aligned) -> Array:
@@ -182,47 +220,45 @@ def _best_elsewhere(query: Query, found: list[tuple[Peak, Aligned]], exclusion_m
 
 
 def _refine(
-    query: Query, prepared: PreparedMap, peak: Peak, aligned: Aligned, options: NccOptions
+    query: Query, prepared: PreparedMap, peak: Peak, aligned: Aligned, options: NccOptions, rounds: int
 ) -> tuple[Peak, Aligned]:
     """Heading and height below the step of the bank: parabolas through three scores, over ever smaller steps."""
-    turn, share = options.heading_step_deg / 2.0, options.height_step_share / 2.0
-    for _ in range(_REFINEMENTS):
-        for step in ((turn, 0.0), (0.0, share)):
-            sides = [_moved(query, prepared, peak, aligned, sign, step, options) for sign in (-1.0, 1.0)]
+    step = 2.0 * _EDGE_PX / math.hypot(*aligned.template.shape)
+    best = (peak, aligned)
+    for _ in range(rounds):
+        for turn, share in ((step, 0.0), (0.0, step)):
+            sides = [_moved(query, prepared, best, sign * turn, sign * share, options) for sign in (-1.0, 1.0)]
             if sides[0] is None or sides[1] is None:
                 continue
             low, high = sides[0][0].score, sides[1][0].score
-            bend = low - 2.0 * peak.score + high
-            summit = 0.5 * (low - high) / bend if bend < 0 else float(np.sign(high - low))
-            tried = _moved(query, prepared, peak, aligned, float(np.clip(summit, -1.0, 1.0)), step, options)
-            peak, aligned = max(
-                [(peak, aligned), *(s for s in (*sides, tried) if s is not None)], key=lambda pair: pair[0].score
-            )
-        turn, share = turn / 2.0, share / 2.0
-    return peak, aligned
+            bend = low - 2.0 * best[0].score + high
+            summit = float(np.clip(0.5 * (low - high) / bend if bend < 0 else np.sign(high - low), -1.5, 1.5))
+            tried = _moved(query, prepared, best, summit * turn, summit * share, options)
+            best = max([best, *(s for s in (*sides, tried) if s is not None)], key=lambda pair: pair[0].score)
+        step /= 2.0
+    return best
 
 
 def _moved(
     query: Query,
     prepared: PreparedMap,
-    peak: Peak,
-    aligned: Aligned,
-    sign: float,
-    step: tuple[float, float],
+    best: tuple[Peak, Aligned],
+    turn_rad: float,
+    share: float,
     options: NccOptions,
 ) -> tuple[Peak, Aligned] | None:
-    """The peak near the last one with the heading and height moved by ``sign`` steps."""
+    """The peak near the last one, with the heading turned and the height changed by a share."""
+    peak, aligned = best
     frame = aligned.frame
     assert frame.heading_deg is not None
     assert frame.height_agl_m is not None
     moved = replace(
         frame,
-        heading_deg=(frame.heading_deg + sign * step[0]) % 360.0,
-        height_agl_m=frame.height_agl_m * (1.0 + sign * step[1]),
+        heading_deg=(frame.heading_deg + math.degrees(turn_rad)) % 360.0,
+        height_agl_m=frame.height_agl_m * (1.0 + share),
     )
     other = laid.align(query, moved, aligned.level, options)
     if isinstance(other, NoFix):
         return None
-    window = _around(query, other, _nadir_px(query, peak, aligned), aligned.level + 1)
-    found = laid.search(query, prepared, other, window, options)
+    found = _near(query, prepared, other, _nadir_px(query, peak, aligned), aligned.level, options)
     return None if found is None else (found, other)

@@ -33,22 +33,18 @@ class NccOptions:
         exhaustive: score every place of the window at full resolution.
         heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
             also where the frame has none.
-        heading_step_deg: between the headings that are tried; the best is then refined below it.
         height_search_share: the height may be off by this share; 0 trusts it.
-        height_step_share: between the heights that are tried.
         rule: when a peak is believed.
         errors: what is assumed of the telemetry and the map.
     """
 
     margin: float = 1.3
     fraction: float = 0.7
-    enhance_radius_px: int = 6
+    enhance_radius_px: int = 8
     min_valid_share: float = 0.9
     exhaustive: bool = False
     heading_search_deg: float = 0.0
-    heading_step_deg: float = 4.0
     height_search_share: float = 0.0
-    height_step_share: float = 0.04
     rule: PeakRule = field(default_factory=PeakRule)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
@@ -61,9 +57,6 @@ class NccOptions:
         for name, limit in (("heading_search_deg", 180.0), ("height_search_share", 0.5)):
             if not 0.0 <= getattr(self, name) <= limit:
                 raise OptionError(f"{name}: expected 0 to {limit:g}, got {getattr(self, name)}")
-        for name in ("heading_step_deg", "height_step_share"):
-            if not getattr(self, name) > 0.0:
-                raise OptionError(f"{name}: expected above 0, got {getattr(self, name)}")
         if self.enhance_radius_px < 0:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
 

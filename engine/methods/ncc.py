@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from engine.integrity import judge_peak, ncc_covariance_m2, peak_covariance_px
@@ -22,19 +24,20 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions) -> Fix | No
     flat = query.refuse_flat(METHOD, options.rule.min_deviation)
     if flat is not None:
         return flat
-    hypotheses = bank.hypotheses(frame, options)
     level = level_for(query.site.gsd_m_per_px, frame.height_agl_m / query.camera.focal_px, query.site.levels)
     with query.watch.stage("align"):
-        aligned = align(query, hypotheses[0], level, options)
+        aligned = align(
+            query, frame if frame.heading_deg is not None else replace(frame, heading_deg=0.0), level, options
+        )
     if isinstance(aligned, NoFix):
         return aligned
     window = window_about(query, aligned, options)
     if window is None:
         return query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
-    if len(hypotheses) == 1 and query.prior is not None:
+    if bank.is_trusted(frame, options) and query.prior is not None:
         peak = search(query, prepared, aligned, window, options)
     else:
-        peak, aligned = bank.search(query, prepared, aligned, hypotheses, window, options)
+        peak, aligned = bank.search(query, prepared, aligned, window, options)
     if peak is None:
         detail = "the map does not cover the frame anywhere in the window"
         return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)

@@ -22,6 +22,7 @@ SCALE = 0.5
 RATIO = 0.8  # the paper gives none; Lowe's own
 FRACTION = 0.7  # of the rotated frame, so that no empty corner is matched
 REPROJECTION_PX = 4.0
+_FAR_M = 1e6
 SIGMA_M = 2.4  # the paper states no covariance; this is the RMS error that it reports
 
 
@@ -96,6 +97,8 @@ def _locate_sift(query: Query, window: Window, search: NDArray[np.uint8]) -> Fix
         return query.refuse(Reason.BAD_POSE, "PnP found no pose", "sift", window=window)
     rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
     center = -rotation.T @ np.asarray(shift, dtype=np.float64).ravel()
+    if not (np.abs(center) < _FAR_M).all():  # PnP reports success on NaN and on the ends of the universe
+        return query.refuse(Reason.BAD_POSE, "PnP found no finite pose", "sift", window=window)
     attitude = Attitude(*attitude_from_rotation(rotation.T @ query.camera.mount.T))
     nadir = query.site.pixel_from_enu(center[:2])
     share = len(inliers) / len(good)

@@ -139,9 +139,14 @@ def _refused_places(time: Array, errors: Errors, refused: NDArray[np.bool_]) -> 
 def _figures_of_merit(summary: dict[str, Any]) -> str:
     parts = [f"{summary['fixes']} of {summary['frames']} frames fixed"]
     if summary.get("rms_m") is not None:
-        parts += [f"{name} {summary[key]:.2f} m" for name, key in (("RMS", "rms_m"), ("median", "median_m"))]
-        parts += [f"95 % within {summary['r95_m']:.2f} m", f"{summary['false_fixes']} false"]
+        parts += [f"{name} {_metres(summary[key])}" for name, key in (("RMS", "rms_m"), ("median", "median_m"))]
+        parts += [f"95 % within {_metres(summary['r95_m'])}", f"{summary['false_fixes']} false"]
     return ", ".join(parts)
+
+
+def _metres(value: float) -> str:
+    """Centimetres where they mean something; a wild value keeps to its line."""
+    return f"{value:.2f} m" if abs(value) < 1e5 else f"{value:.1e} m"
 
 
 def _new_figure(scene: _Scene, size_in: tuple[float, float], panels: int = 1) -> tuple[Any, list[Any]]:
@@ -327,10 +332,8 @@ def _clip(ax: Any, low: float, high: float, points: Array) -> None:
     inset = 0.015 * (high - low)
     for beyond, edge, marker in ((points > high, high - inset, "^"), (points < low, low + inset, "v")):
         if beyond.any():
-            edges, label = (
-                np.full(int(beyond.sum()), edge),
-                f"fix {'above' if marker == '^' else 'below'} the scale",
-            )
+            edges = np.full(int(beyond.sum()), edge)
+            label = f"fix {'above' if marker == '^' else 'below'} the scale"
             ax.plot(time[beyond], edges, marker, color=FIX, markersize=6, label=label, zorder=5)
 
 
@@ -344,12 +347,12 @@ def _height(scene: _Scene) -> Any:
     difference = (fix - truth)[np.isfinite(fix - truth)]
     if difference.size:
         rms, bias = float(np.sqrt(np.mean(difference**2))), float(difference.mean())
-        ax.set_title(
-            f"{scene.title}\nheight: RMS {rms:.2f} m, bias {bias:+.2f} m".strip(), fontsize=10.5, loc="left"
-        )
+        heading = f"{scene.title}\nheight: RMS {_metres(rms)}, bias {_metres(bias)}"
+        ax.set_title(heading.strip(), fontsize=10.5, loc="left")
     ax.set(xlabel=scene.time_label, ylabel="height above the ground (m)")
-    robust = fix[np.isfinite(fix)]
-    low, high = np.percentile(robust, [2.0, 98.0])
+    low, high = np.percentile(fix[np.isfinite(fix)], [2.0, 98.0])
+    if np.isfinite(truth).any():  # heights that are beyond sense do not shrink the sensible ones
+        low, high = np.clip([low, high], 0.5 * np.nanmin(truth) - 5.0, 1.5 * np.nanmax(truth) + 5.0)
     _limit(ax, np.append(truth, [low, high]), fix)
     _draw_rug(ax, scene)
     _legend(figure, [ax])
@@ -360,10 +363,8 @@ def _draw_rug(ax: Any, scene: _Scene) -> None:
     """Refusals as ticks along the lower edge, where there is no value to mark them at."""
     if scene.refused.any():
         time = scene.time[scene.refused]
-        transform = ax.get_xaxis_transform()
-        ax.plot(
-            time, np.full(time.size, 0.02), "|", color=REFUSED, markersize=7, transform=transform, label="refused"
-        )
+        edge, low = ax.get_xaxis_transform(), np.full(time.size, 0.02)
+        ax.plot(time, low, "|", color=REFUSED, markersize=7, transform=edge, label="refused")
 
 
 # -------------------------------------------------------------------------------------------- error in time
