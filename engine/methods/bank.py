@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from engine.methods import laid
 from engine.methods.laid import Aligned, NccOptions
 from engine.methods.query import Query, level_crop
-from engine.ncc_fft import best_places, surfaces
+from engine.ncc_fft import surfaces
+from engine.peaks import best_places
 from engine.prepared import PreparedMap, Region
 from engine.types import Frame, NoFix, Peak, Window
 

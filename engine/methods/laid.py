@@ -12,7 +12,8 @@ from engine.align import MIN_SHRINK, Patch, View, enhance, rectify, view_of
 from engine.errors import OptionError
 from engine.integrity import AssumedErrors, PeakRule
 from engine.methods.query import Query, level_crop
-from engine.ncc_fft import find_peak, match_template, ncc
+from engine.ncc_fft import match_template, ncc
+from engine.peaks import find_peak
 from engine.prepared import PreparedMap, Region
 from engine.types import Frame, NoFix, Peak, Reason, Window
 
