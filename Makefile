@@ -29,7 +29,9 @@ check: $(VENV)/dev.stamp
 	$(BIN)/lint-imports
 
 bench: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest bench --benchmark-only
+	mkdir -p .benchmarks
+	$(BIN)/python -m pytest bench --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
+	$(BIN)/python -m bench.report .benchmarks/run.json
 
 clean:
 	rm -rf $(VENV) demo-report build dist *.egg-info

@@ -7,6 +7,7 @@ Convention:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -29,6 +30,15 @@ _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
 # A patch is at least this share of the fraction that is asked for, or there is none.
 MIN_SHRINK = 0.25
 _SHRINKS = np.linspace(1.0, MIN_SHRINK, 61)
+# Corners (S, A, 4, 2) about the middle of rectangles of area 1 and less, the largest first.
+_RECTANGLES = (
+    0.5
+    * _SHRINKS[:, None, None, None]
+    * np.stack([np.sqrt(_ASPECTS), 1.0 / np.sqrt(_ASPECTS)], axis=1)[:, None]
+    * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+)
+SCORES = ("grey", "local", "gradient", "mixed")
+_MIDDLE_GREY = 127.5
 # Added to the local variance, in squared grey levels: flat ground stays flat instead of becoming sensor noise.
 _NOISE_VARIANCE = 4.0
 
@@ -41,43 +51,88 @@ def to_gray(frame: Frame) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
-def enhance(gray: NDArray[np.uint8], *, radius_px: int = 8, valid: NDArray[np.bool_] | None = None) -> Image:
-    """Local normalisation, (H, W) to (H, W): each pixel less its neighbourhood's mean, over its deviation.
+def check_score(score: str) -> None:
+    """Raise OptionError where no score has this name."""
+    if score not in SCORES:
+        raise OptionError(f"score: expected one of {', '.join(SCORES)}, got {score!r}")
 
-    This is the paper's "enhance" step: shadows, haze and exposure change the local mean and contrast, streets
-    and roofs stay. Neighbourhoods are boxes of 2 radius_px + 1 pixels. Before it the picture is smoothed by the
-    binomial 1-2-1: sampled edges alias, and aliasing draws correlation peaks towards whole pixels.
+
+def enhance(
+    gray: NDArray[np.uint8], *, radius_px: int = 8, score: str = "local", valid: NDArray[np.bool_] | None = None
+) -> Image:
+    """What of the grey levels is correlated, (H, W) to (H, W); done alike to frame and map.
+
+    This is the paper's "enhance" step. Before it the picture is smoothed by the binomial 1-2-1: sampled edges
+    alias, and aliasing draws correlation peaks towards whole pixels. ``docs/scores.md`` says which score to use.
+
+    - "local": each pixel less its neighbourhood's mean, over its deviation. Shadows, haze and exposure change the
+      local mean and contrast, streets and roofs stay.
+    - "gradient": the same of the gradient's magnitude, which does not care which side of an edge is darker.
+    - "mixed": the sum of both.
+    - "grey": the smoothed grey levels less middle grey.
 
     Args:
         gray: the picture.
-        radius_px: half the size of the neighbourhood; 0 only smooths.
+        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels; 0 leaves the normalisation out.
+        score: one of :data:`SCORES`.
         valid: where False, pixels take no part and come out as 0.
 
     Raises:
-        OptionError: the radius is negative.
+        OptionError: the radius is negative, or no score has this name.
     """
     if radius_px < 0:
         raise OptionError(f"radius_px: expected 0 or more, got {radius_px}")
+    check_score(score)
+    weight = None if valid is None else valid.astype(np.float32)
+    smooth = _smoothed(gray, weight)
+    if score == "grey":
+        return _masked(smooth.astype(np.float32) - _MIDDLE_GREY, weight)
+    if score == "local":
+        return _normalised(smooth, radius_px, weight)
+    # No gradient is taken across the edge of what is valid.
+    inner = None if weight is None else cv2.erode(weight, np.ones((3, 3), np.uint8))
+    gradient = _normalised(_gradient_magnitude(smooth), radius_px, inner)
+    return gradient if score == "gradient" else gradient + _normalised(smooth, radius_px, weight)
+
+
+def _smoothed(gray: NDArray[np.uint8], weight: Image | None) -> NDArray[np.uint8] | Image:
+    """The picture under 1-2-1: whole grey levels, which are quicker, or float32 where a mask is honoured."""
+    if weight is None:
+        return np.asarray(cv2.GaussianBlur(gray, (3, 3), 0))
+    share = np.maximum(cv2.GaussianBlur(weight, (3, 3), 0), 1e-6)
+    return np.asarray(cv2.GaussianBlur(gray * weight, (3, 3), 0) / share)
+
+
+def _gradient_magnitude(picture: NDArray[np.uint8] | Image) -> Image:
+    """Grey levels per pixel, by central differences."""
+    across = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    down = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
+    return np.asarray(cv2.magnitude(across, down))
+
+
+def _normalised(picture: NDArray[np.uint8] | Image, radius_px: int, weight: Image | None) -> Image:
+    """Each pixel less the mean of its neighbourhood, over its deviation; of neighbours with weight alone."""
+    if radius_px == 0:
+        return _masked(picture.astype(np.float32), weight)
     box = (2 * radius_px + 1, 2 * radius_px + 1)
-    if valid is None:
-        smooth = cv2.GaussianBlur(gray, (3, 3), 0)
-        picture: Image = smooth.astype(np.float32)
-        if radius_px == 0:
-            return picture
-        mean = cv2.boxFilter(smooth, cv2.CV_32F, box)
-        square = cv2.sqrBoxFilter(smooth, cv2.CV_32F, box)
+    if weight is None:
+        mean = cv2.boxFilter(picture, cv2.CV_32F, box)
+        square = cv2.sqrBoxFilter(picture, cv2.CV_32F, box)
     else:
-        weight = valid.astype(np.float32)
-        share = np.maximum(cv2.GaussianBlur(weight, (3, 3), 0), 1e-6)
-        picture = cv2.GaussianBlur(gray * weight, (3, 3), 0) / share
-        if radius_px == 0:
-            return picture * weight
         share = np.maximum(cv2.blur(weight, box), 1e-6)
         mean = cv2.blur(picture * weight, box) / share
         square = cv2.blur(picture * picture * weight, box) / share
-    deviation = np.sqrt(np.maximum(square - mean * mean, 0.0) + _NOISE_VARIANCE)
-    normal = (picture - mean) / deviation
-    return np.asarray(normal if valid is None else normal * weight, dtype=np.float32)
+    # In place: on a patch of 228 x 228 pixels fresh memory costs more than the arithmetic.
+    square -= mean * mean
+    np.maximum(square, 0.0, out=square)
+    square += _NOISE_VARIANCE
+    normal = np.subtract(picture, mean, out=mean)
+    normal /= np.sqrt(square, out=square)
+    return _masked(normal, weight)
+
+
+def _masked(picture: Image, weight: Image | None) -> Image:
+    return np.asarray(picture if weight is None else picture * weight, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +169,7 @@ def view_of(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: A
         View | None: None where a corner of the frame looks too near the horizon, see :data:`MAX_RAY_DEG`.
     """
     enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
-    w, h = camera.width_px, camera.height_px
-    pixels = np.array(
-        [[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5], [(w - 1) / 2, (h - 1) / 2]]
-    )
-    rays = np.c_[pixels, np.ones(5)] @ np.linalg.inv(camera.matrix).T @ enu_from_camera.T
+    rays = camera.frame_rays @ enu_from_camera.T
     down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
     if down.min() < np.cos(np.radians(MAX_RAY_DEG)):
         return None
@@ -186,17 +237,18 @@ def _shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], A
 
 def _inscribed_size(view: View, shape: tuple[int, ...], fraction: float) -> tuple[int, int] | None:
     """Width and height of the largest upright rectangle about the view's centre inside the frame."""
-    side = fraction * np.sqrt(view.area_px)
-    half = side / 2.0 * np.stack([np.sqrt(_ASPECTS), 1.0 / np.sqrt(_ASPECTS)], axis=1)  # (A, 2)
-    half = _SHRINKS[:, None, None] * half  # (S, A, 2), largest first
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = view.center_px + half[:, :, None] * signs  # (S, A, 4, 2)
-    image = corners @ view.image_from_map[:, :2].T + view.image_from_map[:, 2]
-    pixels = image[..., :2] / image[..., 2:]
+    side = fraction * math.sqrt(view.area_px)
     limit = np.array([shape[1] - 1, shape[0] - 1])
-    inside = ((pixels >= 0) & (pixels <= limit) & (image[..., 2:] > 0)).all(axis=(-2, -1))  # (S, A)
-    best = int(inside.argmax())
-    if not inside.flat[best]:
+    for shapes in (_RECTANGLES[:1], _RECTANGLES):  # at most headings and tilts the largest fits
+        corners = view.center_px + side * shapes  # (S, A, 4, 2)
+        image = corners @ view.image_from_map[:, :2].T + view.image_from_map[:, 2]
+        depth = image[..., 2:]
+        pixels = image[..., :2] / depth
+        inside = ((pixels >= 0) & (pixels <= limit) & (depth > 0)).all(axis=(-2, -1)).ravel()
+        best = int(inside.argmax())
+        if inside[best]:
+            width, height = (int(2 * side * n) for n in shapes.reshape(-1, 4, 2)[best, 2])
+            break
+    else:
         return None
-    width, height = (int(2 * n) for n in half.reshape(-1, 2)[best])
     return (width, height) if min(width, height) >= 8 else None

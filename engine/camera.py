@@ -156,6 +156,13 @@ class Camera:
         """Mean focal length in pixels."""
         return float((self.matrix[0, 0] + self.matrix[1, 1]) / 2.0)
 
+    @cached_property
+    def frame_rays(self) -> Array:
+        """(5, 3) optical rays of the frame's outer corners, clockwise from the top left, and of its middle."""
+        w, h = self.width_px - 0.5, self.height_px - 0.5
+        pixels = [[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h], [(w - 0.5) / 2, (h - 0.5) / 2]]
+        return np.asarray(np.c_[pixels, np.ones(5)] @ np.linalg.inv(self.matrix).T, dtype=np.float64)
+
     @property
     def distorts(self) -> bool:
         """Whether pixels must be moved before the pinhole model holds."""

@@ -102,12 +102,16 @@ def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Arra
         Aerospace order: heading about down, then pitch about right, then roll about forward.
         Heading clockwise from true north, pitch positive nose up, roll positive right side down.
     """
-    r, p, h = (math.radians(v) for v in (roll_deg, pitch_deg, heading_deg))
-    yaw = np.array([[math.cos(h), -math.sin(h), 0], [math.sin(h), math.cos(h), 0], [0, 0, 1.0]])
-    pitch = np.array([[math.cos(p), 0, math.sin(p)], [0, 1.0, 0], [-math.sin(p), 0, math.cos(p)]])
-    roll = np.array([[1.0, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]])
-    enu_from_ned = np.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -1.0]])
-    return np.asarray(enu_from_ned @ yaw @ pitch @ roll, dtype=np.float64)
+    sr, sp, sh = (math.sin(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
+    cr, cp, ch = (math.cos(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
+    # Rz(heading) Ry(pitch) Rx(roll) takes the body to north-east-down; its rows as east, north and -down.
+    return np.array(
+        [
+            [sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr],
+            [ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr],
+            [sp, -cp * sr, -cp * cr],
+        ]
+    )
 
 
 def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:

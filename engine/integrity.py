@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.geo import enu_from_body, transport_covariance
+from engine.geo import transport_covariance
 from engine.types import Frame, Peak, Reason
 
 Array = NDArray[np.float64]
@@ -70,8 +70,8 @@ def score_sigma(pixels: int) -> float:
 class PeakRule:
     """When a correlation peak is believed.
 
-    Scores are counted in :func:`score_sigma`, so that a rule holds for small patches as for large ones. On 1,300
-    searches of simulated towns for a place that was not there, the best place led its rival by at most 1.3.
+    Scores are counted in :func:`score_sigma`, so that a rule holds for small patches as for large ones. Of 1,134
+    searches of simulated towns for a place that was not there, one led its rival by more than 1.3.
 
     Attributes:
         min_sigmas: a peak below this may be chance.
@@ -121,7 +121,7 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
     # A ridge has no curvature along it: the peak is then known to a few pixels there, not infinitely badly.
     values, vectors = np.linalg.eigh(information)
     variances = np.clip(1.0 / np.maximum(values, 1e-9), 0.05**2, 5.0**2)
-    return np.asarray(vectors @ np.diag(variances) @ vectors.T, dtype=np.float64)
+    return np.asarray((vectors * variances) @ vectors.T, dtype=np.float64)
 
 
 def ncc_covariance_m2(
@@ -142,10 +142,8 @@ def ncc_covariance_m2(
     ]
     height_sigma = math.hypot(errors.height_m, errors.height_share * height)
     sigmas = np.array([height_sigma, *tilts, errors.heading_deg])
-    columns = [
-        (_aim_m(camera, values + step) - _aim_m(camera, values - step)) / 2.0 for step in np.diag(sigmas)
-    ]  # each column is already scaled by its sigma
-    spread = np.stack(columns, axis=1)
+    aims = _aim_m(camera, np.concatenate([values + np.diag(sigmas), values - np.diag(sigmas)]))
+    spread = (aims[:4] - aims[4:]).T / 2.0  # each column is already scaled by its sigma
     horizontal = spread @ spread.T + transport_covariance(enu_jacobian, peak_px2) + errors.map_m**2 * np.eye(2)
     covariance = np.diag([0.0, 0.0, height_sigma**2])
     covariance[:2, :2] = horizontal
@@ -153,7 +151,17 @@ def ncc_covariance_m2(
 
 
 def _aim_m(camera: Camera, values: Array) -> Array:
-    """Where the optical axis meets the ground, (2,) metres east and north of the nadir."""
-    height, roll, pitch, heading = values
-    axis = enu_from_body(roll, pitch, heading) @ camera.mount[:, 2]
-    return np.asarray(axis[:2] * (height / max(-axis[2], 1e-3)), dtype=np.float64)
+    """Where the optical axis meets the ground, (N, 2) metres east and north of the nadir.
+
+    Args:
+        camera: its mount says which way of the body is the axis.
+        values: (N, 4) height in metres; roll, pitch and heading in degrees.
+    """
+    forward, right, down = camera.mount[:, 2]
+    sr, sp, sh = np.sin(np.radians(values[:, 1:])).T
+    cr, cp, ch = np.cos(np.radians(values[:, 1:])).T
+    ahead = cp * forward + sp * (sr * right + cr * down)  # along the heading, see engine.geo.enu_from_body
+    aside = cr * right - sr * down
+    below = -sp * forward + cp * (sr * right + cr * down)
+    reach = values[:, 0] / np.maximum(below, 1e-3)
+    return np.stack([(sh * ahead + ch * aside) * reach, (ch * ahead - sh * aside) * reach], axis=1)

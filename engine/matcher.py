@@ -76,7 +76,7 @@ class SceneMatcher:
         self.camera = camera
         self.method = method
         self.device = devices.resolve(device)
-        self._prepared = PreparedMap(site, self.device, self.options.ncc.enhance_radius_px)
+        self._prepared = PreparedMap(site, self.device, self.options.ncc.enhance_radius_px, self.options.ncc.score)
         # What an undistorted picture obeys; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 

@@ -167,18 +167,25 @@ def surface(search: Search, templates: Tensor) -> Tensor:
     """Zero-mean NCC (T, H-h+1, W-w+1) of float32 templates (T, h, w) with a prepared piece of map."""
     if templates.ndim != 3 or 0 in templates.shape:
         raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
+    _check_fit(search, templates)
+    return next(surfaces(search, templates, group=templates.shape[0]))
+
+
+def _check_fit(search: Search, templates: Tensor) -> None:
     (H, W), (h, w) = search.image.shape, templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
-    return next(surfaces(search, templates, group=templates.shape[0]))
 
 
 def surfaces(search: Search, templates: Tensor, *, group: int) -> Iterator[Tensor]:
     """The same for ``group`` templates at a time, which bounds the memory of many templates on a large map."""
     inverse_norms = kernels.inverse_norm(search.sums, *templates.shape[-2:])
     for part in templates.split(group):
-        centred = part - part.mean(dim=(-2, -1), keepdim=True)
-        yield kernels.prepared_surface(search.image, inverse_norms, centred)
+        yield kernels.prepared_surface(search.image, inverse_norms, _centred(part))
+
+
+def _centred(templates: Tensor) -> Tensor:
+    return templates - templates.mean(dim=(-2, -1), keepdim=True)
 
 
 def match_template(search: Search, template: Tensor, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
@@ -187,7 +194,7 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
     Coarse to fine: all places are scored at reduced resolution, the best few at full resolution. It is safe where
     no place that was left out can win: the coarse scores are taken to be wrong by no more than twice what they
     were wrong by at the places that were looked at. Where that does not exclude every other place, and with
-    ``exhaustive``, all places are scored at full resolution.
+    ``exhaustive`` or on another device than the CPU, all places are scored at full resolution.
 
     Args:
         search: from :func:`prepare`.
@@ -198,11 +205,34 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
     if template.ndim != 2 or 0 in template.shape:
         raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
     with torch.inference_mode():
-        if not exhaustive and search.image.device.type == "cpu":
+        if search.image.device.type != "cpu":
+            return _peak_on_device(search, template, exclusion_px)
+        if not exhaustive:
             found = _coarse_to_fine(search, template, exclusion_px)
             if found is not None:
                 return found
         return find_peak(surface(search, template[None]), exclusion_px=exclusion_px)
+
+
+def _peak_on_device(search: Search, template: Tensor, exclusion_px: float) -> Peak:
+    """:func:`find_peak` of the surface, bit for bit; 28 numbers leave the device, in one copy."""
+    _check_fit(search, template[None])
+    inverse_norms = kernels.inverse_norm(search.sums, *template.shape)
+    products = kernels.products(search.image, _centred(template[None]))
+    best, place = kernels.peak(products, inverse_norms)
+    second = kernels.rival(products, inverse_norms, place, math.floor(exclusion_px * exclusion_px))
+    height, width = inverse_norms.shape
+    near = torch.arange(-2, 3, device=place.device)
+    rows = (place // width + near).clamp_(0, height - 1)[:, None]
+    columns = (place % width + near).clamp_(0, width - 1)
+    around = (products[0, rows, columns] * inverse_norms[rows, columns]).clamp_(-1.0, 1.0)
+    found = torch.cat([part.double() for part in (place, best, second, around.flatten())]).cpu().numpy()
+    y, x = divmod(int(found[0]), width)
+    dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
+    r = min(2, x, y, width - 1 - x, height - 1 - y)
+    if r > 0:
+        dx, dy, curvature = fit_summit(found[3:].reshape(5, 5)[2 - r : 3 + r, 2 - r : 3 + r])
+    return Peak(x + dx, y + dy, float(found[1]), float(found[2]), curvature)
 
 
 def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Peak | None:
@@ -222,23 +252,48 @@ def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Pe
     inverse_norms = kernels.inverse_norm(coarse.sums, *model.shape)
     scores = kernels.prepared_surface(coarse.image, inverse_norms, model[None])[0]
     places = best_places(scores, _SEPARATION_PX, _CANDIDATES + 1)
+    loss = _phase_loss(levels[-2][1], model)
     best: Peak | None = None
     doubt, others = 0.0, []
     for index, (x, y, score) in enumerate(places):
         if best is not None and score + doubt < best.score:
-            others += [Peak(x * scale, y * scale, score, -1.0, np.zeros((2, 2))) for x, y, score in places[index:]]
             break  # places come in falling order: none of the rest can win
         if index == _CANDIDATES:
             return None
         found = _refined(levels, scores, x, y)
         if found is None:
             return None
-        doubt = max(doubt, 2.0 * abs(found.score - score) + 0.01)
         others.append(found)
         best = found if best is None or found.score > best.score else best
+        doubt = max(doubt, 2.0 * abs(found.score - score) + 0.01, loss * best.score + 0.01)
     assert best is not None  # a surface has a highest place
-    away = [p.score for p in others if math.hypot(p.x - best.x, p.y - best.y) > exclusion_px]
-    return replace(best, second_score=max(away, default=-1.0))
+    rivals = [
+        (found, place)
+        for found, place in zip(others, places, strict=False)
+        if math.hypot(found.x - best.x, found.y - best.y) > exclusion_px
+    ]
+    rest = _coarse_rest(scores, [place for _, place in rivals], scale, best, exclusion_px)
+    return replace(best, second_score=max([rest, *(found.score for found, _ in rivals)]))
+
+
+def _phase_loss(fine: Tensor, coarse: Tensor) -> float:
+    """How much a perfect match loses on the coarser of two levels where it lies between that level's pixels."""
+    between = _halved(fine[1:, 1:]).ravel()
+    model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
+    norm = float(torch.linalg.vector_norm(between) * torch.linalg.vector_norm(model))
+    return 1.0 - float(torch.dot(between, model)) / norm if norm > 0.0 else 1.0
+
+
+def _coarse_rest(
+    scores: Tensor, rivals: list[tuple[int, int, float]], scale: int, best: Peak, exclusion_px: float
+) -> float:
+    """The best coarse score outside the peak's exclusion zone and away from the rivals that were looked at."""
+    left, r = scores.numpy().copy(), _SEPARATION_PX
+    for x, y, _ in rivals:
+        left[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
+    rows, columns = np.ogrid[: left.shape[0], : left.shape[1]]
+    left[np.square(columns * scale - best.x) + np.square(rows * scale - best.y) <= exclusion_px**2] = -1.0
+    return float(left.max())
 
 
 def _refined(levels: list[tuple[Search, Tensor]], scores: Tensor, x: int, y: int) -> Peak | None:

@@ -134,6 +134,6 @@ def fit_summit(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.flo
         last_x, last_y = x, y
         x = min(0.5, max(-0.5, x - (yy * gx - xy * gy) / determinant))
         y = min(0.5, max(-0.5, y - (xx * gy - xy * gx) / determinant))
-        if abs(x - last_x) + abs(y - last_y) < _NEWTON_END_PX:
+        if n == 3 or abs(x - last_x) + abs(y - last_y) < _NEWTON_END_PX:  # a quadratic takes one step
             break
     return x, y, np.array([[xx, xy], [xy, yy]])

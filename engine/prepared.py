@@ -22,7 +22,7 @@ CELL_PX = 512
 """Regions begin and end on multiples of this, so that neighbouring windows share one."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
-MAX_REGION_PX = 12 << 20
+MAX_REGION_PX = 6 << 20
 """Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 27 bytes."""
 _HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
 
@@ -49,10 +49,11 @@ class PreparedMap:
         site: the map.
         device: where the regions live.
         radius_px: of the local normalisation, see :func:`engine.align.enhance`.
+        score: what frames are enhanced by, see there.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, radius_px: int) -> None:
-        self._site, self._device, self._radius_px = site, device, radius_px
+    def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:
+        self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
         self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()
 
     def cut(self, window: Window, level: int) -> Region:
@@ -106,7 +107,7 @@ class PreparedMap:
     def _prepare(self, window: Window, level: int) -> Region:
         """Enhance with the neighbourhood that the map has beyond the region, so that regions join seamlessly."""
         rows, columns = self._site.level_shape(level)
-        margin = self._radius_px + 1
+        margin = self._radius_px + 2  # the box, the difference of neighbours, the smoothing
         x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
         x1 = min(columns, window.x0 + window.width_px + margin)
         y1 = min(rows, window.y0 + window.height_px + margin)
@@ -115,7 +116,8 @@ class PreparedMap:
         if not self._site.fully_valid:
             mask = self._site.valid(wide, level)
             mask = None if mask.all() else mask
-        picture = enhance(self._site.gray(wide, level), radius_px=self._radius_px, valid=mask)
+        gray = self._site.gray(wide, level)
+        picture = enhance(gray, radius_px=self._radius_px, score=self._score, valid=mask)
         inner = np.s_[
             window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
         ]

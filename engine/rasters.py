@@ -51,6 +51,7 @@ COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
 OVERVIEW_PX = 4096
 """Stretch and collar are found on a copy of at most this many pixels a side."""
+_GDAL_CACHE_BYTES = 128 * 2**20  # GDAL's own cache is a twentieth of the machine's memory
 MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
 HEIGHT_RANGE_M = (-1000.0, 20000.0)
@@ -68,13 +69,15 @@ class Source:
 
 @contextmanager
 def map_errors(argument: str, path: Path) -> Iterator[None]:
-    """Turn what rasterio raises into one line."""
+    """Turn what rasterio raises into one line, and keep GDAL's cache of blocks small while it reads."""
+    import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            yield
+            with rasterio.Env(GDAL_CACHEMAX=_GDAL_CACHE_BYTES):
+                yield
         except (RasterioError, OSError, ValueError) as error:
             reason = str(error.__cause__ or error).splitlines()[0]
             raise MapError(f"{argument}: cannot read {path}: {reason}") from None

@@ -5,6 +5,8 @@ Tests compare every kernel with :mod:`engine.kernels.reference`, which is slow, 
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 from torch import Tensor
 
 from engine.kernels import eager, masked
@@ -17,7 +19,10 @@ __all__ = [
     "inverse_norm",
     "masked_ncc_surface",
     "ncc_surface",
+    "peak",
     "prepared_surface",
+    "products",
+    "rival",
 ]
 
 
@@ -46,6 +51,41 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
 def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
     """Zero-mean NCC of (T, h, w) zero-mean float32 templates with a picture whose patches' norms are known."""
     return eager.prepared_surface(image, inverse_norms, templates)
+
+
+def products(image: Tensor, templates: Tensor) -> Tensor:
+    """What :func:`prepared_surface` is before its division by the patches' norms: numerators (T, H', W')."""
+    return eager.products(image, templates)
+
+
+def peak(products: Tensor, inverse_norms: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Best score (T,) of every template's numerators and its flat place (T,) in (H', W'), the lowest of equals.
+
+    Where ``valid`` (H', W') is False a place scores -1. Nothing leaves the device.
+    """
+    if _by_triton(products):
+        from engine.kernels import triton_peak
+
+        return triton_peak.peak(products, inverse_norms, valid)
+    return eager.peak(products, inverse_norms, valid)
+
+
+def rival(
+    products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int, valid: Tensor | None = None
+) -> Tensor:
+    """Best score (T,) of every template's numerators outside a disc about a flat place; -1 where nothing is.
+
+    Places whose squared distance from ``winner`` (one int64) is at most ``radius_squared`` lie inside.
+    """
+    if _by_triton(products):
+        from engine.kernels import triton_peak
+
+        return triton_peak.rival(products, inverse_norms, valid, winner, radius_squared)
+    return eager.rival(products, inverse_norms, valid, winner, radius_squared)
+
+
+def _by_triton(tensor: Tensor) -> bool:
+    return tensor.device.type == "cuda" and find_spec("triton") is not None
 
 
 def halved(image: Tensor) -> Tensor:

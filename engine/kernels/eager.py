@@ -49,6 +49,7 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
     if zero_mean:  # NCC does not see the window's mean, but the squares below stay small without it
         search = (search - search.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)).to(search.dtype)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)
+        templates = templates - templates.mean(dim=(-2, -1), keepdim=True)  # what rounding left of a flat one
     scores = [_one_surface(picture, group, zero_mean) for picture, group in zip(search, templates, strict=True)]
     return torch.stack(scores).to(search.dtype)
 
@@ -75,8 +76,36 @@ def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) ->
         inverse_norms: (H-h+1, W-w+1) from :func:`inverse_norm`.
         templates: (T, h, w) float32 of zero mean.
     """
+    return products(image, templates).mul_(inverse_norms).clamp_(-1.0, 1.0)
+
+
+def products(image: Tensor, templates: Tensor) -> Tensor:
+    """Numerators of the same (T, H-h+1, W-w+1), the templates scaled to a norm of 1."""
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True).clamp_min_(_TINY)
-    return correlate(image, templates / norm).mul_(inverse_norms).clamp_(-1.0, 1.0)
+    return correlate(image, templates / norm)
+
+
+def peak(products: Tensor, inverse_norms: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Best score (T,) of every template and its flat place (T,), the lowest of equals; invalid places score -1."""
+    scores = _scores(products, inverse_norms, valid).flatten(1)
+    places = scores.argmax(dim=1, keepdim=True)
+    return scores.gather(1, places)[:, 0], places[:, 0]
+
+
+def rival(
+    products: Tensor, inverse_norms: Tensor, valid: Tensor | None, winner: Tensor, radius_squared: int
+) -> Tensor:
+    """Best score (T,) of every template further than a radius from a flat place; -1 where nothing is."""
+    height, width = inverse_norms.shape
+    dy = torch.arange(height, device=winner.device)[:, None] - winner // width
+    dx = torch.arange(width, device=winner.device) - winner % width
+    scores = _scores(products, inverse_norms, valid)
+    return scores.masked_fill_(dy * dy + dx * dx <= radius_squared, -1.0).amax(dim=(1, 2))
+
+
+def _scores(products: Tensor, inverse_norms: Tensor, valid: Tensor | None) -> Tensor:
+    scores = (products * inverse_norms).clamp_(-1.0, 1.0)
+    return scores if valid is None else scores.masked_fill_(~valid, -1.0)
 
 
 def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
@@ -87,16 +116,21 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
         h: rows of a patch.
         w: columns of a patch.
     """
-    floor = _FLAT_SHARE * (sums[1, -1, -1] - sums[1, 0, 0])  # no less than the window's own energy
     if (
         sums.device.type == "cpu" and sums[0].numel() <= _SMALL_PX
-    ):  # on small surfaces a call of torch's costs more than the work that it does
+    ):  # there a call of torch's costs more than its work
         s = sums.numpy()
-        total, square = s[:, h:, w:] - s[:, :-h, w:] - s[:, h:, :-w] + s[:, :-h, :-w]
-        square -= total * total * (1.0 / (h * w))
-        square[square <= float(floor)] = np.inf
-        return torch.from_numpy((1.0 / np.sqrt(square)).astype(np.float32))
+        boxes = s[:, h:, w:] - s[:, :-h, w:]
+        boxes -= s[:, h:, :-w]
+        boxes += s[:, :-h, :-w]
+        total, square = boxes
+        square -= np.square(total, out=total) * (1.0 / (h * w))
+        floor = _FLAT_SHARE * (s[1, -1, -1] - s[1, 0, 0])
+        if square.min() <= floor:
+            square[square <= floor] = np.inf
+        return torch.from_numpy(np.reciprocal(np.sqrt(square, out=square), out=square).astype(np.float32))
     energy = box_energy(sums, h, w)
+    floor = _FLAT_SHARE * (sums[1, -1, -1] - sums[1, 0, 0])  # no less than the window's own energy
     return energy.masked_fill_(energy <= floor, torch.inf).float().rsqrt_()
 
 

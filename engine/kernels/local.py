@@ -27,28 +27,26 @@ class LocalScores:
     REACH = 3
 
     def __init__(self, image: Image, sums: Sums, template: Image, middle: tuple[int, int]) -> None:
-        self._sums = sums
-        self._h, self._w = h, w = template.shape
+        h, w = template.shape
         self.limits = (image.shape[0] - h, image.shape[1] - w)
         """The last row and column at which the template fits."""
-        y0, x0 = (max(0, v - self.REACH) for v in middle)
-        y1, x1 = (min(limit, v + self.REACH) for limit, v in zip(self.limits, middle, strict=True))
+        y0, x0 = self._corner = (max(0, middle[0] - self.REACH), max(0, middle[1] - self.REACH))
+        y1, x1 = min(self.limits[0], middle[0] + self.REACH), min(self.limits[1], middle[1] + self.REACH)
         self._row = w + x1 - x0
-        self._corner = y0 * self._row + x0
         self._patch = np.ascontiguousarray(image[y0 : y1 + h, x0 : x1 + w]).ravel()
         padded = np.zeros((h, self._row), np.float32)
         padded[:, :w] = template
         self._template = padded.ravel()[: (h - 1) * self._row + w]
-        self._template_energy = float(np.dot(self._template, self._template))
+        # The patches' sums of squares about their means, at every place within reach.
+        s = sums[:, y0 : y1 + h + 1, x0 : x1 + w + 1]
+        total, square = s[:, h:, w:] - s[:, :-h, w:] - s[:, h:, :-w] + s[:, :-h, :-w]
+        energy = np.maximum(square - total * total / (h * w), 0.0) * float(np.dot(self._template, self._template))
+        self._inverse_norm = np.divide(1.0, np.sqrt(energy), out=np.zeros_like(energy), where=energy > 0)
 
     def at(self, y: Index, x: Index) -> Sums:
         """Scores (N,) at rows ``y`` and columns ``x``, all of them places at which the template fits."""
-        starts = (y * self._row + x - self._corner).tolist()
-        size = self._template.size
-        products = [np.dot(self._patch[k : k + size], self._template) for k in starts]
-        bottom, right, sums = y + self._h, x + self._w, self._sums
-        total, square = sums[:, bottom, right] - sums[:, y, right] - sums[:, bottom, x] + sums[:, y, x]
-        energy = np.maximum(square - total * total / (self._h * self._w), 0.0)
-        norm = np.sqrt(energy * self._template_energy)
-        scores: Sums = np.divide(products, norm, out=np.zeros(len(products)), where=norm > 0)
+        j, i = y - self._corner[0], x - self._corner[1]
+        template, patch, size = self._template, self._patch, self._template.size
+        products = [np.dot(patch[k : k + size], template) for k in (j * self._row + i).tolist()]
+        scores: Sums = products * self._inverse_norm[j, i]
         return scores.clip(-1.0, 1.0)

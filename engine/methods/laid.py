@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import MIN_SHRINK, Patch, View, enhance, rectify, view_of
+from engine.align import MIN_SHRINK, Patch, View, check_score, enhance, rectify, view_of
 from engine.errors import OptionError
 from engine.integrity import AssumedErrors, PeakRule
 from engine.methods.query import Query, level_crop
@@ -29,7 +29,8 @@ class NccOptions:
     Attributes:
         margin: the 1.3 of equations 4 and 5.
         fraction: the rectified patch's size against the frame's.
-        enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out.
+        score: what is correlated: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
+        enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
         min_valid_share: a place counts only where this share of the patch lies on map that is not nodata.
         exhaustive: score every place of the window at full resolution.
         heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
@@ -41,6 +42,7 @@ class NccOptions:
 
     margin: float = 1.3
     fraction: float = 0.7
+    score: str = "local"
     enhance_radius_px: int = 8
     min_valid_share: float = 0.9
     exhaustive: bool = False
@@ -58,6 +60,7 @@ class NccOptions:
         for name, limit in (("heading_search_deg", 180.0), ("height_search_share", 0.5)):
             if not 0.0 <= getattr(self, name) <= limit:
                 raise OptionError(f"{name}: expected 0 to {limit:g}, got {getattr(self, name)}")
+        check_score(self.score)
         if self.enhance_radius_px < 0:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
 
@@ -100,7 +103,8 @@ def align(query: Query, frame: Frame, level: int, options: NccOptions) -> Aligne
     if patch is None:
         detail = "the frame covers fewer than 8 x 8 pixels of the map"
         return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
-    template = torch.from_numpy(enhance(patch.gray, radius_px=options.enhance_radius_px)).to(query.device)
+    enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+    template = torch.from_numpy(enhanced).to(query.device)
     return Aligned(frame, level, jacobian, view, patch, template)
 
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -138,7 +139,7 @@ class Query:
 
     def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
         """A refusal where the picture has no texture to match, else None."""
-        deviation = float(self.gray.std())
+        deviation = float(cv2.meanStdDev(self.gray)[1][0, 0])
         if deviation >= min_deviation:
             return None
         figure = f"the frame's grey levels deviate by {deviation:.1f}"

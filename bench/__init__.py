@@ -1,0 +1,1 @@
+"""Benchmarks: a speed is a ratio against a named peer, in one run, on one input, beside its accuracy."""

@@ -1,0 +1,40 @@
+"""What every benchmark needs: a fixed number of threads, and the peak memory of one call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from engine import device
+
+
+@pytest.fixture(params=[1, 2], ids=["1thread", "2threads"])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    """Both libraries use so many threads."""
+    count: int = request.param
+    if count > (os.cpu_count() or 1):
+        pytest.skip(f"this machine has fewer than {count} cores")
+    device.set_threads(count)
+    yield count
+    device.set_threads(1)
+
+
+def peak_memory_mb(call: Callable[[], Any]) -> float | None:
+    """By how much one call raises the process's resident memory at its highest; None where Linux does not tell."""
+    status, clear = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    try:
+        clear.write_text("5")  # forget the highest so far
+        before = _kilobytes(status, "VmRSS")
+        call()
+        return (_kilobytes(status, "VmHWM") - before) / 1e3
+    except (OSError, ValueError):
+        return None
+
+
+def _kilobytes(status: Path, name: str) -> int:
+    line = next(line for line in status.read_text().splitlines() if line.startswith(name))
+    return int(line.split()[1])
