@@ -134,8 +134,8 @@ def _step_section(rows: list[dict[str, Any]]) -> list[str]:
         "## The whole step: a 300 x 300 colour frame in, position out",
         "",
         "Grey, enhanced, rectified, matched in the adaptive window, sub-pixel, as coordinates; the engine also",
-        "judges the peak and states a covariance. `OpenCV` enhances the window in every frame, `map prepared` once,",
-        "before.",
+        "judges the peak and states a covariance. `OpenCV` enhances the window in every frame; with `map",
+        "prepared` it keeps the enhanced map.",
         "",
         *_table(["who", "threads", "median ms", "p95 ms", "ratio to OpenCV", "RMS m"], cells),
     ]

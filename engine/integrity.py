@@ -71,12 +71,16 @@ class PeakRule:
     """When a correlation peak is believed.
 
     Scores are counted in :func:`score_sigma`, so that a rule holds for small patches as for large ones. Of 1,134
-    searches of simulated towns for a place that was not there, one led its rival by more than 1.3.
+    searches of simulated towns for a place that was not there, one led its rival by more than 1.3; on
+    324 with the heading or height searched for, the best reached 11.1 and led by at most 6.7.
 
     Attributes:
         min_sigmas: a peak below this may be chance.
         min_margin_sigmas: how far the best rival must stay below the peak.
         min_margin_sigmas_whole_map: the same where the whole map was searched and nothing else vouches for it.
+        min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
+            another town, turned until they fit, look like these.
+        min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
@@ -84,6 +88,8 @@ class PeakRule:
     min_sigmas: float = 4.0
     min_margin_sigmas: float = 1.4
     min_margin_sigmas_whole_map: float = 2.5
+    min_sigmas_searched: float = 13.0
+    min_margin_sigmas_searched: float = 8.0
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 
@@ -91,17 +97,26 @@ class PeakRule:
         _check_positive(self, *self.__dataclass_fields__)
 
 
-def judge_peak(peak: Peak, pixels: int, rule: PeakRule, *, whole_map: bool) -> tuple[Reason, str] | None:
-    """The reason to refuse the peak of a patch of so many pixels, with its figures, or None: believed."""
+def judge_peak(
+    peak: Peak, pixels: int, rule: PeakRule, *, whole_map: bool, searched: bool = False
+) -> tuple[Reason, str] | None:
+    """The reason to refuse a peak, with its figures, or None where it is believed.
+
+    Args:
+        peak: the peak.
+        pixels: of the patch.
+        rule: the thresholds.
+        whole_map: nothing was known of the position.
+        searched: the heading or the height was searched for.
+    """
     sigma = score_sigma(pixels)
-    if peak.score < rule.min_sigmas * sigma:
-        return (
-            Reason.LOW_SCORE,
-            f"best NCC {peak.score:.3f} may be chance; {rule.min_sigmas * sigma:.3f} is asked for",
-        )
+    least = sigma * (rule.min_sigmas_searched if searched else rule.min_sigmas)
+    if peak.score < least:
+        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f} may be chance; {least:.3f} is asked for"
     if not peak.curvature.any():
         return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
-    margin = sigma * (rule.min_margin_sigmas_whole_map if whole_map else rule.min_margin_sigmas)
+    margin = rule.min_margin_sigmas_whole_map if whole_map else rule.min_margin_sigmas
+    margin = sigma * (rule.min_margin_sigmas_searched if searched else margin)
     if peak.score - peak.second_score < margin:
         rival = f"a rival reaches {peak.second_score:.3f}"
         return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"

@@ -109,15 +109,15 @@ def _finish(
         if isinstance(fine, NoFix):
             continue
         better = _near(query, prepared, fine, _nadir_px(query, peak, aligned), aligned.level + 1, options)
-        if better is not None:
-            final.append((better, fine))
+        if better is None:
+            continue
+        # Rivals get as good a heading and height as the winner, or the lead would be that of the refinement.
+        final.append(_refine(query, prepared, better, fine, options, _FINE_ROUNDS) if refine else (better, fine))
     if not final:
         return None
     final.sort(key=lambda pair: -pair[0].score)
     best, aligned = final[0]
     rival = _best_elsewhere(query, final, options.rule.exclusion_m)
-    if refine:
-        best, aligned = _refine(query, prepared, best, aligned, options, _FINE_ROUNDS)
     return replace(best, second_score=max(rival, best.second_score)), aligned
 
 

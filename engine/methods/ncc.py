@@ -34,7 +34,8 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions) -> Fix | No
     window = window_about(query, aligned, options)
     if window is None:
         return query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
-    if bank.is_trusted(frame, options) and query.prior is not None:
+    trusted = bank.is_trusted(frame, options)
+    if trusted and query.prior is not None:
         peak = search(query, prepared, aligned, window, options)
     else:
         peak, aligned = bank.search(query, prepared, aligned, window, options)
@@ -43,7 +44,9 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions) -> Fix | No
         return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
     if query.watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
-    refusal = judge_peak(peak, aligned.template.numel(), options.rule, whole_map=query.prior is None)
+    whole_map = query.prior is None
+    pixels = aligned.template.numel()
+    refusal = judge_peak(peak, pixels, options.rule, whole_map=whole_map, searched=not trusted)
     if refusal is not None:
         return query.refuse(*refusal, METHOD, score=peak.score, window=window)
     return _fix(query, aligned, peak, window, options)
