@@ -126,7 +126,7 @@ def _normalised(picture: NDArray[np.uint8] | Image, radius_px: int, weight: Imag
     square -= mean * mean
     np.maximum(square, 0.0, out=square)
     square += _NOISE_VARIANCE
-    normal = np.subtract(picture, mean, out=mean)
+    normal = np.subtract(picture.astype(np.float32, copy=False), mean, out=mean)
     normal /= np.sqrt(square, out=square)
     return _masked(normal, weight)
 

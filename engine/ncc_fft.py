@@ -291,8 +291,10 @@ def _coarse_rest(
     left, r = scores.numpy().copy(), _SEPARATION_PX
     for x, y, _ in rivals:
         left[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
-    rows, columns = np.ogrid[: left.shape[0], : left.shape[1]]
-    left[np.square(columns * scale - best.x) + np.square(rows * scale - best.y) <= exclusion_px**2] = -1.0
+    down, across = (
+        np.square(np.arange(n) * scale - at) for n, at in zip(left.shape, (best.y, best.x), strict=True)
+    )
+    left[down[:, None] + across <= exclusion_px**2] = -1.0
     return float(left.max())
 
 

@@ -30,12 +30,13 @@ Array = NDArray[np.float64]
 _COARSE_PLACES = 4_000_000
 _COARSE_TEMPLATE_PX = 20
 _CANDIDATES = 8
-_FINALISTS = 3
+_SEMIFINALISTS = 4
+_FINALISTS = 2
 _GROUP = 2  # templates in one batch, which bounds the memory of their surfaces
 _SLACK_PX = 3  # by which a place that was found on a level may be wrong, in pixels of that level
 _EDGE_PX = 1.5  # by which a hypothesis may move the corner of the patch
 _MIDDLE_ROUNDS = 2
-_FINE_ROUNDS = 3
+_FINE_ROUNDS = 2
 
 
 def is_trusted(frame: Frame, options: NccOptions) -> bool:
@@ -43,27 +44,28 @@ def is_trusted(frame: Frame, options: NccOptions) -> bool:
     return frame.heading_deg is not None and options.heading_search_deg == options.height_search_share == 0.0
 
 
-def _hypotheses(frame: Frame, options: NccOptions, reach_px: float) -> list[Frame]:
-    """The frame under headings and heights that leave no edge of a patch further off than :data:`_EDGE_PX`.
+def _hypotheses(frame: Frame, turns: list[float], shares: list[float]) -> list[Frame]:
+    """The frame with its heading turned by each of ``turns`` and its height changed by each of ``shares``."""
+    height, heading = frame.height_agl_m, frame.heading_deg or 0.0
+    assert height is not None  # ncc.locate() refused the frame otherwise
+    return [
+        replace(frame, heading_deg=(heading + turn) % 360.0, height_agl_m=height * (1.0 + share))
+        for turn, share in itertools.product(turns, shares)
+    ]
+
+
+def _grid(options: NccOptions, reach_px: float) -> tuple[list[float], list[float]]:
+    """Turns in degrees and shares of the height that leave no corner of a patch off by more than :data:`_EDGE_PX`.
 
     Args:
-        frame: as it came.
-        options: how far its heading and height may be off.
+        options: how far heading and height may be off.
         reach_px: from the patch's middle to its corner, on the level where the hypotheses are scored.
     """
-    assert frame.height_agl_m is not None
     step = 2.0 * _EDGE_PX / reach_px  # radians, or a share of the height: both move the corner by step * reach
     turns = _steps(options.heading_search_deg, math.degrees(step))
     if options.heading_search_deg == 180.0:
         turns = turns[:-1]  # -180 and 180 are one heading
-    return [
-        replace(
-            frame,
-            heading_deg=((frame.heading_deg or 0.0) + turn) % 360.0,
-            height_agl_m=frame.height_agl_m * (1.0 + share),
-        )
-        for turn, share in itertools.product(turns, _steps(options.height_search_share, step))
-    ]
+    return turns, _steps(options.height_search_share, step)
 
 
 def _steps(reach: float, step: float) -> list[float]:
@@ -85,12 +87,11 @@ def search(
         aligned = laid.align(query, frame, middle, options)
         peak = None if isinstance(aligned, NoFix) else _near(query, prepared, aligned, nadir, level, options)
         if peak is not None and isinstance(aligned, Aligned):
-            if len(frames) > 1:
-                peak, aligned = _refine(query, prepared, peak, aligned, options, _MIDDLE_ROUNDS)
             found.append((peak, aligned))
-    if not found:
-        return None, first
     found.sort(key=lambda pair: -pair[0].score)
+    if len(frames) > 1:
+        found = [_refine(query, prepared, *pair, options, _MIDDLE_ROUNDS) for pair in found[:_SEMIFINALISTS]]
+        found.sort(key=lambda pair: -pair[0].score)
     return _finish(query, prepared, found, first.level, len(frames) > 1, options) or (None, first)
 
 
@@ -126,10 +127,10 @@ def _coarse_level(query: Query, first: Aligned, window: Window, options: NccOpti
     level = first.level
     while True:
         h, w = (n >> (level - first.level) for n in first.template.shape)
-        frames = _hypotheses(query.frame, options, math.hypot(h, w) / 2.0)
-        places = len(frames) * window.area_px / 4**level
+        turns, shares = _grid(options, math.hypot(h, w) / 2.0)
+        places = len(turns) * len(shares) * window.area_px / 4**level
         if places <= _COARSE_PLACES or level + 1 == query.site.levels or min(h, w) >> 1 < _COARSE_TEMPLATE_PX:
-            return level, frames
+            return level, _hypotheses(query.frame, turns, shares)
         level += 1
 
 
