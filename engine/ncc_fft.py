@@ -29,7 +29,7 @@ _WORTH_HALVING_PX = 128 * 128
 _CANDIDATES = 6
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
 _MAX_HALVINGS = 3
-_UPHILL_STEPS = 2  # within the reach of one LocalScores
+_UPHILL_STEPS = 4  # within the reach of one LocalScores
 
 
 def ncc(
@@ -299,24 +299,21 @@ def _coarse_rest(
 
 
 def _refined(levels: list[tuple[Search, Tensor]], scores: Tensor, x: int, y: int) -> Peak | None:
-    """Follow a place of the coarsest level down to full resolution; None where it runs into the window's edge."""
+    """A coarse place at full resolution; None where it runs into the window's edge, or too far uphill."""
     if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
         return None
-    around = scores[y - 1 : y + 2, x - 1 : x + 2].double().numpy()
-    for piece, model in reversed(levels[:-1]):
-        dx, dy, _ = fit_summit(around)
-        y, x = round(2 * (y + dy)), round(2 * (x + dx))
-        scorer = kernels.LocalScores(piece.image.numpy(), piece.sums.numpy(), model.numpy(), (y, x))
-        for uphill in range(_UPHILL_STEPS + 1):
-            if uphill == _UPHILL_STEPS or not all(
-                2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)
-            ):
-                return None
-            around = scorer.at(y + NEAR[0], x + NEAR[1]).reshape(3, 3)
-            best = int(around.argmax())
-            if best == 4:
-                break
-            y, x = y + best // 3 - 1, x + best % 3 - 1
+    (piece, model), scale = levels[0], 2 ** (len(levels) - 1)
+    dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].double().numpy())
+    y, x = round(scale * (y + dy)), round(scale * (x + dx))
+    scorer = kernels.LocalScores(piece.image.numpy(), piece.sums.numpy(), model.numpy(), (y, x))
+    for uphill in range(_UPHILL_STEPS + 1):
+        if uphill == _UPHILL_STEPS or not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
+            return None
+        around = scorer.at(y + NEAR[0], x + NEAR[1]).reshape(3, 3)
+        best = int(around.argmax())
+        if best == 4:
+            break
+        y, x = y + best // 3 - 1, x + best % 3 - 1
     wide = np.zeros((5, 5))
     wide[1:4, 1:4] = around
     wide[FAR[0] + 2, FAR[1] + 2] = scorer.at(y + FAR[0], x + FAR[1])

@@ -24,7 +24,7 @@ class LocalScores:
         middle: (y, x); places that are asked for lie within ``REACH`` of it.
     """
 
-    REACH = 3
+    REACH = 5
 
     def __init__(self, image: Image, sums: Sums, template: Image, middle: tuple[int, int]) -> None:
         h, w = template.shape
