@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import platform
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,12 @@ from engine import device
 
 DOCS = Path(__file__).parents[1] / "docs"
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "bank": "OpenCV loop"}
-INTRO = """# Benchmarks
-
-Made by `make bench`; every figure below comes from one run of it, on {machine}. A time is the
-median of the calls, and a ratio above 1 means faster than the peer it is counted from. Times are compared only
-where the results were shown to be the same: the peers' peaks lie on the same pixel, and the score's error against
-the float64 reference stands beside its time. No GPU was measured.
-"""
+INTRO = (
+    "Made by `make bench`; every figure below comes from one run of it, on {machine}. A time is the median of the "
+    "calls, and a ratio above 1 means faster than the peer it is counted from. Times are compared only where the "
+    "results were shown to be the same: the peers' peaks lie on the same pixel, and the score's error against the "
+    "float64 reference stands beside its time. No GPU was measured."
+)
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
     (DOCS / "img").mkdir(exist_ok=True)
     _ratio_chart(rows).savefig(DOCS / "img" / "ncc-ratio.png", dpi=130, facecolor="white")
     _growth_chart(curves).savefig(DOCS / "img" / "ncc-growth.png", dpi=130, facecolor="white")
-    page = [INTRO.format(machine=_machine())]
+    page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=_machine()), 115), ""]
     page += _peak_section(rows) + _step_section(rows) + _bank_section(rows)
     page += _map_section(big) + _growth_section(curves)
     (DOCS / "benchmarks.md").write_text("\n".join(page) + "\n", encoding="utf-8")
@@ -175,9 +175,12 @@ def _map_section(big: list[dict[str, Any]]) -> list[str]:
     return [
         "## A map of 20,000 x 20,000 pixels, no position",
         "",
-        f"Heading known to 5 degrees, height to 5 %. {ours['right']} of {ours['frames']} frames found, "
-        f"{ours['wrong']} wrong, one thread. Opening and preparing the map took {ours['prepared_s']:.1f} s, once.",
-        "Peak memory is that of the whole process.",
+        *textwrap.wrap(
+            f"Heading known to 5 degrees, height to 5 %. {ours['right']} of {ours['frames']} frames found, "
+            f"{ours['wrong']} wrong, one thread. Opening and preparing the map took {ours['prepared_s']:.1f} s, once. "
+            "Peak memory is that of the whole process.",
+            115,
+        ),
         "",
         *_table(["who", "seconds a frame", "peak MB"], cells),
     ]
