@@ -177,8 +177,8 @@ def _map_section(big: list[dict[str, Any]]) -> list[str]:
         "",
         *textwrap.wrap(
             f"Heading known to 5 degrees, height to 5 %. {ours['right']} of {ours['frames']} frames found, "
-            f"{ours['wrong']} wrong, one thread. Opening and preparing the map took {ours['prepared_s']:.1f} s, once. "
-            "Peak memory is that of the whole process.",
+            f"{ours['wrong']} wrong, one thread. Opening and preparing the map took {ours['prepared_s']:.1f} s, "
+            "once. Peak memory is that of the whole process.",
             115,
         ),
         "",
