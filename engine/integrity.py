@@ -14,16 +14,9 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import transport_covariance
-from engine.types import Frame, Peak, Reason
+from engine.types import Frame, Peak, Reason, check_positive
 
 Array = NDArray[np.float64]
-
-
-def _check_positive(options: object, *names: str) -> None:
-    for name in names:
-        value = getattr(options, name)
-        if not (math.isfinite(value) and value > 0):
-            raise OptionError(f"{name}: expected a number above 0, got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +44,7 @@ class AssumedErrors:
     unknown_slope_deg: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_positive(self, *self.__dataclass_fields__)
+        check_positive(self, *self.__dataclass_fields__)
 
 
 # Neighbouring pixels share their noise: so many of them, squared, count as one.
@@ -94,7 +87,7 @@ class PeakRule:
     exclusion_m: float = 6.0
 
     def __post_init__(self) -> None:
-        _check_positive(self, *self.__dataclass_fields__)
+        check_positive(self, *self.__dataclass_fields__)
 
 
 def judge_peak(

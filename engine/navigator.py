@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from engine.budget import Budget
 from engine.errors import OptionError, TelemetryError
 from engine.orthomap import OrthoMap
-from engine.types import Fix, Frame, NoFix, Prior
+from engine.types import Fix, Frame, NoFix, Prior, check_positive
 
 Array = NDArray[np.float64]
 
@@ -47,9 +47,7 @@ class NavigatorOptions:
     lost_after: int = 12
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise OptionError(f"{name}: expected a number above 0, got {getattr(self, name)}")
+        check_positive(self, *self.__dataclass_fields__)
         if self.growth < 1.0:
             raise OptionError(f"growth: expected 1 or more, got {self.growth}")
 

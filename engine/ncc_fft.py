@@ -154,13 +154,8 @@ def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
         raise DtypeError(f"image: expected float32, got {image.dtype}")
     half = None
     if halvings > 0 and min(image.shape) >= 2 * _COARSE_TEMPLATE_PX:
-        half = prepare(_halved(image), halvings=halvings - 1)
+        half = prepare(kernels.halved(image), halvings=halvings - 1)
     return Search(image.contiguous(), kernels.integrals(image), half)
-
-
-def _halved(image: Tensor) -> Tensor:
-    """Means of 2 x 2 pixels; an odd last row or column is left out."""
-    return kernels.halved(image)
 
 
 def surface(search: Search, templates: Tensor) -> Tensor:
@@ -193,8 +188,9 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
 
     Coarse to fine: all places are scored at reduced resolution, the best few at full resolution. It is safe where
     no place that was left out can win: the coarse scores are taken to be wrong by no more than twice what they
-    were wrong by at the places that were looked at. Where that does not exclude every other place, and with
-    ``exhaustive`` or on another device than the CPU, all places are scored at full resolution.
+    were wrong by at the places that were looked at, and by no less than a match between coarse pixels loses.
+    Where that does not exclude every other place, and with ``exhaustive`` or on another device than the CPU, all
+    places are scored at full resolution.
 
     Args:
         search: from :func:`prepare`.
@@ -245,7 +241,7 @@ def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Pe
             break
         if H * W < _WORTH_HALVING_PX or min(H - h, W - w) < 16:
             break
-        levels.append((piece.half, _halved(model)))
+        levels.append((piece.half, kernels.halved(model)))
     if len(levels) == 1:
         return None  # nothing to gain
     (coarse, model), scale = levels[-1], 2 ** (len(levels) - 1)
@@ -278,7 +274,7 @@ def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Pe
 
 def _phase_loss(fine: Tensor, coarse: Tensor) -> float:
     """How much a perfect match loses on the coarser of two levels where it lies between that level's pixels."""
-    between = _halved(fine[1:, 1:]).ravel()
+    between = kernels.halved(fine[1:, 1:]).ravel()
     model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
     norm = float(torch.linalg.vector_norm(between) * torch.linalg.vector_norm(model))
     return 1.0 - float(torch.dot(between, model)) / norm if norm > 0.0 else 1.0

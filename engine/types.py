@@ -289,6 +289,18 @@ Result = Fix | NoFix
 """What a frame ends in."""
 
 
+def check_positive(options: object, *names: str) -> None:
+    """Refuse options of which one is not a finite number above 0.
+
+    Raises:
+        OptionError: names the first that is not.
+    """
+    for name in names:
+        value = getattr(options, name)
+        if not (math.isfinite(value) and value > 0):
+            raise OptionError(f"{name}: expected a number above 0, got {value}")
+
+
 def options_from_mapping(cls: type[Any], values: Mapping[str, Any]) -> Any:
     """Build an options dataclass from names and values; an unknown name is refused by name.
 

@@ -5,6 +5,7 @@ Tests compare every kernel with :mod:`engine.kernels.reference`, which is slow, 
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.util import find_spec
 
 from torch import Tensor
@@ -85,7 +86,12 @@ def rival(
 
 
 def _by_triton(tensor: Tensor) -> bool:
-    return tensor.device.type == "cuda" and find_spec("triton") is not None
+    return tensor.device.type == "cuda" and _has_triton()
+
+
+@cache
+def _has_triton() -> bool:
+    return find_spec("triton") is not None
 
 
 def halved(image: Tensor) -> Tensor:

@@ -116,9 +116,8 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
         h: rows of a patch.
         w: columns of a patch.
     """
-    if (
-        sums.device.type == "cpu" and sums[0].numel() <= _SMALL_PX
-    ):  # there a call of torch's costs more than its work
+    # On small surfaces on the CPU a call of torch's costs more than its work.
+    if sums.device.type == "cpu" and sums[0].numel() <= _SMALL_PX:
         s = sums.numpy()
         boxes = s[:, h:, w:] - s[:, :-h, w:]
         boxes -= s[:, h:, :-w]

@@ -109,7 +109,7 @@ def _finish(
         fine = laid.align(query, aligned.frame, level, options)
         if isinstance(fine, NoFix):
             continue
-        better = _near(query, prepared, fine, _nadir_px(query, peak, aligned), aligned.level + 1, options)
+        better = _near(query, prepared, fine, laid.nadir_px(query, peak, aligned), aligned.level + 1, options)
         if better is None:
             continue
         # Rivals get as good a heading and height as the winner, or the lead would be that of the refinement.
@@ -204,19 +204,14 @@ def _near(
     return laid.search(query, prepared, aligned, window, options)
 
 
-def _nadir_px(query: Query, peak: Peak, aligned: Aligned) -> Array:
-    place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
-    return query.site.full_from_level(place, aligned.level)
-
-
 def _best_elsewhere(query: Query, found: list[tuple[Peak, Aligned]], exclusion_m: float) -> float:
     """The best score at another place than the winner's."""
-    winner = _nadir_px(query, *found[0])
+    winner = laid.nadir_px(query, *found[0])
     distance_px = exclusion_m / query.site.gsd_m_per_px
     scores = [
         peak.score
         for peak, aligned in found[1:]
-        if np.hypot(*(_nadir_px(query, peak, aligned) - winner)) > distance_px
+        if np.hypot(*(laid.nadir_px(query, peak, aligned) - winner)) > distance_px
     ]
     return max(scores, default=-1.0)
 
@@ -262,5 +257,5 @@ def _moved(
     other = laid.align(query, moved, aligned.level, options)
     if isinstance(other, NoFix):
         return None
-    found = _near(query, prepared, other, _nadir_px(query, peak, aligned), aligned.level, options)
+    found = _near(query, prepared, other, laid.nadir_px(query, peak, aligned), aligned.level, options)
     return None if found is None else (found, other)

@@ -145,6 +145,12 @@ def search(
     return Peak(x, y, peak.score, peak.second_score, peak.curvature, peak.hypothesis)
 
 
+def nadir_px(query: Query, peak: Peak, aligned: Aligned) -> Array:
+    """The camera's nadir (2,) in map pixels, from where its patch was found."""
+    place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
+    return query.site.full_from_level(place, aligned.level)
+
+
 def masked_scores(region: Region, templates: torch.Tensor, options: NccOptions) -> torch.Tensor:
     """Scores (T, H', W') where the region has nodata; -1 where too little of a template lies on map."""
     assert region.valid is not None

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from engine.integrity import judge_peak, ncc_covariance_m2, peak_covariance_px
 from engine.methods import bank
-from engine.methods.laid import METHOD, Aligned, NccOptions, align, search, window_about
+from engine.methods.laid import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
 from engine.methods.query import Query, level_for
 from engine.prepared import PreparedMap
 from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
@@ -55,7 +53,7 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions) -> Fix | No
 def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions) -> Fix:
     """The camera's nadir and its covariance."""
     site, frame = query.site, aligned.frame
-    nadir = site.full_from_level(np.array([peak.x, peak.y]) - aligned.patch.offset_px, aligned.level)
+    nadir = nadir_px(query, peak, aligned)
     east, north = site.enu_from_pixel(nadir)
     lat, lon = site.geodetic_from_pixel(nadir)
     peak_px2 = peak_covariance_px(peak, aligned.template.numel())
