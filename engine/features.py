@@ -17,6 +17,7 @@ References:
     https://doi.org/10.1109/CVPR.2012.6248018 (RootSIFT).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,7 @@ def sift(
     *,
     max_keypoints: int = 300,
     upright: bool = False,
+    up_deg: float = 0.0,
     mask: Tensor | None = None,
     upsample: float = 2.0,
     contrast_threshold: float = 0.02,
@@ -82,7 +84,9 @@ def sift(
     Args:
         images: (B, 1, H, W) floating point, values in [0, 1].
         max_keypoints: Number of slots N.
-        upright: Take every angle as 0 instead of the dominant gradient's; right where the heading is known.
+        upright: Take every angle as ``up_deg`` instead of the dominant gradient's; cheaper, and right where the
+            heading is known.
+        up_deg: See above; from +x towards +y. Two pictures match where theirs differ by the turn between them.
         mask: (B, 1, H, W) bool, True where a keypoint may lie.
         upsample: Grid of the first octave, in samples per image pixel: 1, 1.5 or 2. The scales are the same.
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
@@ -103,7 +107,8 @@ def sift(
         if mask is not None:
             points = points.take(allowed(points, mask))
         points = points.take(strongest(points, plan, max_keypoints, spread))
-        angle = torch.zeros_like(points.x) if upright else dominant_angle(gaussians, points, plan)
+        upward = torch.full_like(points.x, math.radians(up_deg))
+        angle = upward if upright else dominant_angle(gaussians, points, plan)
         descriptors = describe(gaussians, points, angle, plan, root=root)
         return _to_slots(points, angle, descriptors, batch, max_keypoints)
 
