@@ -6,15 +6,22 @@ tangent (:func:`_orient`).
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from engine import device
 from engine.keypoints import Points
 from engine.scalespace import Plan
 
+Array = NDArray[Any]
+
+_POINTS_PER_THREAD = 64
 _ANGLE_BINS = 36
 _ORIENT_SAMPLES = 13  # per side, 0.75 sigma apart: Lowe's window of 4.5 sigma
 _ORIENT_STEP = 0.75
@@ -63,6 +70,22 @@ def _gradients(
 
 def dominant_angle(gaussians: Tensor, points: Points, plan: Plan) -> Tensor:
     """Return the angle (radians) of the highest peak in the histogram of gradient directions."""
+    if gaussians.device.type != "cpu":
+        return angle_by_tensors(gaussians, points, plan)
+    from engine.kernels import compiled
+
+    window, smooth = (weights.numpy() for weights in _orientation_weights(gaussians.device))
+    window = window.reshape(_ORIENT_SAMPLES, _ORIENT_SAMPLES)
+
+    def work(where: Array, places: Array) -> Any:
+        step = np.float32(_ORIENT_STEP)
+        return compiled.angles(gaussians.numpy(), plan.table.numpy(), where, places, step, window, smooth)
+
+    return _in_parts(work, points, plan)
+
+
+def angle_by_tensors(gaussians: Tensor, points: Points, plan: Plan) -> Tensor:
+    """Return the same as :func:`dominant_angle`, as tensor ops on any device."""
     gx, gy = _gradients(gaussians, points, plan, None, _ORIENT_SAMPLES, _ORIENT_STEP)
     window, smooth = _orientation_weights(gaussians.device)
     bins = (torch.atan2(gy, gx) * (_ANGLE_BINS / math.tau)).round_().long()
@@ -75,21 +98,44 @@ def dominant_angle(gaussians: Tensor, points: Points, plan: Plan) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _orientation_weights(device: torch.device) -> tuple[Tensor, Tensor]:
+def _orientation_weights(where: torch.device) -> tuple[Tensor, Tensor]:
     """Return the window (S,) of sigma 1.5 keypoint sigmas, and the (36, 36) circular smoothing 1 4 6 4 1."""
     ramp = (np.arange(_ORIENT_SAMPLES) - (_ORIENT_SAMPLES - 1) / 2) * _ORIENT_STEP
     window = np.exp(-0.5 * (ramp[:, None] ** 2 + ramp**2) / 1.5**2).ravel()
     taps = zip((-2, -1, 0, 1, 2), (1, 4, 6, 4, 1), strict=True)
     smooth = sum(weight / 16 * np.roll(np.eye(_ANGLE_BINS), shift, 1) for shift, weight in taps)
-    return torch.from_numpy(window.astype(np.float32)).to(device), torch.from_numpy(smooth).float().to(device)
+    return torch.from_numpy(window.astype(np.float32)).to(where), torch.from_numpy(smooth).float().to(where)
 
 
 def describe(gaussians: Tensor, points: Points, angle: Tensor, plan: Plan, *, root: bool) -> Tensor:
     """Return (P, 128) descriptors: 4 x 4 cells of 8 orientations, all in the keypoint's frame."""
+    if gaussians.device.type != "cpu":
+        return normalise(cells_by_tensors(gaussians, points, angle, plan), root=root)
+    from engine.kernels import compiled
+
+    def work(where: Array, places: Array, turn: Array) -> Any:
+        step = np.float32(_CELL_SIGMAS / _CELL_SAMPLES)
+        return compiled.descriptors(gaussians.numpy(), plan.table.numpy(), where, places, turn, step, _tents())
+
+    return normalise(_in_parts(work, points, plan, angle), root=root)
+
+
+def _in_parts(work: Callable[..., Array], points: Points, plan: Plan, *columns: Tensor) -> Tensor:
+    """Return work(where, places, *columns) of all points: octave, image, level; x, y, sigma in octave pixels."""
+    where = torch.stack([points.octave, points.image, points.level], dim=1).numpy()
+    places = torch.stack([points.x, points.y, points.growth * plan.first_sigma], dim=1).numpy()
+    rows = [where, places, *(column.numpy() for column in columns)]
+    parts = device.parts(len(where), len(where) // _POINTS_PER_THREAD)
+    done = device.in_parallel(lambda part: work(*(row[part[0] : part[1]] for row in rows)), parts)
+    return torch.from_numpy(np.concatenate(done))
+
+
+def cells_by_tensors(gaussians: Tensor, points: Points, angle: Tensor, plan: Plan) -> Tensor:
+    """Return (P, 128) of :func:`describe` before they are normalised, as tensor ops on any device."""
     step = _CELL_SIGMAS / _CELL_SAMPLES
     gx, gy = _gradients(gaussians, points, plan, angle, _DESC_SAMPLES, step)
     pooled = _orient(gx, gy) @ _pooling(gaussians.device)  # (8, P, 16)
-    return normalise(pooled.permute(1, 2, 0).flatten(1), root=root)
+    return pooled.permute(1, 2, 0).flatten(1)
 
 
 def _orient(gx: Tensor, gy: Tensor) -> Tensor:
@@ -107,13 +153,19 @@ def _orient(gx: Tensor, gy: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _pooling(device: torch.device) -> Tensor:
+def _pooling(where: torch.device) -> Tensor:
     """Return (S, 16): bilinear weights of the samples in the cells, times a Gaussian of half the width."""
+    weights = np.einsum("ry,cx->yxrc", _tents(), _tents()).reshape(_DESC_SAMPLES**2, _CELLS**2)
+    return torch.from_numpy(weights).to(where)
+
+
+@lru_cache(maxsize=1)
+def _tents() -> Array:
+    """Return (cells, samples) float32: the weights of :func:`_pooling` along one axis."""
     ramp = (np.arange(_DESC_SAMPLES) - (_DESC_SAMPLES - 1) / 2) / _CELL_SAMPLES
     centres = np.arange(_CELLS) - (_CELLS - 1) / 2
-    tent = np.maximum(0, 1 - np.abs(ramp[:, None] - centres)) * np.exp(-0.5 * (ramp[:, None] / (_CELLS / 2)) ** 2)
-    weights = np.einsum("yr,xc->yxrc", tent, tent).reshape(_DESC_SAMPLES**2, _CELLS**2)
-    return torch.from_numpy(weights.astype(np.float32)).to(device)
+    tents: Array = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(-0.5 * (ramp / (_CELLS / 2)) ** 2)
+    return tents.astype(np.float32)
 
 
 def normalise(descriptors: Tensor, *, root: bool) -> Tensor:

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar
+
 import torch
 
 from engine.errors import DeviceError, OptionError
+
+T = TypeVar("T")
+R = TypeVar("R")
+_WORKER = "scenematch-worker"
 
 
 def resolve(device: str | torch.device = "auto") -> torch.device:
@@ -50,3 +60,26 @@ def set_threads(count: int) -> None:
         raise OptionError(f"threads: expected 1 or more, got {count}")
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
+
+
+def parts(size: int, wanted: int) -> list[tuple[int, int]]:
+    """Cut a range of ``size`` into at most ``wanted`` parts (begin, end), not more than there are threads."""
+    count = max(1, min(wanted, torch.get_num_threads()))
+    return [(size * i // count, size * (i + 1) // count) for i in range(count)]
+
+
+def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
+    """Return the work done on each piece, by as many threads as torch has.
+
+    It pays where the work lets go of Python's lock. A piece of a piece is worked on where it is met, so that no
+    worker waits for another.
+    """
+    threads = torch.get_num_threads()
+    if len(pieces) == 1 or threads == 1 or threading.current_thread().name.startswith(_WORKER):
+        return [work(piece) for piece in pieces]
+    return list(_workers(threads).map(work, pieces))
+
+
+@lru_cache(maxsize=1)
+def _workers(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix=_WORKER)

@@ -25,9 +25,10 @@ import torch
 from torch import Tensor
 
 from engine.descriptors import describe, dominant_angle, normalise
+from engine.device import in_parallel
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.keypoints import Points, allowed, detect, rank, strongest
-from engine.scalespace import gaussian_levels, make_plan
+from engine.scalespace import make_plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ def sift(
     upright: bool = False,
     up_deg: float = 0.0,
     mask: Tensor | None = None,
-    upsample: float = 2.0,
+    upsample: int = 2,
     contrast_threshold: float = 0.02,
     root: bool = True,
     spread: int = 6,
@@ -88,7 +89,7 @@ def sift(
             heading is known.
         up_deg: See above; from +x towards +y. Two pictures match where theirs differ by the turn between them.
         mask: (B, 1, H, W) bool, True where a keypoint may lie.
-        upsample: Grid of the first octave, in samples per image pixel: 1, 1.5 or 2. The scales are the same.
+        upsample: Samples per image pixel of the first octave: 1, or 2. The scales are the same.
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
         root: Return RootSIFT (square roots of the L1-normalised descriptor), also of unit L2 norm.
         spread: The image is divided into spread x spread cells, and keypoints beyond a cell's double share give
@@ -99,18 +100,29 @@ def sift(
     """
     _check_images(images, mask)
     _check_options(max_keypoints, upsample, contrast_threshold, spread)
-    with torch.inference_mode():
-        batch, _, height, width = images.shape
-        plan = make_plan(height, width, batch, upsample, images.device)
-        gaussians = gaussian_levels(images[:, 0].float().nan_to_num(0.0, 1.0, 0.0), plan)
-        points = detect(gaussians, plan, contrast_threshold)
-        if mask is not None:
-            points = points.take(allowed(points, mask))
-        points = points.take(strongest(points, plan, max_keypoints, spread))
-        upward = torch.full_like(points.x, math.radians(up_deg))
-        angle = upward if upright else dominant_angle(gaussians, points, plan)
-        descriptors = describe(gaussians, points, angle, plan, root=root)
-        return _to_slots(points, angle, descriptors, batch, max_keypoints)
+    images = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0)
+
+    def work(part: slice) -> Features:
+        plan = make_plan(*images.shape[1:], len(images[part]), int(upsample), images.device)
+        with torch.inference_mode():
+            gaussians, points = detect(images[part], plan, contrast_threshold)
+            if mask is not None:
+                points = points.take(allowed(points, mask[part]))
+            points = points.take(strongest(points, plan, max_keypoints, spread))
+            upward = torch.full_like(points.x, math.radians(up_deg))
+            angle = upward if upright else dominant_angle(gaussians, points, plan)
+            descriptors = describe(gaussians, points, angle, plan, root=root)
+            return _to_slots(points, angle, descriptors, len(images[part]), max_keypoints)
+
+    if images.device.type != "cpu":
+        return work(slice(None))
+    # One scale space at a time stays near a processor.
+    done = in_parallel(work, [slice(i, i + 1) for i in range(len(images))])
+    return done[0] if len(done) == 1 else Features(*(torch.cat(f) for f in zip(*map(_fields, done), strict=True)))
+
+
+def _fields(features: Features) -> tuple[Tensor, ...]:
+    return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid
 
 
 def opencv_sift(
@@ -135,7 +147,7 @@ def opencv_sift(
         raise ShapeError(f"images: expected (H, W) or (B, H, W), got {images.shape}")
     if images.dtype != np.uint8:
         raise DtypeError(f"images: expected uint8, got {images.dtype}")
-    _check_options(max_keypoints, 2.0, contrast_threshold, 1)
+    _check_options(max_keypoints, 2, contrast_threshold, 1)
     batch = images if images.ndim == 3 else images[None]
     detector = cv2.SIFT_create(nfeatures=max_keypoints, contrastThreshold=contrast_threshold)
     slots = np.zeros((len(batch), max_keypoints, 4 + 128), np.float32)
@@ -233,11 +245,11 @@ def _check_images(images: Tensor, mask: Tensor | None) -> None:
         raise DtypeError(f"mask: expected bool, got {mask.dtype}")
 
 
-def _check_options(max_keypoints: int, upsample: float, contrast_threshold: float, spread: int) -> None:
+def _check_options(max_keypoints: int, upsample: int, contrast_threshold: float, spread: int) -> None:
     if max_keypoints < 1:
         raise OptionError(f"max_keypoints: expected at least 1, got {max_keypoints}")
-    if upsample not in (1, 1.5, 2):
-        raise OptionError(f"upsample: expected 1, 1.5 or 2, got {upsample}")
+    if upsample not in (1, 2):
+        raise OptionError(f"upsample: expected 1 or 2, got {upsample}")
     if not contrast_threshold >= 0:
         raise OptionError(f"contrast_threshold: expected a number from 0 up, got {contrast_threshold}")
     if spread < 1:

@@ -3,19 +3,25 @@
 An extremum is refined by a quadratic; what is of low contrast or lies along an edge is dropped (Lowe's tests).
 """
 
+import threading
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from engine.scalespace import FIRST_SIGMA_PX, SCALES, Octave, Plan
+from engine import device
+from engine.scalespace import FIRST_SIGMA_PX, SCALES, Octave, Plan, gaussian_levels, reach_px
+
+Array = NDArray[Any]
 
 _BORDER = 4  # octave pixels along the edge that carry no keypoint
 _EDGE_RATIO = 10.0
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
-_STRIP = 100_000  # pixels of a level that the search for extrema takes at a time on a CPU
+_PART_PX = 200_000  # pixels of an octave from which on a thread of its own pays
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _FARTHEST = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 
@@ -49,8 +55,71 @@ class Points:
         return FIRST_SIGMA_PX * self.growth * torch.exp2(self.octave.float())
 
 
-def detect(gaussians: Tensor, plan: Plan, contrast_threshold: float) -> Points:
-    """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges."""
+def detect(images: Tensor, plan: Plan, contrast_threshold: float) -> tuple[Tensor, Points]:
+    """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges.
+
+    Args:
+        images: (B, H, W) float32; on a CPU one at a time.
+        plan: made for these images.
+        contrast_threshold: Lowe's.
+
+    Returns:
+        The Gaussian levels, flat, which on a CPU the thread's next call overwrites; and the points.
+    """
+    if images.device.type == "cpu":
+        return _detect_compiled(images[0], plan, contrast_threshold)
+    gaussians = gaussian_levels(images, plan)
+    return gaussians, search(gaussians, plan, contrast_threshold)
+
+
+def _detect_compiled(image: Tensor, plan: Plan, contrast_threshold: float) -> tuple[Tensor, Points]:
+    """Do :func:`detect` for one image, (H, W), on the CPU."""
+    from engine.kernels import compiled
+
+    gaussians = _buffer(plan.gaussian_size)
+    threshold = contrast_threshold / SCALES
+    limits = (SCALES, _MOVES, threshold, _FARTHEST, _EDGE_RATIO)
+    found, source = [], image.contiguous()
+    for number, octave in enumerate(plan.octaves):
+        height, width, *place, _ = plan.table[number].tolist()
+        voxels = _voxels_compiled(source.numpy(), octave, gaussians.numpy(), tuple(place), _EARLY * threshold)
+        found.append(compiled.refine(gaussians.numpy(), (height, width, *place), voxels, limits, number))
+        source = octave.levels(gaussians)[SCALES, :height:2, 0, :width:2].contiguous()
+    x, y, growth, contrast, level, of = torch.from_numpy(np.concatenate(found)).unbind(1)
+    pixel = torch.exp2(of) / plan.upsample
+    return gaussians, Points(of.long(), torch.zeros_like(of).long(), level.long(), x, y, growth, contrast, pixel)
+
+
+def _voxels_compiled(
+    source: Array, octave: Octave, buffer: Array, place: tuple[int, ...], threshold: float
+) -> Array:
+    """Write an octave's levels and return its extrema, by as many threads as its size is worth."""
+    from engine.kernels import compiled
+
+    (rows, columns), reach = octave.source, tuple(map(reach_px, octave.sigmas))
+    across = compiled.filters(columns, octave.width, octave.sigmas, reach, octave.up)
+    down = compiled.filters(rows, octave.height, octave.sigmas, reach, octave.up)
+
+    def work(part: tuple[int, int]) -> Any:
+        return compiled.search(source, across, down, buffer, place, part, _BORDER, np.float32(threshold))
+
+    parts = device.parts(octave.height, octave.height * octave.width // _PART_PX)
+    return np.concatenate(device.in_parallel(work, parts))
+
+
+_local = threading.local()
+
+
+def _buffer(size: int) -> Tensor:
+    """Return the thread's own memory for a scale space: new pages from the system are a tenth of the work."""
+    buffer: Tensor | None = getattr(_local, "buffer", None)
+    if buffer is None or buffer.numel() < size:
+        buffer = _local.buffer = torch.empty(size)
+    return buffer[:size]
+
+
+def search(gaussians: Tensor, plan: Plan, contrast_threshold: float) -> Points:
+    """Find the points of all octaves in their Gaussian levels, as tensor ops."""
     threshold = contrast_threshold / SCALES
     found = [_extrema(gaussians, octave, _EARLY * threshold) for octave in plan.octaves]
     number = torch.cat([torch.full_like(f[:, 0], n) for n, f in enumerate(found)])
@@ -75,29 +144,16 @@ def detect(gaussians: Tensor, plan: Plan, contrast_threshold: float) -> Points:
 
 def _extrema(gaussians: Tensor, octave: Octave, threshold: float) -> Tensor:
     """Return (M, 4) level, y, image, x where |DoG| is the largest of its 3 x 3 x 3 and above the threshold."""
-    levels = octave.levels(gaussians)[..., _BORDER - 1 : octave.width - _BORDER + 1]
-    begin, end = _BORDER, octave.height - _BORDER
-    found = [torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)]
-    if levels.shape[3] < 3:
-        return found[0]
-    rows = max(16, _STRIP // octave.width) if gaussians.device.type == "cpu" else octave.height
-    for y in range(begin, end, rows):  # a strip stays in a processor's cache
-        strip = levels[:, y - 1 : min(y + rows, end) + 1]
-        size = torch.sub(strip[1:], strip[:-1]).abs_()
-        top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
-        top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
-        top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
-        first = torch.tensor([1, y, 0, _BORDER], device=gaussians.device)
-        found.append(_nonzero(size[1:-1, 1:-1, :, 1:-1] >= top) + first)
-    return torch.cat(found)
-
-
-def _nonzero(mask: Tensor) -> Tensor:
-    """Return mask.nonzero(), by looking at eight elements at a time: few are True."""
-    padded = torch.nn.functional.pad(mask.flatten(), (0, -mask.numel() % 8))
-    words = padded.view(torch.int64).nonzero()
-    index = (words * 8 + torch.arange(8, device=mask.device)).flatten()
-    return torch.stack(torch.unravel_index(index[padded[index]], mask.shape), dim=1)
+    edge = _BORDER - 1
+    levels = octave.levels(gaussians)[:, edge : octave.height - edge, :, edge : octave.width - edge]
+    if levels.shape[1] < 3 or levels.shape[3] < 3:
+        return torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)
+    size = (levels[1:] - levels[:-1]).abs_()
+    top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
+    top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
+    top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
+    found = (size[1:-1, 1:-1, :, 1:-1] >= top).nonzero()
+    return found + torch.tensor([1, _BORDER, 0, _BORDER], device=gaussians.device)
 
 
 def _fit_quadratic(
@@ -122,7 +178,7 @@ def _fit_quadratic(
 
 
 @lru_cache(maxsize=8)
-def _quadratic(device: torch.device) -> tuple[Tensor, Tensor]:
+def _quadratic(where: torch.device) -> tuple[Tensor, Tensor]:
     """Return (27, 9), Lowe's differences for x, y, s, xx, yy, ss, xy, xs, ys of the neighbours (s, y, x) of a DoG.
 
     And (36, 3) int32, the Gaussians (s, y, x) that they are differences of: one level more.
@@ -141,8 +197,8 @@ def _quadratic(device: torch.device) -> tuple[Tensor, Tensor]:
 
     columns = [first(x, y, s), first(y, s, x), first(s, x, y), second(x, y, s), second(y, s, x), second(s, x, y)]
     columns += [cross(x, y, s), cross(x, s, y), cross(y, s, x)]
-    stencil = torch.from_numpy(np.stack(columns, 1).astype(np.float32)).to(device)
-    return stencil, torch.from_numpy(gaussians.astype(np.int32)).to(device)
+    stencil = torch.from_numpy(np.stack(columns, 1).astype(np.float32)).to(where)
+    return stencil, torch.from_numpy(gaussians.astype(np.int32)).to(where)
 
 
 def allowed(points: Points, mask: Tensor) -> Tensor:

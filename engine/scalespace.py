@@ -1,7 +1,8 @@
 """Scale space: all Gaussian levels of a batch of images, octave by octave, in one flat buffer.
 
-Every level is ``G_y I G_x^T``, with banded matrices that are cut into blocks for the matmul; upsampling is part
-of the matrix, so that no interpolation comes before the blur.
+Every level is ``G_y I G_x^T``; upsampling is part of G, so that no interpolation comes before the blur. As tensor
+ops G is a banded matrix that is cut into blocks for the matmul; :mod:`engine.kernels.compiled` has the same
+weights as a filter.
 """
 
 import math
@@ -33,35 +34,44 @@ class _Band:
         return self.blocks.shape[0] * _BLOCK + 2 * self.reach
 
 
-def _band(inputs: int, sigmas: tuple[float, ...], upsample: float, device: torch.device) -> _Band:
-    """Return G[l, i, j] ~ exp(-(i / upsample - j)^2 / (2 sigma_l^2)), rows summing to 1 also at the edges."""
-    outputs = _outputs(inputs, upsample)
-    reach = math.ceil(_TRUNCATE * max(sigmas))
-    rows = round(_BLOCK * upsample)
+def reach_px(sigma: float) -> int:
+    """Return how far a Gaussian is taken, in pixels of what it blurs."""
+    return math.ceil(_TRUNCATE * sigma)
+
+
+@lru_cache(maxsize=128)
+def _band(inputs: int, sigmas: tuple[float, ...], up: int, device: torch.device) -> _Band:
+    """Return G[l, i, j] ~ exp(-(i / up - j)^2 / (2 sigma_l^2)), rows summing to 1 also at the edges."""
+    outputs = _outputs(inputs, up)
+    reach = reach_px(max(sigmas)) + up - 1
+    rows = _BLOCK * up
     count = math.ceil(outputs / rows)
     out = np.arange(count * rows).reshape(count, 1, rows, 1)
     source = (np.arange(count)[:, None] * _BLOCK + np.arange(-reach, _BLOCK + reach)).reshape(count, 1, 1, -1)
     spread = np.maximum(np.array(sigmas), 1e-3).reshape(1, -1, 1, 1)
-    weights = np.exp(-0.5 * ((out / upsample - source) / spread) ** 2)
+    near = np.array([reach_px(s) for s in sigmas]).reshape(1, -1, 1, 1)
+    weights = np.exp(-0.5 * ((out / up - source) / spread) ** 2)
+    weights *= (source - out // up >= -near) & (source - out // up < near + up)
     weights *= (source >= 0) & (source < inputs) & (out < outputs)
     weights /= np.maximum(weights.sum(-1, keepdims=True), 1e-30)
     return _Band(torch.from_numpy(weights.astype(np.float32)).to(device), reach)
 
 
-def _outputs(inputs: int, upsample: float) -> int:
-    return math.floor((inputs - 1) * upsample) + 1
+def _outputs(inputs: int, up: int) -> int:
+    return (inputs - 1) * up + 1
 
 
 @dataclass(frozen=True, slots=True)
 class Octave:
     """Where an octave lies in the flat buffer of Gaussians: levels x rows x images x columns."""
 
+    source: tuple[int, int]  # height and width of the picture that is blurred
+    up: int  # outputs per pixel of it
+    sigmas: tuple[float, ...]  # in its pixels
     height: int
     width: int
     shape: tuple[int, int, int, int]  # with the blocks' padding
     offset: int
-    vertical: _Band
-    horizontal: _Band
 
     def levels(self, gaussians: Tensor) -> Tensor:
         """Return the octave's part of the buffer, (levels, rows, images, columns)."""
@@ -72,7 +82,7 @@ class Octave:
 class Plan:
     """What depends on the images' shape alone."""
 
-    upsample: float
+    upsample: int
     octaves: tuple[Octave, ...]
     gaussian_size: int
     table: Tensor  # (octaves, 6) int64: height, width, offset, and the strides of level, row and image
@@ -89,23 +99,20 @@ class Plan:
 
 
 @lru_cache(maxsize=32)
-def make_plan(height: int, width: int, batch: int, upsample: float, device: torch.device) -> Plan:
-    """Lay out the octaves and their filters; kept for the shapes met last, as frames come in one size."""
+def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> Plan:
+    """Lay out the octaves; kept for the shapes met last, as frames come in one size."""
     growth = [2.0 ** (level / SCALES) for level in range(_LEVELS)]
     sigmas = tuple(math.sqrt((FIRST_SIGMA_PX * g) ** 2 - _CAMERA_SIGMA_PX**2) for g in growth)
     octaves: list[Octave] = []
-    size = 0
-    while not octaves or min(height, width) >= _SMALLEST_OCTAVE:
-        factor = 1.0 if octaves else upsample
-        vertical, horizontal = (_band(n, sigmas, factor, device) for n in (height, width))
-        if not octaves:
-            height, width = _outputs(height, upsample), _outputs(width, upsample)
-        rows, columns = (b.blocks.shape[0] * b.blocks.shape[2] for b in (vertical, horizontal))
+    size, source, up = 0, (height, width), upsample
+    while not octaves or min(source) >= _SMALLEST_OCTAVE:
+        height, width = (_outputs(n, up) for n in source)
+        rows, columns = (-(-n // (_BLOCK * up)) * _BLOCK * up for n in (height, width))
         shape = (_LEVELS, rows, batch, columns)
-        octaves.append(Octave(height, width, shape, size, vertical, horizontal))
+        octaves.append(Octave(source, up, sigmas, height, width, shape, size))
         size += math.prod(shape)
         sigmas = tuple(FIRST_SIGMA_PX * upsample * math.sqrt(g**2 - 1) for g in growth)
-        height, width = (height + 1) // 2, (width + 1) // 2
+        source, up = ((height + 1) // 2, (width + 1) // 2), 1
     table = [
         (o.height, o.width, o.offset, math.prod(o.shape[1:]), math.prod(o.shape[2:]), o.shape[3]) for o in octaves
     ]
@@ -123,7 +130,7 @@ def gaussian_levels(images: Tensor, plan: Plan) -> Tensor:
 def _blur(images: Tensor, octave: Octave, gaussians: Tensor) -> Tensor:
     """Write the octave's levels G_y I G_x^T into their place and return them as (L, B, height, width)."""
     batch, height, width = images.shape
-    across, down = octave.horizontal, octave.vertical
+    across, down = (_band(n, octave.sigmas, octave.up, images.device) for n in (width, height))
     count, levels, size, _ = across.blocks.shape
     wide = images.new_zeros(height, batch, across.padded)
     wide[..., across.reach : across.reach + width] = images.transpose(0, 1)

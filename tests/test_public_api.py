@@ -40,7 +40,7 @@ PUBLIC = [
     "features",
     "ncc_fft",
 ]
-UNUSED = ("matplotlib", "rasterio", "kornia", "pyproj", "typer", "triton", "rich", "PIL", "scipy", "skimage")
+UNUSED = ("matplotlib", "rasterio", "kornia", "pyproj", "typer", "triton", "numba", "rich", "PIL", "scipy", "skimage")
 
 
 @pytest.fixture(scope="module")
