@@ -1,7 +1,7 @@
 """Camera pose from matched points: options in, statistics out, or None where the matches do not carry a pose.
 
-OpenCV's RANSAC finds the matches that agree, Gauss-Newton refines on them, and an a-contrario test asks whether
-chance could have made as many agree: RANSAC alone finds a pose in any set of wrong matches.
+:mod:`engine.pnp` finds the matches that agree and refines on them, and it finds some in any set of wrong matches.
+Here an a-contrario test asks whether chance could have made as many agree.
 
 Convention:
     ``cam_from_map``: x_cam = R X_map + t, camera axes x right, y down, z forward; map axes in metres, z up.
@@ -10,28 +10,38 @@ Convention:
 References:
     Moisan and Stival, A probabilistic criterion to detect rigid point matches between two images, IJCV 2004,
     https://doi.org/10.1023/B:VISI.0000013094.38752.54 (a-contrario test).
-    Collins and Bartoli, Infinitesimal plane-based pose estimation, IJCV 2014,
-    https://doi.org/10.1007/s11263-014-0725-5 (the two poses that a plane allows).
+    Schweighofer and Pinz, Robust pose estimation from a planar target, PAMI 2006,
+    https://doi.org/10.1109/TPAMI.2006.252 (the two poses that a plane allows).
 """
 
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.pnp import (
+    Fit,
+    Problem,
+    View,
+    covariance_of,
+    look,
+    ransac,
+    refine,
+    refine_from_attitude,
+    turn_from_attitude,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SAMPLE = 3  # matches that fix a pose, up to ...
 _POSES_PER_SAMPLE = 4
-_ROUNDS = 4  # alternations of refinement and selection
-_STEPS = 4  # Gauss-Newton steps in each
+_MIRRORED_STEPS = 4  # of the other pose of a plane: enough to see how well it could fit
 _PAIRED = 300  # projections that are compared with all image points for the chance of agreement
 _SAME_POSE_DEG = 1.5
+_IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +53,8 @@ class PoseOptions:
         max_iterations: Samples that RANSAC draws at most.
         confidence: Probability, in (0, 1), at which RANSAC stops early.
         min_inliers: Fewest distinct matches that may carry a pose.
+        distinct_px: Matches in one square cell of this side count once: they look at the same pixels, and are
+            right or wrong together.
         max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses that as
             many matches support by chance.
         min_spread_px: Smallest standard deviation of the inliers in the image, in the direction where they
@@ -56,6 +68,7 @@ class PoseOptions:
     max_iterations: int = 1000
     confidence: float = 0.999
     min_inliers: int = 6
+    distinct_px: float = 16.0
     max_log10_nfa: float = -6.0
     min_spread_px: float = 6.0
     min_cost_gap: float = 9.0
@@ -63,7 +76,7 @@ class PoseOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("reprojection_px", "min_spread_px", "min_cost_gap", "noise_floor_px"):
+        for name in ("reprojection_px", "distinct_px", "min_spread_px", "min_cost_gap", "noise_floor_px"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name}: expected a positive number, got {getattr(self, name)}")
         if not 0 < self.confidence < 1:
@@ -155,18 +168,25 @@ def solve_pose(
     points_m, points_px, K, weights = _checked(points_m, points_px, camera_matrix, weights)
     finite = np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0)
     known = np.flatnonzero(finite)
-    if len(known) < options.min_inliers or _spread(points_px[known]) < options.min_spread_px:
+    if len(known) < options.min_inliers or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
-    matches = _Matches(points_m[known] - origin, points_px[known], K, weights[known], prior)
-    start = _ransac(matches, options)
-    if start is None:
+    problem = Problem(
+        points=(points_m[known] - origin).T,
+        pixels=points_px[known].T,
+        K=K,
+        weights=weights[known],
+        attitude=None if prior is None else prior.rotation,
+        precision=np.zeros(3) if prior is None else np.deg2rad(prior.sigma_deg) ** -2.0 * np.ones(3),
+        tolerance_px=options.reprojection_px,
+        noise_floor_px=options.noise_floor_px,
+        min_inliers=options.min_inliers,
+    )
+    fit = _fit(problem, options)
+    if fit is None or not _supported(problem, fit, options) or _ambiguous(problem, fit, options):
         return None
-    fit = _refine(matches, start, options)
-    if fit is None or not _supported(matches, fit, options) or _ambiguous(matches, fit, options):
-        return None
-    log10_nfa = _log10_nfa(matches, fit, options)
-    if log10_nfa > options.max_log10_nfa:
+    log10_nfa, covariance = _log10_nfa(problem, fit, options), covariance_of(problem, fit)
+    if log10_nfa > options.max_log10_nfa or covariance is None:
         return None
     inliers = np.zeros(len(finite), bool)
     inliers[known[fit.inliers]] = True
@@ -175,32 +195,12 @@ def solve_pose(
         rotation=fit.rotation,
         translation=-fit.rotation @ center,
         center_m=center,
-        covariance=fit.covariance,
+        covariance=covariance,
         inliers=inliers,
-        rms_px=float(np.sqrt(np.mean(np.sum(fit.residual[fit.inliers] ** 2, axis=1)))),
-        sigma_px=fit.sigma_px,
+        rms_px=float(np.sqrt(np.mean(fit.view.squared[fit.inliers]))),
+        sigma_px=math.sqrt(fit.variance_px2),
         log10_nfa=log10_nfa,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Matches:
-    points: Array  # (N, 3) about their mean
-    pixels: Array
-    K: Array
-    weights: Array
-    prior: AttitudePrior | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    rotation: Array
-    center: Array
-    inliers: Mask
-    residual: Array  # (N, 2) of all matches
-    sigma_px: float
-    covariance: Array
-    cost: float
 
 
 def _checked(points_m: Array, points_px: Array, camera_matrix: Array, weights: Array | None) -> tuple[Array, ...]:
@@ -219,163 +219,55 @@ def _checked(points_m: Array, points_px: Array, camera_matrix: Array, weights: A
 
 
 def _spread(points: Array) -> float:
-    """Return the smallest standard deviation of points (N, 2) over all directions."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(np.cov(points.T, bias=True))[0]), 0.0))
+    """Return the smallest standard deviation of points (2, N) over all directions."""
+    x, y = points - points.mean(axis=1, keepdims=True)
+    xx, xy, yy = float(x @ x), float(x @ y), float(y @ y)
+    smaller = 0.5 * (xx + yy - math.hypot(xx - yy, 2 * xy))
+    return math.sqrt(max(smaller, 0.0) / points.shape[1])
 
 
-def _ransac(matches: _Matches, options: PoseOptions) -> tuple[Array, Array] | None:
-    """Return rotation and centre of the best pose from three matches."""
-    params = cv2.UsacParams()
-    params.threshold = options.reprojection_px
-    params.confidence = options.confidence
-    params.maxIterations = options.max_iterations
-    params.randomGeneratorState = options.seed
-    params.sampler = cv2.SAMPLING_UNIFORM
-    params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_NULL  # the refinement below does it better
-    try:
-        found, _, rotvec, t, inliers = cv2.solvePnPRansac(
-            matches.points, matches.pixels, matches.K, None, params=params
-        )
-    except cv2.error:  # every sample was degenerate
-        return None
-    if not found or inliers is None or not (np.isfinite(rotvec).all() and np.isfinite(t).all()):
-        return None
-    R = cv2.Rodrigues(rotvec)[0]
-    return R, -R.T @ t[:, 0]
+def _fit(problem: Problem, options: PoseOptions) -> Fit | None:
+    fit = refine_from_attitude(problem, options.seed)
+    if fit is not None:
+        return fit
+    start = ransac(problem, options.max_iterations, options.confidence, options.seed)
+    return None if start is None else refine(problem, *start)
 
 
-def _residual(matches: _Matches, R: Array, center: Array) -> tuple[Array, Array]:
-    """Return (N, 2) projection less pixel, infinite behind the camera, and (N, 3) points in the camera."""
-    x = (matches.points - center) @ R.T
-    ahead = x[:, 2] > 1e-9
-    depth = np.where(ahead, x[:, 2], 1.0)
-    projected = (x / depth[:, None]) @ matches.K[:2].T
-    return np.where(ahead[:, None], projected - matches.pixels, np.inf), x
+def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
+    """Ask for inliers that are not on a line, seen from above."""
+    if np.count_nonzero(fit.inliers) < options.min_inliers:
+        return False
+    above = float(fit.center[2] - problem.points[2, fit.inliers].mean())
+    return above > 0 and _spread(problem.pixels[:, fit.inliers]) >= options.min_spread_px
 
 
-def _inliers(residual: Array, options: PoseOptions) -> Mask:
-    return np.asarray(np.einsum("ij,ij->i", residual, residual) <= options.reprojection_px**2)
+def _distinct(pixels: Array, options: PoseOptions) -> int:
+    """Return how many cells of the image the pixels (2, N) occupy."""
+    x, y = np.floor(pixels / options.distinct_px).astype(np.int64)
+    return len(set((x * (1 << 32) + y).tolist()))
 
 
-def _refine(
-    matches: _Matches, start: tuple[Array, Array], options: PoseOptions, rounds: int = _ROUNDS
-) -> _Fit | None:
-    """Alternate between the pose of the inliers and the inliers of the pose."""
-    R, center = start
-    residual, x = _residual(matches, R, center)
-    inliers = _inliers(residual, options)
-    sigma = options.reprojection_px / 3
-    for _ in range(rounds):
-        if inliers.sum() < options.min_inliers:
-            return None
-        for _ in range(_STEPS):
-            step = _gauss_newton_step(matches, R, residual, x, inliers, sigma)
-            if step is None:
-                return None
-            delta, _covariance = step
-            center = center + delta[:3]
-            R = cv2.Rodrigues(delta[3:])[0] @ R
-            residual, x = _residual(matches, R, center)
-            if not np.isfinite(residual[inliers]).all():
-                return None
-            if float(np.abs(delta) @ (1, 1, 1, 100, 100, 100)) < 1e-6:
-                break
-        sigma = _sigma_px(matches, residual, inliers, options)
-        previous, inliers = inliers, _inliers(residual, options)
-        if np.array_equal(previous, inliers):
-            break
-    if inliers.sum() < options.min_inliers:
-        return None
-    step = _gauss_newton_step(matches, R, residual, x, inliers, sigma)
-    if step is None:
-        return None
-    cost = _cost(matches, R, center, options, sigma)
-    return _Fit(R, center, inliers, residual, sigma, step[1], cost)
-
-
-def _sigma_px(matches: _Matches, residual: Array, inliers: Mask, options: PoseOptions) -> float:
-    """Return the deviation s whose distances r, cut off at T, have the inliers' mean square.
-
-    E[r^2 | r < T] = 2 s^2 (1 - u / (e^u - 1)),  u = T^2 / (2 s^2).
-    """
-    squared = float(matches.weights[inliers] @ np.einsum("ij,ij->i", residual[inliers], residual[inliers]))
-    mean = max(squared / (2 * inliers.sum() - 6), options.noise_floor_px**2)
-    half, variance = 0.5 * options.reprojection_px**2, mean
-    for _ in range(5):
-        u = min(half / variance, 50.0)
-        variance = min(mean / (1 - u / math.expm1(u)), half)
-    return math.sqrt(variance)
-
-
-def _prior_residual(prior: AttitudePrior | None, R: Array) -> Array:
-    """Return the rotation from the prior's attitude to R, about the camera's axes, in sigmas."""
-    if prior is None:
-        return np.zeros(3)
-    turn: Array = cv2.Rodrigues(R @ prior.rotation.T)[0][:, 0]
-    return turn / np.deg2rad(prior.sigma_deg)
-
-
-def _gauss_newton_step(
-    matches: _Matches, R: Array, residual: Array, x: Array, inliers: Mask, sigma: float
-) -> tuple[Array, Array] | None:
-    """Return the step (centre, rotation) and the covariance (6, 6), or None where the pose is undetermined.
-
-    With x = R (X - C), R <- exp([w]) R and C <- C + c:  dx = -R c - [x] w,  and the pixel is K x / z.
-    """
-    X, Y, Z = x[inliers].T
-    zero = np.zeros_like(Z)
-    to_pixel = np.stack([1 / Z, zero, -X / Z**2, zero, 1 / Z, -Y / Z**2], axis=1).reshape(-1, 2, 3)
-    to_pixel = matches.K[:2, :2] @ to_pixel
-    turn = np.stack([zero, Z, -Y, -Z, zero, X, Y, -X, zero], axis=1).reshape(-1, 3, 3)
-    root = np.repeat(np.sqrt(matches.weights[inliers]), 2) / sigma
-    J = np.concatenate([-to_pixel @ R, to_pixel @ turn], axis=2).reshape(-1, 6) * root[:, None]
-    normal, right = J.T @ J, -J.T @ (residual[inliers].ravel() * root)
-    if matches.prior is not None:
-        precision = 1 / np.deg2rad(np.broadcast_to(matches.prior.sigma_deg, 3))
-        normal[3:, 3:] += np.diag(precision**2)
-        right[3:] -= precision * _prior_residual(matches.prior, R)
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal / np.outer(scale, scale)
-    if not np.isfinite(scaled).all() or np.linalg.eigvalsh(scaled)[0] < 1e-10:
-        return None
-    covariance = np.linalg.inv(scaled) / np.outer(scale, scale)
-    return covariance @ right, covariance
-
-
-def _supported(matches: _Matches, fit: _Fit, options: PoseOptions) -> bool:
-    """Ask for enough distinct inliers, not on a line, and seen from above."""
-    return (
-        _distinct(matches, fit.inliers) >= options.min_inliers
-        and _spread(matches.pixels[fit.inliers]) >= options.min_spread_px
-        and float(fit.center[2]) > float(np.median(matches.points[fit.inliers, 2]))
-    )
-
-
-def _distinct(matches: _Matches, chosen: Mask) -> int:
-    """Return how many pixels, whole numbers of x and y, the chosen matches occupy."""
-    pixels = np.round(matches.pixels[chosen]).astype(np.int64)
-    return len(np.unique(pixels[:, 0] * (1 << 32) + pixels[:, 1]))
-
-
-def _log10_nfa(matches: _Matches, fit: _Fit, options: PoseOptions) -> float:
+def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
     """Return log10 of the expected number of poses that as many of N matches support by chance.
 
-    NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the inliers. p is the chance that a wrong match agrees: the
-    share of all pairings of a map point with an image point, also of other matches, that agree with the pose.
-    This counts the crowding of the points, which a uniform density would not.
+    NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the distinct inliers. p is the chance that a wrong match agrees:
+    the share of all pairings of a map point with an image point, also of other matches, that agree with the
+    pose. This counts the crowding of the points, which a uniform density would not.
     """
-    total, k = len(matches.pixels), _distinct(matches, fit.inliers)
-    if k <= _SAMPLE:
+    total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
+    if k < options.min_inliers:
         return math.inf
     square = options.reprojection_px**2
-    own = np.arange(0, total, -(-total // _PAIRED))
-    dx, dy = ((fit.residual + matches.pixels)[own, axis, None] - matches.pixels[:, axis] for axis in (0, 1))
-    near = dx * dx + dy * dy <= square
-    agree = int(near.sum()) - int(near[np.arange(len(own)), own].sum())
-    extent = np.ptp(matches.pixels, axis=0) + 1
+    own = slice(None, None, -(-total // _PAIRED))
+    a, b, one = fit.view.projected[:, own], problem.pixels, np.ones((1, total))
+    left = np.concatenate([a, np.sum(a * a, axis=0, keepdims=True), one[:, own]])
+    right = np.concatenate([-2 * b, one, np.sum(b * b, axis=0, keepdims=True)])
+    near = left.T @ right <= square  # |a|^2 - 2 a b + |b|^2
+    agree = np.count_nonzero(near) - np.count_nonzero(fit.inliers[own])
+    extent = np.ptp(problem.pixels, axis=1) + 1
     uniform = math.pi * square / float(extent[0] * extent[1])
-    p = min(max(agree / (len(own) * (total - 1)), uniform), 1.0)
+    p = min(max(agree / (len(near) * (total - 1)), uniform), 1.0)
     counts = (
         _log10_choose(total, k) + _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
     )
@@ -386,33 +278,40 @@ def _log10_choose(n: int, k: int) -> float:
     return (math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)) / math.log(10)
 
 
-def _ambiguous(matches: _Matches, fit: _Fit, options: PoseOptions) -> bool:
-    """Ask whether the other of the two poses that a plane allows explains the inliers nearly as well."""
-    points, pixels = matches.points[fit.inliers], matches.pixels[fit.inliers]
-    try:
-        _, rotvecs, ts, _ = cv2.solvePnPGeneric(points, pixels, matches.K, None, flags=cv2.SOLVEPNP_IPPE)
-    except cv2.error:  # the points are in no plane: one pose
+def _ambiguous(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
+    """Ask whether the other of the two poses that a plane allows explains the matches nearly as well."""
+    R, center = _mirrored(problem.points[:, fit.inliers], fit)
+    if _same(R, fit.rotation):
         return False
-    for rotvec, t in zip(rotvecs, ts, strict=True):
-        R = cv2.Rodrigues(rotvec)[0]
-        center = -R.T @ t[:, 0]
-        if _same(R, fit.rotation) or _cost(matches, R, center, options, fit.sigma_px) > 4 * fit.cost + 100:
-            continue  # too far off for a refinement to make up
-        other = _refine(matches, (R, center), options, rounds=1)
-        if other is None or _same(other.rotation, fit.rotation):
-            continue
-        cost = _cost(matches, other.rotation, other.center, options, fit.sigma_px)
-        if cost < fit.cost + options.min_cost_gap:
-            return True
-    return False
+    cost = _cost(problem, fit.rotation, fit.view, fit.variance_px2, options)
+    if _cost(problem, R, look(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
+        return False  # too far off for a refinement to make up
+    other = refine(problem, R, center, steps=_MIRRORED_STEPS)
+    if other is None or _same(other.rotation, fit.rotation):
+        return False
+    return _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + options.min_cost_gap
+
+
+def _mirrored(points: Array, fit: Fit) -> tuple[Array, Array]:
+    """Return the pose that shows a plane through the points alike if perspective is weak.
+
+    Depth mirrored in the line of sight v, and the plane in itself:  R' = (1 - 2 v v^T) R (1 - 2 n n^T).
+    """
+    middle = points.mean(axis=1)
+    away = points - middle[:, None]
+    n = np.linalg.eigh(away @ away.T)[1][:, 0]
+    seen = fit.rotation @ (middle - fit.center)
+    v = seen / np.linalg.norm(seen)
+    mirror, plane = _IDENTITY - 2 * v[:, None] * v, _IDENTITY - 2 * n[:, None] * n
+    R = mirror @ fit.rotation @ plane
+    return R, middle - R.T @ seen
 
 
 def _same(R: Array, other: Array) -> bool:
-    return bool(np.trace(R @ other.T) > 1 + 2 * math.cos(math.radians(_SAME_POSE_DEG)))
+    return float(np.sum(R * other)) > 1 + 2 * math.cos(math.radians(_SAME_POSE_DEG))
 
 
-def _cost(matches: _Matches, R: Array, center: Array, options: PoseOptions, sigma: float) -> float:
+def _cost(problem: Problem, R: Array, view: View, variance: float, options: PoseOptions) -> float:
     """Return chi-square of all matches, each bounded at the threshold, and of the prior."""
-    residual, _ = _residual(matches, R, center)
-    squared = np.minimum(np.einsum("ij,ij->i", residual, residual), options.reprojection_px**2)
-    return float(matches.weights @ squared) / sigma**2 + float(np.sum(_prior_residual(matches.prior, R) ** 2))
+    cost = float(problem.weights @ np.minimum(view.squared, options.reprojection_px**2)) / variance
+    return cost + float(problem.precision @ turn_from_attitude(problem, R) ** 2)
