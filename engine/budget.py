@@ -14,26 +14,42 @@ from engine.errors import OptionError
 class Budget:
     """Milliseconds that one frame may take from call to answer; infinite where nobody waits.
 
+    Attributes:
+        total_ms: of a frame with a prior.
+        search_ms: of a frame without one, which searches the whole map; None is as ``total_ms``.
+
     Raises:
-        OptionError: ``total_ms`` is not above 0.
+        OptionError: one is not above 0.
     """
 
     total_ms: float = math.inf
+    search_ms: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.total_ms > 0:
-            raise OptionError(f"total_ms: expected more than 0 ms, got {self.total_ms}")
+        for name in ("total_ms", "search_ms"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise OptionError(f"{name}: expected more than 0 ms, got {value}")
 
 
 class Deadline:
-    """A budget that started to run. The clock is monotonic; tests hand in their own."""
+    """A budget that started to run. The clock is monotonic; tests hand in their own.
+
+    Args:
+        budget: how long.
+        whole_map: whether a search of the whole map is asked for, which may have a budget of its own.
+        clock_ns: monotonic nanoseconds.
+    """
 
     __slots__ = ("_budget_ms", "_clock_ns", "_start_ns")
 
-    def __init__(self, budget: Budget, clock_ns: Callable[[], int] = time.perf_counter_ns) -> None:
+    def __init__(
+        self, budget: Budget, clock_ns: Callable[[], int] = time.perf_counter_ns, *, whole_map: bool = False
+    ) -> None:
         self._clock_ns = clock_ns
         self._start_ns = clock_ns()
-        self._budget_ms = budget.total_ms
+        search_ms = budget.total_ms if budget.search_ms is None else budget.search_ms
+        self._budget_ms = search_ms if whole_map else budget.total_ms
 
     @property
     def elapsed_ms(self) -> float:

@@ -18,6 +18,7 @@ References:
 """
 
 import math
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,6 +122,17 @@ def sift(
     return done[0] if len(done) == 1 else Features(*(torch.cat(f) for f in zip(*map(_fields, done), strict=True)))
 
 
+def plans_made() -> int:
+    """How many sizes of image were planned for so far; a flight of one camera needs a few."""
+    return make_plan.cache_info().misses
+
+
+def loops_compiled() -> int:
+    """How many loops were compiled, or loaded from where they are kept, so far."""
+    compiled = sys.modules.get("engine.kernels.compiled")
+    return 0 if compiled is None else compiled.count()
+
+
 def _fields(features: Features) -> tuple[Tensor, ...]:
     return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid
 
@@ -162,6 +174,11 @@ def opencv_sift(
     values = torch.from_numpy(slots)
     described = normalise(values[..., 4:], root=root)
     return Features(values[..., :2], values[..., 2], values[..., 3], described, torch.from_numpy(valid))
+
+
+_TRAIN_CHUNK = 4096  # train slots that are compared at a time, so that a whole map's never lie in memory at once
+_FAR = 1e30
+_FORBIDDEN = -2.0  # below every cosine
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,24 +231,84 @@ def match(
     """
     if not 0 < ratio <= 1:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
+    found = []
     with torch.inference_mode():
-        allowed = query.valid[:, :, None] & train.valid[:, None, :]
-        if max_angle_diff_deg is not None:
-            turn = train.angle_deg[:, None, :] - query.angle_deg[:, :, None] - rotation_deg
-            allowed &= ((turn + 180).remainder(360) - 180).abs() <= max_angle_diff_deg
-        if max_scale_factor is not None:
-            factor = train.scale_px[:, None, :] / (query.scale_px[:, :, None] * scale)
-            allowed &= (factor <= max_scale_factor) & (factor * max_scale_factor >= 1)
-        cosine = query.descriptors @ train.descriptors.mT
-        squared = (2 - 2 * cosine).clamp_min_(0).masked_fill_(~allowed, torch.inf)
-        nearest, index = squared.min(dim=2)
-        second = squared.scatter(2, index[:, :, None], torch.inf).amin(dim=2)
-        quotient = (nearest / second.clamp_min(1e-12)).sqrt().nan_to_num(1.0)
+        for begin in range(0, max(1, train.valid.shape[1]), _TRAIN_CHUNK):
+            part = _slots(train, begin, begin + _TRAIN_CHUNK)
+            cosine = query.descriptors @ part.descriptors.mT
+            _forbid(cosine, query, part, rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+            found.append(_two_nearest(cosine, begin))
+        first, index, second, is_back = found[0] if len(found) == 1 else _merged(found)
+        nearest, next_nearest = _distance(first), _distance(second)
+        quotient = (nearest / next_nearest.clamp_min(1e-6)).nan_to_num(1.0)
         valid = nearest.isfinite() & (quotient <= ratio)
         if mutual:
-            back = squared.argmin(dim=1).gather(1, index)
-            valid &= back == torch.arange(index.shape[1], device=index.device)
-    return Matches(index, nearest.sqrt(), quotient, valid)
+            valid &= is_back
+    return Matches(index, nearest, quotient, valid)
+
+
+def _distance(cosine: Tensor) -> Tensor:
+    """Distance of unit vectors; infinite where the pair was forbidden."""
+    return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < _FORBIDDEN, torch.inf)
+
+
+def _slots(features: Features, begin: int, end: int) -> Features:
+    """Some of the slots."""
+    return Features(*(values[:, begin:end] for values in _fields(features)))
+
+
+def _forbid(
+    cosine: Tensor,
+    query: Features,
+    train: Features,
+    rotation_deg: float,
+    max_angle_diff_deg: float | None,
+    scale: float,
+    max_scale_factor: float | None,
+) -> None:
+    """Push the cosine (B, N, M) of pairs that are not allowed far down; by sums, which cost less than masks."""
+    for valid, dim in ((query.valid, 2), (train.valid, 1)):
+        if not bool(valid.all()):
+            cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
+    if max_angle_diff_deg is not None and max_angle_diff_deg < 180:
+        turned, known = torch.deg2rad(query.angle_deg + rotation_deg), torch.deg2rad(train.angle_deg)
+        turn = torch.stack([turned.cos(), turned.sin()], dim=2) @ torch.stack([known.cos(), known.sin()], dim=1)
+        excess = math.cos(math.radians(max_angle_diff_deg)) - turn
+        cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
+    if max_scale_factor is not None:
+        own, other = (query.scale_px * scale).clamp_min(1e-9).log(), train.scale_px.clamp_min(1e-9).log()
+        excess = (other[:, None, :] - own[:, :, None]).abs_().sub_(math.log(max_scale_factor))
+        cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
+
+
+def _two_nearest(cosine: Tensor, begin: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """For each query (B, N) the largest cosine, its slot, the second largest, and whether it is its slot's best.
+
+    ``cosine`` (B, N, M) is used up. Slots count from ``begin``.
+    """
+    if 0 in cosine.shape:
+        none = cosine.new_full(cosine.shape[:2], -torch.inf)
+        return none, torch.zeros_like(none, dtype=torch.int64), none, none > 0
+    index = _argmax(cosine)[:, :, None]
+    first = cosine.gather(2, index)
+    is_back = first[:, :, 0] == cosine.amax(dim=1).gather(1, index[:, :, 0])
+    second = cosine.scatter_(2, index, -torch.inf).amax(dim=2)
+    return first[:, :, 0], index[:, :, 0] + begin, second, is_back
+
+
+def _argmax(values: Tensor) -> Tensor:
+    """values.argmax(2); on a CPU by numpy, which is ten times as fast."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(values.numpy().argmax(2))
+    return values.argmax(2)
+
+
+def _merged(found: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The nearest of all chunks, and the second nearest: of its own chunk or another's nearest."""
+    first, index, second, is_back = (torch.stack(values) for values in zip(*found, strict=True))
+    best = first.argmax(dim=0, keepdim=True)
+    others = first.scatter(0, best, second.gather(0, best))
+    return first.gather(0, best)[0], index.gather(0, best)[0], others.amax(dim=0), is_back.gather(0, best)[0]
 
 
 def _check_images(images: Tensor, mask: Tensor | None) -> None:

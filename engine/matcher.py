@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import torch
 
 from engine import device as devices
 from engine.align import to_gray
-from engine.budget import Budget
+from engine.budget import Budget, Deadline
 from engine.camera import Camera
+from engine.costs import Costs
 from engine.errors import OptionError
-from engine.methods import ncc, paper, sift
+from engine.features import loops_compiled, plans_made
+from engine.landmarks import LandmarkMap
+from engine.methods import ladder, paper
 from engine.methods.laid import NccOptions
-from engine.methods.query import Query, Stopwatch
+from engine.methods.query import Query, Stopwatch, level_crop, level_for
 from engine.methods.sift import SiftOptions
 from engine.orthomap import OrthoMap
 from engine.prepared import PreparedMap
-from engine.types import Fix, Frame, NoFix, Prior, Reason
+from engine.types import Fix, Frame, NoFix, Prior, Reason, Window
 
 METHODS = ("ncc", "sift", "auto")
 PROFILES = ("engine", "paper")
+_WARM_SHARES = (0.25, 0.12)  # of the map's shorter side that a made-up frame sees
+_WARM_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +55,8 @@ class SceneMatcher:
     Args:
         site: the map.
         camera: as calibrated, with its distortion; frames are undistorted by a lookup computed once.
-        method: "ncc" (needs height and heading), "sift" (needs neither), or "auto": NCC where height and
-            heading are known, SIFT where they are not or where NCC refuses.
+        method: "ncc" (needs height and heading), "sift" (needs neither), or "auto": NCC where height and heading
+            are known, then SIFT where there is time; where both have a fix they must agree.
         device: "cpu", "cuda" or "auto".
         options: settings; the defaults serve.
 
@@ -77,16 +83,52 @@ class SceneMatcher:
         self.method = method
         self.device = devices.resolve(device)
         self._prepared = PreparedMap(site, self.device, self.options.ncc.enhance_radius_px, self.options.ncc.score)
+        self._landmarks = LandmarkMap(site, self.device)
+        self._tools = ladder.Tools(self._prepared, self._landmarks, self.options.ncc, self.options.sift)
+        self._costs = Costs()
         # What an undistorted picture obeys; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 
     def warmup(self) -> None:
-        """Match a made-up frame once, so that lookups, plans and pools exist before take-off."""
-        rng = np.random.default_rng(0)
-        noise = rng.integers(0, 256, (self.camera.height_px, self.camera.width_px), dtype=np.uint8)
-        height_m = 0.25 * min(self.site.width_px, self.site.height_px) * self.site.gsd_m_per_px
-        frame = Frame(noise, 0, height_m, 0.0, 0.0, 0.0)
-        self.locate(frame, Prior(east_m=0.0, north_m=0.0, sigma_m=10.0))
+        """Do before take-off what is done once: find the map's features, compile, plan, and learn what rungs cost.
+
+        Features are found on every level that is small enough (:data:`engine.landmarks.PREPARED_PX`); those of a
+        map that comes from a file are kept for the next start. The frames that are matched are the map's own.
+        """
+        features = self.options.sift.map_features == "prepared" and self.options.sift.matcher is None
+        if features and self.method != "ncc" and self.options.profile == "engine":
+            self._landmarks.prepare()
+        for share in _WARM_SHARES:
+            frame, prior = self._made_up(share)
+            for _ in range(_WARM_ROUNDS):
+                self.locate(frame, prior)
+                if self.options.profile == "engine":
+                    ladder.every_rung(self._query(frame, prior, Deadline(Budget())), self._tools, self.method)
+
+    def _made_up(self, share: float) -> tuple[Frame, Prior]:
+        """The frame that a camera would take above the map's middle, when it sees this share of its shorter side."""
+        site, camera = self.site, self.camera
+        side_px = share * min(site.width_px, site.height_px)
+        per_px = side_px / max(camera.width_px, camera.height_px)
+        level = level_for(1.0, per_px, site.levels)
+        size = (round(camera.width_px * per_px), round(camera.height_px * per_px))
+        corner = ((site.width_px - size[0]) // 2, (site.height_px - size[1]) // 2)
+        crop = level_crop(site, Window(*corner, max(1, size[0]), max(1, size[1])), level)
+        image = cv2.resize(site.gray(crop, level), (camera.width_px, camera.height_px))
+        middle = site.enu_from_pixel(np.array([site.width_px - 1, site.height_px - 1]) / 2.0)
+        height_m = per_px * camera.focal_px * site.gsd_m_per_px
+        prior = Prior(east_m=float(middle[0]), north_m=float(middle[1]), sigma_m=5.0)
+        return Frame(np.asarray(image, np.uint8), 0, height_m, 0.0, 0.0, 0.0), prior
+
+    @property
+    def one_off_work(self) -> dict[str, int]:
+        """Counts of what is made once and kept; after :meth:`warmup` none should rise while the map is small."""
+        return {
+            "map regions": self._prepared.made,
+            "landmark tiles": self._landmarks.made,
+            "feature plans": plans_made(),
+            "compiled loops": loops_compiled(),
+        }
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """Where the camera was when the frame was taken.
@@ -100,24 +142,26 @@ class SceneMatcher:
         Raises:
             CalibrationError: the frame is not of the camera's resolution.
         """
-        watch = Stopwatch(budget or Budget(), self.device)
-        with watch.stage("grey"):
-            gray = self.camera.undistort(to_gray(frame))
-        query = Query(frame, gray, self._pinhole, self.site, prior, self.device, watch)
+        deadline = Deadline(budget or Budget(), whole_map=prior is None)
+        query = self._query(frame, prior, deadline)
         result = self._dispatch(query)
-        if isinstance(result, Fix) and not watch.deadline.met:
+        if isinstance(result, Fix) and not deadline.met:
             return query.refuse(
                 Reason.LATE, "the answer came after the budget", result.method, window=result.window
             )
-        return replace(result, timings=watch.timings)
+        return replace(result, timings=query.watch.timings)
+
+    def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
+        watch = Stopwatch(deadline, self.device, self._costs)
+        with watch.stage("grey"):
+            gray = self.camera.undistort(to_gray(frame))
+        return Query(frame, gray, self._pinhole, self.site, prior, self.device, watch)
 
     def _dispatch(self, query: Query) -> Fix | NoFix:
         if self.options.profile == "paper":
             return paper.locate(query, self.method)
-        known = query.frame.height_agl_m is not None and query.frame.heading_deg is not None
-        if self.method == "sift" or (self.method == "auto" and not known):
-            return sift.locate(query, self.options.sift)
-        result = ncc.locate(query, self._prepared, self.options.ncc)
-        if self.method == "auto" and isinstance(result, NoFix) and result.reason is not Reason.LATE:
-            return sift.locate(query, self.options.sift)
-        return result
+        if self.method == "ncc":
+            return ladder.by_ncc(query, self._tools)
+        if self.method == "sift":
+            return ladder.by_sift(query, self._tools)
+        return ladder.by_both(query, self._tools)

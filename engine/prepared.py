@@ -55,6 +55,8 @@ class PreparedMap:
     def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
         self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()
+        self.made = 0
+        """Regions prepared so far."""
 
     def cut(self, window: Window, level: int) -> Region:
         """The prepared part of a level that holds a window, cut to it.
@@ -87,6 +89,7 @@ class PreparedMap:
         region = self._regions.get((level, wanted))
         if region is None:
             region = self._prepare(wanted, level)
+            self.made += 1
             self._regions[level, wanted] = region
             self._forget()
         self._regions.move_to_end((level, wanted))

@@ -181,6 +181,7 @@ class Reason(enum.Enum):
     NO_HEADING = "no_heading"
     TILTED = "tilted"
     LATE = "late"
+    FAILED = "failed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +216,7 @@ class Fix:
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).
+        stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "verified" by both methods.
     """
 
     timestamp_ns: int | None
@@ -230,6 +232,7 @@ class Fix:
     window: Window
     timings: Timings
     map_xy_px: tuple[float, float]
+    stage: str = "fine"
 
     @property
     def sigma_m(self) -> float:

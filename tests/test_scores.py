@@ -13,7 +13,7 @@ import torch
 from engine import Fix, Frame, MatcherOptions, OptionError, OrthoMap, SceneMatcher
 from engine import prepared as prepared_map
 from engine.align import SCORES, enhance
-from engine.budget import Budget
+from engine.budget import Budget, Deadline
 from engine.methods import ncc
 from engine.methods.laid import NccOptions
 from engine.methods.query import Query, Stopwatch
@@ -149,7 +149,7 @@ def locate(ground, camera, frame, score):
     """The NCC method on a map that was prepared for a score."""
     options = NccOptions(score=score)
     prepared = PreparedMap(ground.site, CPU, options.enhance_radius_px, score)
-    watch = Stopwatch(Budget(), CPU)
+    watch = Stopwatch(Deadline(Budget()), CPU)
     query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, watch)
     return ncc.locate(query, prepared, options)
 

@@ -30,6 +30,11 @@ def _compiled(function):
         return njit(nogil=True, error_model="numpy", fastmath=_FAST)(function)
 
 
+def count() -> int:
+    """How many versions of the loops were compiled or loaded so far."""
+    return sum(len(loop.signatures) for loop in (search, refine, angles, descriptors))
+
+
 @lru_cache(maxsize=128)
 def filters(inputs: int, outputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> Filters:
     """Gaussians along one axis as weights (levels, up, taps), reach (levels,) and gains (levels, outputs).

@@ -12,8 +12,15 @@ from engine.prepared import PreparedMap
 from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
 
 
-def locate(query: Query, prepared: PreparedMap, options: NccOptions) -> Fix | NoFix:
-    """One frame to a fix by correlation; needs its height, and its heading or the time to search for it."""
+def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Fix | NoFix:
+    """One frame to a fix by correlation; needs its height, and its heading or the time to search for it.
+
+    Args:
+        query: the frame.
+        prepared: the map.
+        options: settings.
+        coarser: levels above the one whose pixels are like the frame's, for an answer that is quicker and cruder.
+    """
     frame = query.frame
     if frame.height_agl_m is None:
         return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
@@ -23,6 +30,7 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions) -> Fix | No
     if flat is not None:
         return flat
     level = level_for(query.site.gsd_m_per_px, frame.height_agl_m / query.camera.focal_px, query.site.levels)
+    level = min(level + coarser, query.site.levels - 1)
     with query.watch.stage("align"):
         aligned = align(
             query, frame if frame.heading_deg is not None else replace(frame, heading_deg=0.0), level, options

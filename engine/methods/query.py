@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.budget import Budget, Deadline
+from engine.budget import Deadline
 from engine.camera import Camera
+from engine.costs import Costs
 from engine.device import synchronise
 from engine.orthomap import OrthoMap
 from engine.types import Frame, NoFix, Prior, Reason, Timings, Window
@@ -24,12 +25,30 @@ Array = NDArray[np.float64]
 
 
 class Stopwatch:
-    """Milliseconds by stage, against a deadline."""
+    """Milliseconds by stage, against a deadline, and what is known of the price of a rung.
 
-    def __init__(self, budget: Budget, device: torch.device) -> None:
-        self.deadline = Deadline(budget)
+    Args:
+        deadline: runs already.
+        device: work on it is waited for when a stage ends.
+        costs: prices of the rungs, refreshed by each.
+    """
+
+    def __init__(self, deadline: Deadline, device: torch.device, costs: Costs | None = None) -> None:
+        self.deadline = deadline
         self._device = device
+        self._costs = costs or Costs()
         self._stages_ms: dict[str, float] = {}
+
+    def affords(self, rung: str, work: float) -> bool:
+        """Whether the time that is left will do for a rung of this much work; True for one that never ran."""
+        return self._costs.expected_ms(rung, work) <= self.deadline.remaining_ms
+
+    @contextmanager
+    def rung(self, name: str, work: float) -> Iterator[None]:
+        """Note what a rung of this much work costs."""
+        start_ms = self.deadline.elapsed_ms
+        yield
+        self._costs.learn(name, work, self.deadline.elapsed_ms - start_ms)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

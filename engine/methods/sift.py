@@ -1,4 +1,4 @@
-"""The SIFT method (Fig. 6): half scale, features of frame and window, matches lifted to 3D, PnP with RANSAC."""
+"""The SIFT method (Fig. 6): half scale, features of frame and map, matches lifted to 3D, PnP with RANSAC."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import view_of
 from engine.errors import OptionError
-from engine.features import Features, match, sift
+from engine.features import match, sift
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.integrity import AssumedErrors
-from engine.methods.query import Query, level_crop, level_for
+from engine.landmarks import LandmarkMap, Landmarks, as_picture
+from engine.learned import PairMatcher
+from engine.methods.query import Query
+from engine.methods.views import LOWEST_M, Belief, View, turn_deg, views_of
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
 from engine.types import Attitude, Fix, NoFix, Reason, Window
@@ -23,7 +25,7 @@ from engine.types import Attitude, Fix, NoFix, Reason, Window
 Array = NDArray[np.float64]
 
 METHOD = "sift"
-_CROP_STEP_PX = 32
+MAP_FEATURES = ("prepared", "per_frame")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,9 +35,21 @@ class SiftOptions:
     Attributes:
         margin: the 1.3 of equations 4 and 5.
         scale: the frame is reduced to this before detection; the paper's 0.5.
-        max_keypoints: features taken from the frame; the window's share grows with its area.
-        max_map_keypoints: upper limit for the window, also where it is the whole map.
+        max_keypoints: features taken from the frame; the map's are as dense.
+        map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
+        max_map_keypoints: upper limit for a window that is described per frame.
         ratio: best against second-best descriptor distance (Lowe's test).
+        upright: where the heading is known, turn the descriptors by it and not by each keypoint's gradients.
+        max_turn_deg: where the heading is known and descriptors are not upright, how far the angles of a match may
+            contradict it; None does not ask.
+        max_scale_factor: where the height is known, by which factor the scales of a match may contradict it; None
+            does not ask.
+        second_look: where nothing is found, look again without the heading and with heights up to
+            ``height_factor`` off.
+        height_factor: see above; 1 trusts the height also then.
+        max_height_m: where the height is unknown, it is at most this.
+        matcher: takes the place of features: it is given the reduced frame and the crop of the map, and what it
+            matches is lifted and solved for the pose as features are.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
         use_attitude: where the frame came with heading, roll and pitch, let them weigh in the pose by their
@@ -47,8 +61,16 @@ class SiftOptions:
     margin: float = 1.3
     scale: float = 0.5
     max_keypoints: int = 300
+    map_features: str = "prepared"
     max_map_keypoints: int = 6000
     ratio: float = 0.8
+    upright: bool = True
+    max_turn_deg: float | None = 30.0
+    max_scale_factor: float | None = 1.5
+    second_look: bool = True
+    height_factor: float = 2.0
+    max_height_m: float = 500.0
+    matcher: PairMatcher | None = None
     min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
     use_attitude: bool = True
@@ -56,103 +78,164 @@ class SiftOptions:
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
-        if not self.margin >= 1.0:
-            raise OptionError(f"margin: expected 1 or more, got {self.margin}")
+        for name in ("margin", "height_factor"):
+            if not getattr(self, name) >= 1.0:
+                raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         for name in ("scale", "ratio"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
+        for name, least in (("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", LOWEST_M)):
+            value = getattr(self, name)
+            if value is not None and not value > least:
+                raise OptionError(f"{name}: expected above {least:g}, got {value}")
+        if self.map_features not in MAP_FEATURES:
+            raise OptionError(
+                f"map_features: expected one of {', '.join(MAP_FEATURES)}, got {self.map_features!r}"
+            )
         if self.max_keypoints < 4:
             raise OptionError(f"max_keypoints: expected 4 or more, got {self.max_keypoints}")
 
 
-def locate(query: Query, options: SiftOptions) -> Fix | NoFix:
+@dataclass(frozen=True, slots=True)
+class _Matched:
+    """Points of the frame found again in a view: (M, 2) pixels of the frame and (M, 3) metres on the ground."""
+
+    view: View
+    points_px: Array
+    points_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Reduced:
+    """The frame reduced as the paper does, (1, 1, H, W) in [0, 1], and the scale (x, y) that reduced it."""
+
+    picture: torch.Tensor
+    scale: Array
+
+    def full(self, xy_px: Array) -> Array:
+        """Places in the frame: edges lie on edges, centres on centres."""
+        return np.asarray((xy_px + 0.5) / self.scale - 0.5, dtype=np.float64)
+
+
+def locate(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Fix | NoFix:
     """One frame to a fix by features; needs neither height nor heading."""
     flat = query.refuse_flat(METHOD, options.min_deviation)
     if flat is not None:
         return flat
+    height_m, factor = query.frame.height_agl_m, options.height_factor
+    unknown = (LOWEST_M, options.max_height_m)
+    told = Belief(unknown if height_m is None else (height_m, height_m), turn_deg(query))
+    result = _look(query, landmarks, told, options)
+    if isinstance(result, Fix) or result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
+        return result
+    doubted = Belief(unknown if height_m is None else (height_m / factor, height_m * factor), None)
+    deadline = query.watch.deadline
+    if not options.second_look or doubted == told or deadline.remaining_ms < deadline.elapsed_ms:
+        return result
+    second = _look(query, landmarks, doubted, options)
+    return second if isinstance(second, Fix) else result
+
+
+def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOptions) -> Fix | NoFix:
+    """Match, lift and solve, with what is believed of the telemetry."""
     watch = query.watch
     with watch.stage("window"):
-        window = _window(query, options)
-    if isinstance(window, NoFix):
-        return window
-    with watch.stage("frame features"):
-        frame_features, frame_scale = _frame_features(query, options)
-    with watch.stage("map features"):
-        map_features, level, corner = _map_features(query, window, options)
-    with watch.stage("match"):
-        pairs = match(frame_features, map_features, ratio=options.ratio).pairs().cpu().numpy()
-        points_px = _full_resolution(_take(frame_features, pairs[:, 0]), frame_scale)
-        map_px = query.site.full_from_level(_take(map_features, pairs[:, 1]) + corner, level)
-    if len(pairs) < options.pose.min_inliers:
-        detail = f"{len(pairs)} matches; {options.pose.min_inliers} are asked for"
+        views = views_of(query, belief, METHOD, margin=options.margin, scale=options.scale)
+    if isinstance(views, NoFix):
+        return views
+    if options.matcher is not None:
+        matched = _by_matcher(query, views, options.matcher, options)
+    else:
+        matched = _by_features(query, views, landmarks, belief, options)
+    matched.sort(key=lambda found: len(found.points_px), reverse=True)
+    count, window = len(matched[0].points_px), matched[0].view.window
+    if count < options.pose.min_inliers:
+        detail = f"{count} matches; {options.pose.min_inliers} are asked for"
         return query.refuse(Reason.TOO_FEW_MATCHES, detail, METHOD, window=window)
     if watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the pose", METHOD, window=window)
-    with watch.stage("pose"):
-        points_m = np.c_[query.site.enu_from_pixel(map_px), query.site.surface_at(map_px)]
-        prior = _attitude_prior(query, options)
-        stats = solve_pose(points_m, points_px, query.camera.matrix, options.pose, prior=prior)
-    if stats is None:
-        detail = f"no pose explains enough of the {len(pairs)} matches"
-        return query.refuse(Reason.BAD_POSE, detail, METHOD, window=window)
-    return _fix(query, stats, window, options)
+    prior = _attitude_prior(query, options)
+    for found in matched:
+        with watch.stage("pose"):
+            stats = solve_pose(found.points_m, found.points_px, query.camera.matrix, options.pose, prior=prior)
+        if stats is not None:
+            return _fix(query, stats, found.view.window, options)
+    return query.refuse(Reason.BAD_POSE, f"no pose explains enough of the {count} matches", METHOD, window=window)
 
 
-def _window(query: Query, options: SiftOptions) -> Window | NoFix:
-    """The adaptive window (eq. 4, 5); the whole map where position or height is unknown."""
-    frame, nadir = query.frame, query.prior_px
-    if nadir is None or frame.height_agl_m is None:
-        return Window(0, 0, query.site.width_px, query.site.height_px)
-    attitude = frame.attitude or Attitude(0.0, 0.0, 0.0)
-    view = view_of(query.camera, attitude, frame.height_agl_m, query.jacobian)
-    if view is None:
-        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
-        return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", METHOD)
-    width, height = view.footprint_px
-    if frame.heading_deg is None:  # at any heading the footprint fits the square of its diagonal
-        width = height = math.hypot(width, height)
-    window = query.window(nadir + view.center_px, (width, height), (width, height), margin=options.margin)
-    return window or query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
+def _by_features(
+    query: Query, views: list[View], landmarks: LandmarkMap, belief: Belief, options: SiftOptions
+) -> list[_Matched]:
+    """Features of the frame among those of the map, view by view."""
+    turn = belief.turn_deg
+    upright = options.upright and turn is not None
+    with query.watch.stage("frame features"):
+        reduced = _reduced(query, options.scale)
+        features = sift(reduced.picture, max_keypoints=options.max_keypoints, upright=upright, up_deg=turn or 0.0)
+    matched = []
+    for view in views:
+        with query.watch.stage("map features"):
+            known = _map_features(query, view, landmarks, upright, options)
+        with query.watch.stage("match"):
+            found = match(
+                features,
+                known.features,
+                ratio=options.ratio,
+                rotation_deg=-(turn or 0.0),
+                max_angle_diff_deg=None if upright or turn is None else options.max_turn_deg,
+                scale=1.0 / view.coarser,
+                max_scale_factor=None if belief.height_m is None else options.max_scale_factor,
+            )
+            pairs = found.pairs().cpu().numpy()
+            points_px = reduced.full(features.xy_px[0].cpu().numpy()[pairs[:, 0]])
+            matched.append(_Matched(view, points_px, known.points_m[pairs[:, 1]]))
+    return matched
 
 
-def _frame_features(query: Query, options: SiftOptions) -> tuple[Features, tuple[float, float]]:
-    """Features of the reduced frame, and the scale (x, y) that reduced it."""
+def _by_matcher(query: Query, views: list[View], matcher: PairMatcher, options: SiftOptions) -> list[_Matched]:
+    """What the user's own matcher finds, view by view."""
+    reduced = _reduced(query, options.scale)
+    matched = []
+    for view in views:
+        with query.watch.stage("match"), torch.inference_mode():
+            crop = as_picture(query.site.gray(view.crop, view.level), query.device)
+            points, places = (found.cpu().numpy() for found in matcher(reduced.picture, crop))
+            map_px = query.site.full_from_level(places + view.corner_px, view.level)
+            matched.append(_Matched(view, reduced.full(points), _lifted(query.site, map_px)))
+    return matched
+
+
+def _reduced(query: Query, scale: float) -> _Reduced:
     height, width = query.gray.shape
-    size = (max(16, round(width * options.scale)), max(16, round(height * options.scale)))
+    size = (max(16, round(width * scale)), max(16, round(height * scale)))
     picture = cv2.resize(query.gray, size, interpolation=cv2.INTER_AREA)
-    features = sift(_tensor(picture, query.device), max_keypoints=options.max_keypoints)
-    return features, (size[0] / width, size[1] / height)
+    return _Reduced(as_picture(np.asarray(picture, np.uint8), query.device), np.array(size) / [width, height])
 
 
-def _map_features(query: Query, window: Window, options: SiftOptions) -> tuple[Features, int, Array]:
-    """Features of the window on the pyramid level like the reduced frame's, the level, and the crop's corner."""
-    site = query.site
-    level = min(1, site.levels - 1)
-    if query.frame.height_agl_m is not None:
-        reduced_gsd = query.frame.height_agl_m / (query.camera.focal_px * options.scale)
-        level = level_for(site.gsd_m_per_px, reduced_gsd, site.levels)
-    crop = level_crop(site, window, level, step_px=_CROP_STEP_PX)
+def _map_features(
+    query: Query, view: View, landmarks: LandmarkMap, upright: bool, options: SiftOptions
+) -> Landmarks:
+    """Landmarks of a view, as dense as the features of the reduced frame; denser where its pixels are coarser."""
+    reduced_px = query.gray.size * options.scale**2
+    if options.map_features == "prepared":
+        per_px = options.max_keypoints / reduced_px * max(1.0, view.coarser) ** 2
+        return landmarks.find(view.crop, view.level, upright=upright, per_px=per_px)
+    site, crop = query.site, view.crop
+    count = np.clip(
+        options.max_keypoints * crop.area_px / reduced_px, options.max_keypoints, options.max_map_keypoints
+    )
     mask = None
     if not site.fully_valid:
-        mask = torch.from_numpy(site.valid(crop, level)).to(query.device)[None, None]
-    share = crop.area_px / (query.gray.size * options.scale**2)
-    count = int(np.clip(options.max_keypoints * share, options.max_keypoints, options.max_map_keypoints))
-    features = sift(_tensor(site.gray(crop, level), query.device), max_keypoints=count, mask=mask)
-    return features, level, np.array([crop.x0, crop.y0], dtype=np.float64)
+        mask = torch.from_numpy(site.valid(crop, view.level)).to(query.device)[None, None]
+    picture = as_picture(site.gray(crop, view.level), query.device)
+    features = sift(picture, max_keypoints=int(count), upright=upright, mask=mask)
+    map_px = site.full_from_level(features.xy_px[0].cpu().numpy() + view.corner_px, view.level)
+    return Landmarks(features, _lifted(site, map_px))
 
 
-def _tensor(gray: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(gray)).to(device)[None, None].float() / 255.0
-
-
-def _take(features: Features, index: NDArray[np.int64]) -> Array:
-    """Places (M, 2) of the features with these indices."""
-    return np.asarray(features.xy_px[0].cpu().numpy()[index], dtype=np.float64)
-
-
-def _full_resolution(xy_px: Array, scale: tuple[float, float]) -> Array:
-    """Places in the reduced picture to places in the frame: edges lie on edges, centres on centres."""
-    return np.asarray((xy_px + 0.5) / np.array(scale) - 0.5, dtype=np.float64)
+def _lifted(site: OrthoMap, map_px: Array) -> Array:
+    """(N, 3) east, north and the height of the surface at pixels of the map."""
+    return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:

@@ -1,0 +1,125 @@
+"""The anytime ladder: of each method the best rung that the time left affords, and with both a second opinion.
+
+Prices are learned (:mod:`engine.costs`): before a rung is begun it is known what it will hardly exceed, and a rung
+that would come too late is not begun. Without a budget the highest rung is always affordable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from engine.landmarks import LandmarkMap
+from engine.methods import laid, ncc, sift
+from engine.methods.bank import is_trusted
+from engine.methods.laid import NccOptions
+from engine.methods.query import Query, level_for
+from engine.methods.sift import SiftOptions
+from engine.prepared import PreparedMap
+from engine.types import Fix, NoFix, Reason, Result
+
+_COARSER = (0, 1, 2)  # levels above the frame's own that NCC may fall back to
+_LEAST_SIDE_PX = 24  # of what is correlated there
+_REDUCED = (1.0, 0.7, 0.5)  # of the scale at which SIFT looks at the frame
+_SAME_PLACE = 13.8  # chi-square of two degrees of freedom that chance exceeds once in a thousand
+
+
+@dataclass(frozen=True, slots=True)
+class Tools:
+    """What the methods work with."""
+
+    prepared: PreparedMap
+    landmarks: LandmarkMap
+    ncc: NccOptions
+    sift: SiftOptions
+
+
+def by_ncc(query: Query, tools: Tools) -> Result:
+    """NCC on the finest level of the map that the time affords."""
+    if query.frame.height_agl_m is None or query.prior is None or not is_trusted(query.frame, tools.ncc):
+        area_px = query.site.width_px * query.site.height_px
+        if not query.watch.affords("ncc search", area_px):
+            return _late(query, laid.METHOD)
+        with query.watch.rung("ncc search", area_px):
+            return ncc.locate(query, tools.prepared, tools.ncc)
+    for coarser in _COARSER:
+        work_px = _window_px(query, tools.ncc, coarser)
+        if work_px is not None and query.watch.affords("ncc", work_px):
+            with query.watch.rung("ncc", work_px):
+                result = ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
+            return _on_stage(result, "coarse" if coarser else "fine")
+    return _late(query, laid.METHOD)
+
+
+def by_sift(query: Query, tools: Tools) -> Result:
+    """SIFT at the highest resolution of the frame that the time affords."""
+    known = query.prior is not None and query.frame.height_agl_m is not None
+    rung = "sift" if known else "sift search"
+    for share in _REDUCED:
+        options = tools.sift if share == 1.0 else replace(tools.sift, scale=tools.sift.scale * share)
+        work_px = query.gray.size * options.scale**2
+        if query.watch.affords(rung, work_px):
+            with query.watch.rung(rung, work_px):
+                result = sift.locate(query, tools.landmarks, options)
+            return _on_stage(result, "coarse" if share < 1.0 else "fine")
+    return _late(query, sift.METHOD)
+
+
+def by_both(query: Query, tools: Tools) -> Result:
+    """NCC where height and heading are known, then SIFT where there is time: two fixes must be of one place."""
+    if query.frame.height_agl_m is None or query.frame.heading_deg is None:
+        return by_sift(query, tools)
+    first = by_ncc(query, tools)
+    second = by_sift(query, tools)
+    if isinstance(first, NoFix) or isinstance(second, NoFix):
+        return first if isinstance(first, Fix) or _was_late(second) else second
+    apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+    spread_m2 = (first.covariance_m2 + second.covariance_m2)[:2, :2]
+    if float(apart_m @ np.linalg.solve(spread_m2, apart_m)) > _SAME_PLACE:
+        detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
+        return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
+    return replace(min(first, second, key=lambda fix: fix.sigma_m), stage="verified")
+
+
+def every_rung(query: Query, tools: Tools, method: str) -> None:
+    """Run each rung once, so that its price is known."""
+    for coarser in _COARSER if method != "sift" else ():
+        work_px = _window_px(query, tools.ncc, coarser)
+        if work_px is not None:
+            with query.watch.rung("ncc", work_px):
+                ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
+    for share in _REDUCED if method != "ncc" else ():
+        options = replace(tools.sift, scale=tools.sift.scale * share)
+        with query.watch.rung("sift", query.gray.size * options.scale**2):
+            sift.locate(query, tools.landmarks, options)
+
+
+def _window_px(query: Query, options: NccOptions, coarser: int) -> float | None:
+    """Pixels of the window on a level, which is what NCC costs by; None where the level is too coarse."""
+    site, camera, height_m = query.site, query.camera, query.frame.height_agl_m
+    assert height_m is not None  # asked for before
+    assert query.prior is not None
+    level = level_for(site.gsd_m_per_px, height_m / camera.focal_px, site.levels) + coarser
+    per_px = height_m / (camera.focal_px * site.gsd_m_per_px * 2.0**level)
+    least = options.fraction * min(camera.width_px, camera.height_px) * per_px
+    if coarser and (level >= site.levels or least < _LEAST_SIDE_PX):
+        return None
+    slack_px = 6.0 * query.prior.sigma_m / (site.gsd_m_per_px * 2.0**level)
+    sides = (options.margin * side * per_px + slack_px for side in (camera.width_px, camera.height_px))
+    return float(np.prod(list(sides)))
+
+
+def _on_stage(result: Result, stage: str) -> Result:
+    return replace(result, stage=stage) if isinstance(result, Fix) else result
+
+
+def _was_late(result: Result) -> bool:
+    return isinstance(result, NoFix) and result.reason is Reason.LATE
+
+
+def _late(query: Query, method: str) -> NoFix:
+    left_ms = query.watch.deadline.remaining_ms
+    return query.refuse(
+        Reason.LATE, f"{left_ms:.1f} ms are left; the least that {method} can do takes longer", method
+    )

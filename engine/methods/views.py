@@ -1,0 +1,116 @@
+"""Where on the map features are looked for: the adaptive window, on each pyramid level that the height allows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.align import view_of
+from engine.geo import enu_from_body
+from engine.landmarks import PREPARED_PX
+from engine.methods.query import Query, level_crop, level_for
+from engine.types import Attitude, NoFix, Reason, Window
+
+LOWEST_M = 1.0
+"""The lowest height that is looked for where the height is unknown."""
+_CROP_STEP_PX = 32
+_LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What of the telemetry is believed in one look at a frame.
+
+    Attributes:
+        heights_m: the lowest and the highest that is looked for; equal where the height is known.
+        turn_deg: direction of the map's x axis in the frame, from +x towards +y; None where unknown.
+    """
+
+    heights_m: tuple[float, float]
+    turn_deg: float | None
+
+    @property
+    def height_m(self) -> float | None:
+        """The height where it is known."""
+        return self.heights_m[0] if self.heights_m[0] == self.heights_m[1] else None
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A part of one level of the map that the frame may show.
+
+    Attributes:
+        window: in pixels of the full map.
+        level: of the pyramid.
+        crop: the window in pixels of the level.
+        coarser: pixel of the level over pixel of the reduced frame, on the ground; at the lowest height.
+    """
+
+    window: Window
+    level: int
+    crop: Window
+    coarser: float
+
+    @property
+    def corner_px(self) -> NDArray[np.float64]:
+        """(2,) the crop's top-left pixel."""
+        return np.array([self.crop.x0, self.crop.y0], np.float64)
+
+
+def turn_deg(query: Query) -> float | None:
+    """Direction of the map's x axis in the middle of the frame, by the telemetry; None without a heading."""
+    attitude = query.frame.attitude
+    if attitude is None:
+        return None
+    enu_from_camera = (
+        enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ query.camera.mount
+    )
+    x, y, _ = enu_from_camera.T @ np.array([*query.jacobian[:, 0], 0.0])
+    return math.degrees(math.atan2(y, x))
+
+
+def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale: float) -> list[View] | NoFix:
+    """The windows to look at, one a level; a level that is too large to be searched gives way to a coarser one.
+
+    Args:
+        query: the frame and its prior; without a prior every window is the whole map.
+        belief: the heights decide on the levels, and on each the highest that it serves on the size of the window.
+        method: what a refusal names.
+        margin: the 1.3 of equations 4 and 5.
+        scale: of the reduced frame.
+    """
+    site, heights_m = query.site, belief.heights_m
+    per_height = 1.0 / (query.camera.focal_px * scale * site.gsd_m_per_px)
+    first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
+    views: dict[int, View] = {}
+    for level in range(first, last + 1):
+        served_m = heights_m[1] if level == last else 2 ** (level + _LEVEL_ENDS) / per_height
+        window = _window(query, served_m, belief.turn_deg is not None, method, margin)
+        if isinstance(window, NoFix):
+            return window
+        searched = level
+        while window.area_px >> 2 * searched > PREPARED_PX and searched < site.levels - 1:
+            searched += 1
+        crop = level_crop(site, window, searched, step_px=_CROP_STEP_PX)
+        views[searched] = View(window, searched, crop, 2**searched / (heights_m[0] * per_height))
+    return list(views.values())
+
+
+def _window(query: Query, height_m: float, known_turn: bool, method: str, margin: float) -> Window | NoFix:
+    """The adaptive window (eq. 4, 5) at a height; the whole map where the position is unknown."""
+    nadir = query.prior_px
+    if nadir is None:
+        return Window(0, 0, query.site.width_px, query.site.height_px)
+    attitude = query.frame.attitude or Attitude(0.0, 0.0, 0.0)
+    view = view_of(query.camera, attitude, height_m, query.jacobian)
+    if view is None:
+        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
+        return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", method)
+    width, height = view.footprint_px
+    if not known_turn:  # at any heading the footprint fits the square of its diagonal
+        width = height = math.hypot(width, height)
+    window = query.window(nadir + view.center_px, (width, height), (width, height), margin=margin)
+    return window or query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)

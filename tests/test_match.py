@@ -1,0 +1,63 @@
+"""Matching a frame's descriptors with many of the map: in chunks as in one piece, and as written down plainly."""
+
+import numpy as np
+import pytest
+import torch
+
+from engine import features as module
+from engine.features import Features, match
+
+
+def described(count, seed, *, like=None):
+    """Random features; the first of them are noisy copies of ``like``."""
+    generator = torch.Generator().manual_seed(seed)
+    descriptors = torch.rand(1, count, 128, generator=generator)
+    if like is not None:
+        shared = like.descriptors.shape[1]
+        descriptors[:, :shared] = like.descriptors * 11.0 + 0.3 * descriptors[:, :shared]
+    return Features(
+        xy_px=torch.zeros(1, count, 2),
+        scale_px=1.0 + 3.0 * torch.rand(1, count, generator=generator),
+        angle_deg=360.0 * torch.rand(1, count, generator=generator),
+        descriptors=torch.nn.functional.normalize(descriptors, dim=2),
+        valid=torch.rand(1, count, generator=generator) < 0.9,
+    )
+
+
+def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
+    """Pair by pair, in float64: nearest, ratio and mutual test among the pairs that are allowed."""
+    q, t = query.descriptors[0].double().numpy(), train.descriptors[0].double().numpy()
+    distance = np.sqrt(np.maximum(0.0, 2.0 - 2.0 * q @ t.T))
+    off = train.angle_deg[0].numpy()[None] - query.angle_deg[0].numpy()[:, None] - turn_deg
+    grown = train.scale_px[0].numpy()[None] / query.scale_px[0].numpy()[:, None] / scale
+    allowed = query.valid[0].numpy()[:, None] & train.valid[0].numpy()[None]
+    allowed &= np.abs((off + 180) % 360 - 180) <= most_deg
+    allowed &= np.abs(np.log(grown)) <= np.log(factor)
+    distance[~allowed] = np.inf
+    pairs = []
+    for i, row in enumerate(distance):
+        first, second = np.sort(row)[:2]
+        j = int(row.argmin())
+        if first < np.inf and first <= ratio * second and distance[:, j].argmin() == i:
+            pairs.append((i, j))
+    return pairs
+
+
+@pytest.mark.parametrize("chunk", [7, 64, 4096])
+@pytest.mark.parametrize(("most_deg", "factor"), [(180.0, 1e9), (60.0, 1e9), (180.0, 1.5), (75.0, 2.0)])
+def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, most_deg, factor):
+    monkeypatch.setattr(module, "_TRAIN_CHUNK", chunk)
+    query = described(60, 1)
+    train = described(333, 2, like=query)
+    found = match(
+        query, train, ratio=0.9, rotation_deg=20.0, max_angle_diff_deg=most_deg, scale=1.2, max_scale_factor=factor
+    )
+    expected = plainly(query, train, 0.9, 20.0, most_deg, 1.2, factor)
+    assert len(expected) > 3
+    assert [tuple(pair) for pair in found.pairs().tolist()] == expected
+
+
+def test_nothing_matches_a_map_without_features():
+    empty = described(0, 3)
+    assert match(described(5, 1), empty).pairs().shape == (0, 2)
+    assert match(empty, described(5, 1)).pairs().shape == (0, 2)
