@@ -10,6 +10,7 @@
     ├── MapError                        a map or surface model that cannot be read or placed on the Earth
     ├── CalibrationError                a camera file that cannot be read, or does not fit its frames
     ├── TelemetryError                  telemetry, truth or frames that cannot be read or contradict each other
+    ├── StateError        (RuntimeError) a call at the wrong time, such as to something that was closed
     └── BackendError                    a fast path that could not do its work
 
 A message is one line and names the argument, what was expected and what came.
@@ -47,6 +48,10 @@ class CalibrationError(EngineError):
 
 class TelemetryError(EngineError):
     """Telemetry, truth or frames cannot be read or contradict each other."""
+
+
+class StateError(EngineError, RuntimeError):
+    """A call came at the wrong time."""
 
 
 class BackendError(EngineError):

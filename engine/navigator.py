@@ -93,13 +93,14 @@ class Navigator:
         """Whether there is a fix to carry on from."""
         return self._track is not None
 
-    def update(self, frame: Frame, prior: Prior | None = None) -> Fix | NoFix:
+    def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
 
         Args:
             frame: taken after every frame before it.
             prior: what somebody else knows of this frame's place; used where it is tighter than what the last
                 fixes say.
+            budget: of this frame, in place of the navigator's.
 
         Raises:
             TelemetryError: the frame is not newer than the last one.
@@ -108,7 +109,7 @@ class Navigator:
         own = self._predict(frame, interval_s)
         if own is None or (prior is not None and prior.sigma_m < own.sigma_m):
             own = prior if prior is not None else own
-        result = self._matcher.locate(self._with_height(frame), own, self._budget)
+        result = self._matcher.locate(self._with_height(frame), own, budget or self._budget)
         self._last_ns = frame.timestamp_ns if frame.timestamp_ns is not None else self._last_ns
         if isinstance(result, Fix):
             self._accept(result, frame)

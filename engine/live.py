@@ -1,0 +1,272 @@
+"""Live: frames as they are captured, answers in time. A queue of one, in which the newest frame wins.
+
+A worker thread matches; a watchman answers for it when the deadline comes first, and replaces it where it hangs or
+dies. What a worker finds after its frame was answered for is never put out.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from engine.budget import Budget
+from engine.errors import EngineError, StateError
+from engine.navigator import Navigator
+from engine.types import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
+
+_log = logging.getLogger("scenematch")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveOptions:
+    """How long a frame and a worker are waited for.
+
+    Attributes:
+        deadline_ms: age, counted from capture, by which a frame is answered.
+        patience_ms: beyond the deadline, after which a worker is taken to hang and is replaced.
+        max_speed_mps: of the vehicle, by which a new worker's search grows while there was none.
+    """
+
+    deadline_ms: float = 121.0
+    patience_ms: float = 1000.0
+    max_speed_mps: float = 15.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, *self.__dataclass_fields__)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of one frame.
+
+    Attributes:
+        frame: as it was submitted.
+        result: its fix, or why there is none.
+        age_ms: from capture to output.
+    """
+
+    frame: Frame
+    result: Result
+    age_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What went in and what came out: submitted = answered + dropped + at most one that waits and one in work."""
+
+    submitted: int = 0
+    dropped: int = 0
+    answered: int = 0
+    late: int = 0
+    workers_replaced: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Job:
+    frame: Frame
+    prior: Prior | None
+    captured_ns: int
+    answered: bool = False
+
+
+class Live:
+    """Answers a stream of frames.
+
+    Args:
+        make_navigator: makes a navigator that begins at a prior, or anywhere where that is None; called once by
+            the constructor, and in its own thread by every worker that replaces one.
+        deliver: takes each answer, one at a time, from one of the engine's threads.
+        start: where the flight begins.
+        options: settings.
+
+    Convention:
+        Ages are on ``time.monotonic_ns``. Python cannot stop a thread: one that hangs is left behind, and nothing
+        of it is used any more. A hang that holds Python's lock stops the whole process.
+    """
+
+    def __init__(
+        self,
+        make_navigator: Callable[[Prior | None], Navigator],
+        deliver: Callable[[Answer], None],
+        start: Prior | None = None,
+        options: LiveOptions | None = None,
+    ) -> None:
+        self._make_navigator, self._deliver = make_navigator, deliver
+        self._options = options or LiveOptions()
+        self._last: tuple[Fix, int] | None = None
+        self._changed = threading.Condition()
+        self._delivering = threading.Lock()
+        self._waiting: _Job | None = None
+        self._working: _Job | None = None
+        self._number = 0  # of the worker that counts
+        self._counts = Counts()
+        self._closed = False
+        self._start_thread(self._work, make_navigator(start), 0)
+        self._start_thread(self._watch)
+
+    @property
+    def counts(self) -> Counts:
+        """What went in and came out so far."""
+        with self._changed:
+            return self._counts
+
+    def submit(self, frame: Frame, prior: Prior | None = None, captured_ns: int | None = None) -> None:
+        """Hand in the newest frame; one that still waits is dropped. Never blocks for longer than a lock is held.
+
+        Args:
+            frame: newer than every frame before it.
+            prior: what somebody else knows of its place.
+            captured_ns: when it was captured, on ``time.monotonic_ns``; None is now.
+
+        Raises:
+            StateError: the pipeline was closed.
+        """
+        job = _Job(frame, prior, time.monotonic_ns() if captured_ns is None else captured_ns)
+        with self._changed:
+            if self._closed:
+                raise StateError("submit: expected an open pipeline, got one that was closed")
+            self._count("submitted")
+            if self._waiting is not None:
+                self._count("dropped")
+            self._waiting = job
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Take no more frames; the one in work is answered still, one that waits is dropped."""
+        with self._changed:
+            self._closed = True
+            if self._waiting is not None:
+                self._count("dropped")
+                self._waiting = None
+            self._changed.notify_all()
+            due_s = (self._options.deadline_ms + self._options.patience_ms) * 1e-3
+            self._changed.wait_for(lambda: self._working is None or self._working.answered, timeout=due_s)
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _work(self, navigator: Navigator | None, number: int) -> None:
+        """The worker: takes the newest frame, matches it, and puts out what it found if it is not too late."""
+        if navigator is None:
+            try:
+                navigator = self._make_navigator(self._resume())
+            except Exception:
+                _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
+                time.sleep(self._options.patience_ms * 1e-3)
+                self._replace(number)
+                return
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None or self._closed or self._number != number)
+                if self._waiting is None or self._number != number:
+                    return
+                job, self._working, self._waiting = self._waiting, self._waiting, None
+                self._changed.notify_all()
+            result, alive = self._match(navigator, job)
+            with self._changed:
+                if self._number != number:
+                    return  # replaced meanwhile
+                self._working = None
+                if isinstance(result, Fix):
+                    self._last = (result, job.captured_ns)
+            self._answer(job, result)
+            if not alive:
+                self._replace(number)
+                return
+
+    def _match(self, navigator: Navigator, job: _Job) -> tuple[Result, bool]:
+        """The result of one frame, and whether the navigator can be used on."""
+        left_ms = self._options.deadline_ms - _age_ms(job)
+        if left_ms <= 0:
+            return _refusal(job, Reason.LATE, "the frame waited until its deadline"), True
+        try:
+            return navigator.update(job.frame, job.prior, Budget(total_ms=left_ms)), True
+        except EngineError as error:  # this frame cannot be used; the next may
+            return _refusal(job, Reason.FAILED, str(error)), True
+        except Exception as error:
+            return _refusal(job, Reason.FAILED, f"{type(error).__name__}: {error}"), False
+
+    def _watch(self) -> None:
+        """The watchman: answers for what is due and replaces a worker that hangs."""
+        while True:
+            with self._changed:
+                if self._closed and self._working is None:
+                    return
+                jobs = [job for job in (self._working, self._waiting) if job is not None and not job.answered]
+                due = [job for job in jobs if _age_ms(job) >= self._options.deadline_ms]
+                at_work = self._working
+                hung = at_work is not None and at_work.answered and self._left_ms(at_work) <= 0
+                number = self._number
+                if self._waiting in due:
+                    self._waiting = None
+                if not due and not hung:
+                    waits = [self._left_ms(job) for job in (self._working, self._waiting) if job is not None]
+                    self._changed.wait(max(min(waits), 0.0) * 1e-3 if waits else None)
+                    continue
+            for job in due:
+                self._answer(job, _refusal(job, Reason.LATE, "no answer by the deadline"))
+            if hung:
+                self._replace(number)
+
+    def _left_ms(self, job: _Job) -> float:
+        """Time until the watchman has something to do about a job."""
+        patience_ms = self._options.patience_ms if job.answered else 0.0
+        return self._options.deadline_ms + patience_ms - _age_ms(job)
+
+    def _answer(self, job: _Job, result: Result) -> None:
+        """Put out one answer a frame; a fix that came too late is none."""
+        with self._delivering:
+            age_ms = _age_ms(job)
+            late = age_ms > self._options.deadline_ms
+            with self._changed:
+                if job.answered:
+                    return
+                job.answered = True
+                self._count("answered", *(["late"] if late else []))
+                self._changed.notify_all()
+            if late and isinstance(result, Fix):
+                result = _refusal(job, Reason.LATE, f"the fix came {age_ms:.0f} ms after capture")
+            try:
+                self._deliver(Answer(job.frame, result, age_ms))
+            except Exception:  # the receiver's own fault, and no reason to stop answering
+                _log.exception("deliver failed")
+
+    def _replace(self, number: int) -> None:
+        with self._changed:
+            if self._number != number:
+                return
+            self._number += 1
+            self._working = None
+            self._count("workers_replaced")
+            self._changed.notify_all()
+        self._start_thread(self._work, None, number + 1)
+
+    def _resume(self) -> Prior | None:
+        """Where a new worker begins: at the last fix, as far around it as the vehicle came since."""
+        with self._changed:
+            last = self._last
+        if last is None:
+            return None
+        fix, captured_ns = last
+        way_m = self._options.max_speed_mps * (time.monotonic_ns() - captured_ns) * 1e-9
+        return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + way_m)
+
+    def _count(self, *names: str) -> None:
+        self._counts = replace(self._counts, **{name: getattr(self._counts, name) + 1 for name in names})
+
+    def _start_thread(self, target: Callable[..., None], *args: object) -> None:
+        threading.Thread(target=target, args=args, name=f"scenematch-{target.__name__}", daemon=True).start()
+
+
+def _age_ms(job: _Job) -> float:
+    return (time.monotonic_ns() - job.captured_ns) * 1e-6
+
+
+def _refusal(job: _Job, reason: Reason, detail: str) -> NoFix:
+    return NoFix(reason=reason, detail=detail, timestamp_ns=job.frame.timestamp_ns)
