@@ -1,10 +1,10 @@
-# make demo | make test | make check | make bench: each sets itself up in .venv and is quick the second time.
+# make demo | test | check | bench | bench-flights | bench-latency: each sets itself up in .venv and is quick the second time.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -14,6 +14,10 @@ $(VENV)/run.stamp: pyproject.toml
 
 $(VENV)/dev.stamp: $(VENV)/run.stamp
 	$(PIP) install --quiet --editable '.[dev]'
+	touch $@
+
+$(VENV)/bench.stamp: $(VENV)/dev.stamp
+	$(PIP) install --quiet --editable '.[bench]'
 	touch $@
 
 demo: $(VENV)/run.stamp
@@ -28,10 +32,16 @@ check: $(VENV)/dev.stamp
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/dev.stamp
+bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks
 	$(BIN)/python -m pytest bench --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
 	$(BIN)/python -m bench.report .benchmarks/run.json
+
+bench-flights: $(VENV)/dev.stamp
+	$(BIN)/python -m bench.flights
+
+bench-latency: $(VENV)/dev.stamp
+	$(BIN)/python -m bench.latency
 
 clean:
 	rm -rf $(VENV) demo-report build dist *.egg-info

@@ -12,6 +12,16 @@ import pytest
 from engine import device
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--quick", action="store_true", help="few pictures and rounds: does every benchmark run?")
+
+
+@pytest.fixture
+def quick(request: pytest.FixtureRequest) -> bool:
+    """Whether figures are only wanted to see that there are some."""
+    return bool(request.config.getoption("--quick"))
+
+
 @pytest.fixture(params=[1, 2], ids=["1thread", "2threads"])
 def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     """Both libraries use so many threads."""

@@ -1,25 +1,23 @@
 """``make bench``: turn a pytest-benchmark run into docs/benchmarks.md and its charts.
 
-    python -m bench.report RUN.json [--quick]
+    python -m bench.report RUN.json [--quick] [--docs DIR]
 
 Beside the run it measures the growth of cost and the search of a whole large map, which take one process each.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import platform
-import sys
 import textwrap
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
-from bench import growth, whole_map
+from bench import growth, sift_sections, whole_map
+from bench.page import machine, table
 from engine import device
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -27,32 +25,36 @@ BASELINE = {"peak": "OpenCV", "step": "OpenCV", "bank": "OpenCV loop"}
 INTRO = (
     "Made by `make bench`; every figure below comes from one run of it, on {machine}. A time is the median of the "
     "calls, and a ratio above 1 means faster than the peer it is counted from. Times are compared only where the "
-    "results were shown to be the same: the peers' peaks lie on the same pixel, and the score's error against the "
-    "float64 reference stands beside its time. No GPU was measured."
+    "results were shown to be the same, or where the quality of the results stands beside them: the peers' peaks "
+    "lie on the same pixel, the score's error against the float64 reference stands beside its time, and so do the "
+    "figures of the features. No GPU was measured."
 )
 
 
 def main() -> None:
     """Read the run, measure the rest, write the page."""
-    run = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, help="what pytest-benchmark wrote")
+    parser.add_argument("--quick", action="store_true", help="leave out the largest map and the curves of growth")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its pictures")
+    options = parser.parse_args()
+    run = json.loads(options.run.read_text(encoding="utf-8"))
     device.set_threads(1)
     rows = [_row(entry) for entry in run["benchmarks"]]
-    curves = growth.curves()
-    big = [] if "--quick" in sys.argv else whole_map.run()
-    (DOCS / "img").mkdir(exist_ok=True)
-    _ratio_chart(rows).savefig(DOCS / "img" / "ncc-ratio.png", dpi=130, facecolor="white")
-    _growth_chart(curves).savefig(DOCS / "img" / "ncc-growth.png", dpi=130, facecolor="white")
-    page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=_machine()), 115), ""]
+    curves = [] if options.quick else growth.curves()
+    big = [] if options.quick else whole_map.run()
+    charts = sift_sections.charts(rows)
+    if any(row["task"] == "peak" for row in rows):
+        charts["ncc-ratio.png"] = _ratio_chart(rows)
+    if curves:
+        charts["ncc-growth.png"] = _growth_chart(curves)
+    (options.docs / "img").mkdir(parents=True, exist_ok=True)
+    for name, figure in charts.items():
+        figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
+    page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=machine()), 115), ""]
     page += _peak_section(rows) + _step_section(rows) + _bank_section(rows)
-    page += _map_section(big) + _growth_section(curves)
-    (DOCS / "benchmarks.md").write_text("\n".join(page) + "\n", encoding="utf-8")
-
-
-def _machine() -> str:
-    import os
-
-    versions = f"Python {platform.python_version()}, torch {torch.__version__}, OpenCV {cv2.__version__}"
-    return f"{os.cpu_count()} cores of a server CPU ({platform.machine()}), no GPU, {versions}"
+    page += _map_section(big) + _growth_section(curves) + sift_sections.sections(rows)
+    (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
 
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:
@@ -67,11 +69,6 @@ def _row(entry: dict[str, Any]) -> dict[str, Any]:
 def _baseline(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
     peer = BASELINE[row["task"]]
     return next(r["median_ms"] for r in rows if r["group"] == row["group"] and r["peer"] == peer)
-
-
-def _table(columns: list[str], rows: list[list[str]]) -> list[str]:
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
 
 
 def _memory(row: dict[str, Any]) -> str:
@@ -113,7 +110,7 @@ def _peak_section(rows: list[dict[str, Any]]) -> list[str]:
         "",
         "![ratio to OpenCV](img/ncc-ratio.png)",
         "",
-        *_table(columns, cells),
+        *table(columns, cells),
     ]
 
 
@@ -137,7 +134,7 @@ def _step_section(rows: list[dict[str, Any]]) -> list[str]:
         "judges the peak and states a covariance. `OpenCV` enhances the window in every frame; with `map",
         "prepared` it keeps the enhanced map.",
         "",
-        *_table(["who", "threads", "median ms", "p95 ms", "ratio to OpenCV", "RMS m"], cells),
+        *table(["who", "threads", "median ms", "p95 ms", "ratio to OpenCV", "RMS m"], cells),
     ]
 
 
@@ -160,7 +157,7 @@ def _bank_section(rows: list[dict[str, Any]]) -> list[str]:
         "OpenCV loops over 36 headings x 5 scales and names the best of them. The engine also refines heading and",
         "height below the step.",
         "",
-        *_table(["who", "threads", "median ms", "ratio", "error m", "peak MB"], cells),
+        *table(["who", "threads", "median ms", "ratio", "error m", "peak MB"], cells),
     ]
 
 
@@ -182,7 +179,7 @@ def _map_section(big: list[dict[str, Any]]) -> list[str]:
             115,
         ),
         "",
-        *_table(["who", "seconds a frame", "peak MB"], cells),
+        *table(["who", "seconds a frame", "peak MB"], cells),
     ]
 
 
@@ -202,7 +199,7 @@ def _growth_section(curves: list[growth.Curve]) -> list[str]:
         "",
         "![growth](img/ncc-growth.png)",
         "",
-        *_table(["against", "unit", "sizes", "median ms", "fitted exponent"], cells),
+        *table(["against", "unit", "sizes", "median ms", "fitted exponent"], cells),
     ]
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.align import SCORES, enhance, to_gray
-from engine.budget import Budget
+from engine.budget import Budget, Deadline
 from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
@@ -125,7 +125,7 @@ def fly(flight: Flight, score: str, site: OrthoMap | None = None) -> list[Trial]
         east, north = truth + rng.uniform(-PRIOR_OFF_M, PRIOR_OFF_M, 2)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
         gray = flight.camera.undistort(to_gray(frame))
-        query = Query(frame, gray, pinhole, ground, prior, CPU, Stopwatch(Budget(), CPU))
+        query = Query(frame, gray, pinhole, ground, prior, CPU, Stopwatch(Deadline(Budget()), CPU))
         trials.append(search(query, prepared, options, truth))
     return trials
 

@@ -106,7 +106,7 @@ class SceneMatcher:
                     ladder.every_rung(self._query(frame, prior, Deadline(Budget())), self._tools, self.method)
 
     def _made_up(self, share: float) -> tuple[Frame, Prior]:
-        """The frame that a camera would take above the map's middle, when it sees this share of its shorter side."""
+        """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""
         site, camera = self.site, self.camera
         side_px = share * min(site.width_px, site.height_px)
         per_px = side_px / max(camera.width_px, camera.height_px)

@@ -40,7 +40,19 @@ PUBLIC = [
     "features",
     "ncc_fft",
 ]
-UNUSED = ("matplotlib", "rasterio", "kornia", "pyproj", "typer", "triton", "numba", "rich", "PIL", "scipy", "skimage")
+UNUSED = (
+    "matplotlib",
+    "rasterio",
+    "kornia",
+    "pyproj",
+    "typer",
+    "triton",
+    "numba",
+    "rich",
+    "PIL",
+    "scipy",
+    "skimage",
+)
 
 
 @pytest.fixture(scope="module")

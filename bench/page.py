@@ -1,0 +1,35 @@
+"""What the pages of the benchmarks share: tables, and the machine that the figures come from."""
+
+from __future__ import annotations
+
+import os
+import platform
+import textwrap
+
+import cv2
+import torch
+
+
+def table(columns: list[str], rows: list[list[str]]) -> list[str]:
+    """Lines of a Markdown table, an empty one after it."""
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
+
+
+def paragraph(text: str) -> list[str]:
+    """Lines of a paragraph that fit the page, an empty one after it."""
+    return [*textwrap.wrap(text, 115), ""]
+
+
+def bullets(*texts: str) -> list[str]:
+    """Lines of a list, an empty one after it."""
+    lines = [
+        line for text in texts for line in textwrap.wrap(text, 115, initial_indent="- ", subsequent_indent="  ")
+    ]
+    return [*lines, ""]
+
+
+def machine() -> str:
+    """The machine and the libraries, in half a sentence."""
+    versions = f"Python {platform.python_version()}, torch {torch.__version__}, OpenCV {cv2.__version__}"
+    return f"{os.cpu_count()} cores of a server CPU ({platform.machine()}), no GPU, {versions}"
