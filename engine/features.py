@@ -37,7 +37,7 @@ class Features:
     """Keypoints and descriptors of a batch of images, in slots of fixed number.
 
     A slot that holds no keypoint is False in ``valid`` and zero elsewhere. The first slots hold the keypoints
-    within their cell's share (see :func:`sift`), the next those beyond it, both by falling contrast.
+    within their cell's share (see :func:`sift`), the next those beyond it, both by falling strength.
 
     Attributes:
         xy_px: (B, N, 2) positions (x, y), pixel centres at integers.
@@ -94,7 +94,7 @@ def sift(
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
         root: Return RootSIFT (square roots of the L1-normalised descriptor), also of unit L2 norm.
         spread: The image is divided into spread x spread cells, and keypoints beyond a cell's double share give
-            way to weaker ones elsewhere; 1 ranks by contrast alone.
+            way to weaker ones elsewhere; 1 ranks by strength alone, which is contrast times the root of scale.
 
     Returns:
         Features on the images' device; no value is NaN.

@@ -209,8 +209,11 @@ def allowed(points: Points, mask: Tensor) -> Tensor:
 
 
 def strongest(points: Points, plan: Plan, max_keypoints: int, spread: int) -> Tensor:
-    """Return the indices of the points to keep, ordered by image and then by precedence."""
-    order = points.contrast.argsort(descending=True, stable=True)
+    """Return the indices of the points to keep, ordered by image and then by precedence.
+
+    Of two keypoints of like contrast the coarser is the surer: what counts is contrast times the root of scale.
+    """
+    order = (points.contrast * points.scale_px.sqrt()).argsort(descending=True, stable=True)
     octave = plan.octaves[0]
     image = points.image[order]
     x = (points.x * points.pixel_px)[order] * (plan.upsample * spread / octave.width)

@@ -22,14 +22,14 @@ from engine.types import Window
 
 Array = NDArray[np.float64]
 
-DETECTOR_VERSION = 1
+DETECTOR_VERSION = 2
 """Part of the key of stored landmarks; to be raised with every change of what is detected and how described."""
 TILE_PX = 256
 """Tiles begin on multiples of this in every level."""
 HALO_PX = 64
 """How far beyond its edges a tile is seen; the descriptor of nearly every keypoint ends there."""
 CELL_PX = 64
-"""Landmarks are ranked by contrast within square cells of the level."""
+"""Landmarks are ranked by strength within square cells of the level."""
 MAX_PER_CELL = 96
 PREPARED_PX = 16 << 20
 """Levels are prepared at once, and searched as a whole, up to this many pixels."""
@@ -40,7 +40,7 @@ _STORED: Kinds = {
     "xy_px": (np.float32, (2,)),  # in pixels of the level
     "scale_px": (np.float32, ()),
     "angle_deg": (np.float32, ()),
-    "rank": (np.uint8, ()),  # by contrast within its cell
+    "rank": (np.uint8, ()),  # by strength within its cell
     "descriptors": (np.float16, (128,)),  # half the memory, and the same matches
 }
 
@@ -82,7 +82,7 @@ class LandmarkMap:
             window: in pixels of the level, inside it.
             level: of the map's pyramid.
             upright: every angle is 0, along the map's x axis, instead of the dominant gradient's.
-            per_px: landmarks per pixel at most, in each cell those of the highest contrast.
+            per_px: landmarks per pixel at most, in each cell the strongest.
         """
         keys = _keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
@@ -170,7 +170,7 @@ class LandmarkMap:
             max_keypoints=_SLOTS,
             upright=upright,
             mask=torch.from_numpy(mask)[None, None].to(self._device),
-            spread=1,  # by contrast alone; landmarks are spread by the cells of the level
+            spread=1,  # by strength alone; landmarks are spread by the cells of the level
         )
         count = int(found.valid.sum())
         xy = found.xy_px[0, :count].cpu().numpy() + np.array([left, top], np.float32)

@@ -191,7 +191,7 @@ def test_the_mask_holds_keypoints_back():
 
 def test_spread_reaches_weak_texture():
     strong, weak = texture(120, 60, 1), texture(120, 180, 2)
-    image = np.hstack([strong, (weak.astype(np.float32) * 0.25 + 96).astype(np.uint8)])
+    image = np.hstack([strong, (weak.astype(np.float32) * 0.15 + 109).astype(np.uint8)])
     shares = [
         (
             valid(sift(tensor(image), max_keypoints=60, spread=s, contrast_threshold=0.005), "xy_px")[:, 0] > 60

@@ -45,7 +45,7 @@ BudgetOption = Annotated[
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace the results in a folder that exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Results as JSON on standard output.")]
 ThreadsOption = Annotated[
-    int | None, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.")
+    int, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.", show_default=True)
 ]
 
 
@@ -91,7 +91,7 @@ def demo(
         int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
     ] = 1,
     device: DeviceOption = "auto",
-    threads: ThreadsOption = None,
+    threads: ThreadsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -129,7 +129,7 @@ def track(
     device: DeviceOption = "auto",
     budget_ms: BudgetOption = None,
     profile: ProfileOption = "engine",
-    threads: ThreadsOption = None,
+    threads: ThreadsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -167,7 +167,7 @@ def locate(
     ] = None,
     method: MethodOption = "auto",
     device: DeviceOption = "auto",
-    threads: ThreadsOption = None,
+    threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Find one picture on the map.
@@ -238,8 +238,7 @@ def options(
     """Options before the command."""
 
 
-def _threads(count: int | None) -> None:
-    if count is not None:
-        from engine.device import set_threads
+def _threads(count: int) -> None:
+    from engine.device import set_threads
 
-        set_threads(count)
+    set_threads(count)
