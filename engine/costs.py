@@ -9,6 +9,8 @@ _MEMORY = 0.93  # weight of a run after the next one: some fourteen runs count
 _SURPRISE = 2.0  # a run counts for at most this factor of what was expected: one interruption is no new price
 _SIGMAS = 3.0
 _LEAST_MS = 0.05
+_DOUBT = 0.9  # what is left of the deviation each time that a step is refused for its price
+_FORGET = 0.99  # and of the price itself
 
 
 @dataclass(slots=True)
@@ -55,6 +57,20 @@ class Costs:
     def learn(self, step: str, work: float, ms: float) -> None:
         """Note that a step with this much work took so many milliseconds."""
         self._prices.setdefault(step, _Price()).learn(work, ms)
+
+    def doubt(self, step: str, *, price: bool) -> None:
+        """Note that a step was refused for its price: one that never runs is never seen to have become cheap.
+
+        Args:
+            step: its name.
+            price: whether the price itself fades, so that the step is tried again; else the spread about it alone.
+        """
+        known = self._prices.get(step)
+        if known is not None:
+            known.square *= _DOUBT**2
+            if price:
+                known.ms *= _FORGET
+                known.work_ms *= _FORGET
 
     def expected_ms(self, step: str, work: float) -> float:
         """What the step will hardly exceed: its expected time and three deviations; 0 where it never ran."""

@@ -186,7 +186,9 @@ class Live:
         if left_ms <= 0:
             return _refusal(job, Reason.LATE, "the frame waited until its deadline"), True
         try:
-            return navigator.update(job.frame, job.prior, Budget(total_ms=left_ms)), True
+            # A search of the whole map may go on after its frame was answered for: the next frame gains by it.
+            budget = Budget(total_ms=left_ms, search_ms=left_ms + self._options.patience_ms)
+            return navigator.update(job.frame, job.prior, budget), True
         except EngineError as error:  # this frame cannot be used; the next may
             return _refusal(job, Reason.FAILED, str(error)), True
         except Exception as error:

@@ -98,12 +98,16 @@ class SceneMatcher:
         features = self.options.sift.map_features == "prepared" and self.options.sift.matcher is None
         if features and self.method != "ncc" and self.options.profile == "engine":
             self._landmarks.prepare()
-        for share in _WARM_SHARES:
-            frame, prior = self._made_up(share)
-            for _ in range(_WARM_ROUNDS):
-                self.locate(frame, prior)
-                if self.options.profile == "engine":
-                    ladder.every_rung(self._query(frame, prior, Deadline(Budget())), self._tools, self.method)
+        for warm in (False, True):
+            self._costs = Costs()  # what compiles and plans is no price of a flight's
+            for share in _WARM_SHARES:
+                frame, prior = self._made_up(share)
+                for _ in range(_WARM_ROUNDS if warm else 1):
+                    self.locate(frame, prior)
+                    if self.options.profile == "engine":
+                        ladder.every_rung(self._query(frame, prior, Deadline(Budget())), self._tools, self.method)
+            if self.options.profile == "engine":
+                self.locate(frame)  # the search of the whole map
 
     def _made_up(self, share: float) -> tuple[Frame, Prior]:
         """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from engine.budget import Budget
 from engine.errors import OptionError, TelemetryError
 from engine.orthomap import OrthoMap
-from engine.types import Fix, Frame, NoFix, Prior, check_positive
+from engine.types import Fix, Frame, NoFix, Prior, Reason, check_positive
 
 Array = NDArray[np.float64]
 
@@ -113,6 +113,8 @@ class Navigator:
         self._last_ns = frame.timestamp_ns if frame.timestamp_ns is not None else self._last_ns
         if isinstance(result, Fix):
             self._accept(result, frame)
+        elif result.reason is Reason.LATE:
+            pass  # no time to look says nothing of where the vehicle is
         elif self._track is not None:
             self._track.refusals += 1
             if self._track.refusals >= self._options.lost_after:

@@ -70,3 +70,17 @@ def test_no_estimate_is_negative_or_not_a_number():
         assert 0.0 <= costs.expected_ms("step", work) < np.inf
     costs = learned([100.0, 1.0] * 9, lambda work: 1.0 / work)  # dearer the less there is to do
     assert costs.expected_ms("step", 1000.0) >= 0.0
+
+
+def test_a_step_that_is_refused_is_doubted():
+    costs = learned([1.0, 1.0, 1.0], lambda work: 5.0)
+    costs.learn("step", 1.0, 9.0)
+    high = costs.expected_ms("step", 1.0)
+    for _ in range(50):
+        costs.doubt("step", price=False)
+    assert 5.0 <= costs.expected_ms("step", 1.0) < high  # the spread is gone, the price is not
+    for _ in range(300):
+        costs.doubt("step", price=True)
+    assert costs.expected_ms("step", 1.0) < 1.0
+    costs.doubt("other", price=True)
+    assert costs.expected_ms("other", 1.0) == 0.0

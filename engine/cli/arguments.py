@@ -35,7 +35,7 @@ def parse_position(name: str, text: str | None) -> Prior | None:
 
 
 def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
-    """The budget of a frame; None where nothing was given.
+    """The budget of a frame; None where nothing was given. A search of the whole map is not held to it.
 
     Raises:
         OptionError: it is not a finite number above 0.
@@ -44,7 +44,7 @@ def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
         return None
     if not (math.isfinite(budget_ms) and budget_ms > 0):
         raise OptionError(f"{name}: expected milliseconds above 0, got {budget_ms:g}")
-    return Budget(total_ms=budget_ms)
+    return Budget(total_ms=budget_ms, search_ms=math.inf)
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:

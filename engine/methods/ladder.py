@@ -37,25 +37,33 @@ class Tools:
 
 def by_ncc(query: Query, tools: Tools) -> Result:
     """NCC on the finest level of the map that the time affords."""
-    if query.frame.height_agl_m is None or query.prior is None or not is_trusted(query.frame, tools.ncc):
-        area_px = query.site.width_px * query.site.height_px
-        if not query.watch.affords("ncc search", area_px):
-            return _late(query, laid.METHOD)
-        with query.watch.rung("ncc search", area_px):
-            return ncc.locate(query, tools.prepared, tools.ncc)
-    for coarser in _COARSER:
-        work_px = _window_px(query, tools.ncc, coarser)
-        if work_px is not None and query.watch.affords("ncc", work_px):
-            with query.watch.rung("ncc", work_px):
+    if query.frame.height_agl_m is None:
+        return ncc.locate(query, tools.prepared, tools.ncc)  # which refuses
+    if query.prior is None or not is_trusted(query.frame, tools.ncc):
+        rung = "ncc search" if query.prior is None else "ncc bank"
+        levels = {0: float(query.site.width_px * query.site.height_px)}
+    else:
+        rung = "ncc"
+        levels = _window_px(query, tools.ncc)
+    for coarser, work_px in levels.items():
+        if query.watch.affords(rung, work_px):
+            with query.watch.rung(rung, work_px):
                 result = ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
             return _on_stage(result, "coarse" if coarser else "fine")
-    return _late(query, laid.METHOD)
+    return _late(query, laid.METHOD, rung)
 
 
-def by_sift(query: Query, tools: Tools) -> Result:
-    """SIFT at the highest resolution of the frame that the time affords."""
-    known = query.prior is not None and query.frame.height_agl_m is not None
-    rung = "sift" if known else "sift search"
+def by_sift(query: Query, tools: Tools, *, second: bool = False) -> Result:
+    """SIFT at the highest resolution of the frame that the time affords.
+
+    Args:
+        query: the frame.
+        tools: the map and settings.
+        second: a fix is in hand already and must not be lost to an attempt that takes too long.
+    """
+    rung = "sift"
+    if query.prior is None or query.frame.height_agl_m is None:
+        rung = "sift search" if query.prior is None else "sift heights"
     for share in _REDUCED:
         options = tools.sift if share == 1.0 else replace(tools.sift, scale=tools.sift.scale * share)
         work_px = query.gray.size * options.scale**2
@@ -63,7 +71,7 @@ def by_sift(query: Query, tools: Tools) -> Result:
             with query.watch.rung(rung, work_px):
                 result = sift.locate(query, tools.landmarks, options)
             return _on_stage(result, "coarse" if share < 1.0 else "fine")
-    return _late(query, sift.METHOD)
+    return _late(query, sift.METHOD, rung, price=not second)
 
 
 def by_both(query: Query, tools: Tools) -> Result:
@@ -71,7 +79,7 @@ def by_both(query: Query, tools: Tools) -> Result:
     if query.frame.height_agl_m is None or query.frame.heading_deg is None:
         return by_sift(query, tools)
     first = by_ncc(query, tools)
-    second = by_sift(query, tools)
+    second = by_sift(query, tools, second=isinstance(first, Fix))
     if isinstance(first, NoFix) or isinstance(second, NoFix):
         return first if isinstance(first, Fix) or _was_late(second) else second
     apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
@@ -83,31 +91,32 @@ def by_both(query: Query, tools: Tools) -> Result:
 
 
 def every_rung(query: Query, tools: Tools, method: str) -> None:
-    """Run each rung once, so that its price is known."""
-    for coarser in _COARSER if method != "sift" else ():
-        work_px = _window_px(query, tools.ncc, coarser)
-        if work_px is not None:
-            with query.watch.rung("ncc", work_px):
-                ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
+    """Run each rung once, so that its price is known; the query has a prior."""
+    for coarser, work_px in _window_px(query, tools.ncc).items() if method != "sift" else ():
+        with query.watch.rung("ncc", work_px):
+            ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
     for share in _REDUCED if method != "ncc" else ():
         options = replace(tools.sift, scale=tools.sift.scale * share)
         with query.watch.rung("sift", query.gray.size * options.scale**2):
             sift.locate(query, tools.landmarks, options)
 
 
-def _window_px(query: Query, options: NccOptions, coarser: int) -> float | None:
-    """Pixels of the window on a level, which is what NCC costs by; None where the level is too coarse."""
+def _window_px(query: Query, options: NccOptions) -> dict[int, float]:
+    """Pixels of the window, by which NCC costs, on the frame's own level and the coarser ones that serve."""
     site, camera, height_m = query.site, query.camera, query.frame.height_agl_m
     assert height_m is not None  # asked for before
     assert query.prior is not None
-    level = level_for(site.gsd_m_per_px, height_m / camera.focal_px, site.levels) + coarser
-    per_px = height_m / (camera.focal_px * site.gsd_m_per_px * 2.0**level)
-    least = options.fraction * min(camera.width_px, camera.height_px) * per_px
-    if coarser and (level >= site.levels or least < _LEAST_SIDE_PX):
-        return None
-    slack_px = 6.0 * query.prior.sigma_m / (site.gsd_m_per_px * 2.0**level)
-    sides = (options.margin * side * per_px + slack_px for side in (camera.width_px, camera.height_px))
-    return float(np.prod(list(sides)))
+    own = level_for(site.gsd_m_per_px, height_m / camera.focal_px, site.levels)
+    out = {}
+    for coarser in _COARSER:
+        gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
+        per_px = height_m / (camera.focal_px * gsd_m)
+        least = options.fraction * min(camera.width_px, camera.height_px) * per_px
+        if coarser == 0 or (own + coarser < site.levels and least >= _LEAST_SIDE_PX):
+            slack_px = 6.0 * query.prior.sigma_m / gsd_m
+            width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
+            out[coarser] = width * height
+    return out
 
 
 def _on_stage(result: Result, stage: str) -> Result:
@@ -118,8 +127,8 @@ def _was_late(result: Result) -> bool:
     return isinstance(result, NoFix) and result.reason is Reason.LATE
 
 
-def _late(query: Query, method: str) -> NoFix:
+def _late(query: Query, method: str, rung: str, *, price: bool = True) -> NoFix:
+    query.watch.give_up(rung, price=price)
     left_ms = query.watch.deadline.remaining_ms
-    return query.refuse(
-        Reason.LATE, f"{left_ms:.1f} ms are left; the least that {method} can do takes longer", method
-    )
+    detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
+    return query.refuse(Reason.LATE, detail, method)

@@ -43,6 +43,10 @@ class Stopwatch:
         """Whether the time that is left will do for a rung of this much work; True for one that never ran."""
         return self._costs.expected_ms(rung, work) <= self.deadline.remaining_ms
 
+    def give_up(self, rung: str, *, price: bool) -> None:
+        """Note that not even the least of a rung was affordable, see :meth:`engine.costs.Costs.doubt`."""
+        self._costs.doubt(rung, price=price)
+
     @contextmanager
     def rung(self, name: str, work: float) -> Iterator[None]:
         """Note what a rung of this much work costs."""
