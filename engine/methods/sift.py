@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 METHOD = "sift"
 MAP_FEATURES = ("prepared", "per_frame")
+_BLUNT_PX = 1.6  # scale at which a keypoint's place is half as sure, in variance, as a small one's
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,11 +99,19 @@ class SiftOptions:
 
 @dataclass(frozen=True, slots=True)
 class _Matched:
-    """Points of the frame found again in a view: (M, 2) pixels of the frame and (M, 3) metres on the ground."""
+    """Points of the frame found again in a view.
+
+    Attributes:
+        view: where.
+        points_px: (M, 2) pixels of the frame.
+        points_m: (M, 3) metres on the ground.
+        weights: (M,) relative inverse variances of the pixels.
+    """
 
     view: View
     points_px: Array
     points_m: Array
+    weights: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +166,14 @@ def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOpt
     prior = _attitude_prior(query, options)
     for found in matched:
         with watch.stage("pose"):
-            stats = solve_pose(found.points_m, found.points_px, query.camera.matrix, options.pose, prior=prior)
+            stats = solve_pose(
+                found.points_m,
+                found.points_px,
+                query.camera.matrix,
+                options.pose,
+                prior=prior,
+                weights=found.weights,
+            )
         if stats is not None:
             return _fix(query, stats, found.view.window, options)
     return query.refuse(Reason.BAD_POSE, f"no pose explains enough of the {count} matches", METHOD, window=window)
@@ -188,7 +204,9 @@ def _by_features(
             )
             pairs = found.pairs().cpu().numpy()
             points_px = reduced.full(features.xy_px[0].cpu().numpy()[pairs[:, 0]])
-            matched.append(_Matched(view, points_px, known.points_m[pairs[:, 1]]))
+            scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
+            weights = 1.0 / (1.0 + (scale_px / _BLUNT_PX) ** 2)
+            matched.append(_Matched(view, points_px, known.points_m[pairs[:, 1]], weights))
     return matched
 
 
@@ -201,7 +219,8 @@ def _by_matcher(query: Query, views: list[View], matcher: PairMatcher, options: 
             crop = as_picture(query.site.gray(view.crop, view.level), query.device)
             points, places = (found.cpu().numpy() for found in matcher(reduced.picture, crop))
             map_px = query.site.full_from_level(places + view.corner_px, view.level)
-            matched.append(_Matched(view, reduced.full(points), _lifted(query.site, map_px)))
+            ground_m = _lifted(query.site, map_px)
+            matched.append(_Matched(view, reduced.full(points), ground_m, np.ones(len(ground_m))))
     return matched
 
 
