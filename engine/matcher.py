@@ -19,6 +19,7 @@ from engine.landmarks import LandmarkMap
 from engine.methods import ladder, paper
 from engine.methods.laid import NccOptions
 from engine.methods.query import Query, Stopwatch, level_crop, level_for
+from engine.methods.samples import SampleMap
 from engine.methods.sift import SiftOptions
 from engine.orthomap import OrthoMap
 from engine.prepared import PreparedMap
@@ -84,7 +85,10 @@ class SceneMatcher:
         self.device = devices.resolve(device)
         self._prepared = PreparedMap(site, self.device, self.options.ncc.enhance_radius_px, self.options.ncc.score)
         self._landmarks = LandmarkMap(site, self.device)
-        self._tools = ladder.Tools(self._prepared, self._landmarks, self.options.ncc, self.options.sift)
+        self._samples = SampleMap(site, self._prepared)
+        self._tools = ladder.Tools(
+            self._prepared, self._landmarks, self._samples, self.options.ncc, self.options.sift
+        )
         self._costs = Costs()
         # What an undistorted picture obeys; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
@@ -130,6 +134,7 @@ class SceneMatcher:
         return {
             "map regions": self._prepared.made,
             "landmark tiles": self._landmarks.made,
+            "sampled cells": self._samples.made,
             "feature plans": plans_made(),
             "compiled loops": loops_compiled(),
         }

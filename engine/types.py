@@ -177,6 +177,7 @@ class Reason(enum.Enum):
     TOO_FEW_MATCHES = "too_few_matches"
     BAD_POSE = "bad_pose"
     INCONSISTENT = "inconsistent"
+    UNCONFIRMED = "unconfirmed"
     NO_HEIGHT = "no_height"
     NO_HEADING = "no_heading"
     TILTED = "tilted"
@@ -216,7 +217,8 @@ class Fix:
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).
-        stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "verified" by both methods.
+        stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "refined" in all of the
+            pose, "verified" by both methods.
     """
 
     timestamp_ns: int | None

@@ -61,7 +61,15 @@ def test_with_time_the_highest_rung(ground, make, frame, prior, method):
     for budget in (None, HURRY):
         fix = make(method).locate(frame, prior, budget)
         assert off_m(ground, fix) < 1.0
-        assert fix.stage == "fine"
+        assert fix.stage == {"ncc": "refined", "sift": "fine"}[method]
+
+
+def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, prior):
+    fix, fine = make("ncc", dense=1e9).locate(frame, prior, HURRY), make("ncc").locate(frame, prior, HURRY)
+    assert isinstance(fix, Fix)
+    assert isinstance(fine, Fix)
+    assert (fix.stage, fix.up_m, fine.stage) == ("fine", None, "refined")
+    assert fine.sigma_m <= fix.sigma_m
 
 
 @pytest.mark.parametrize(("method", "rung"), [("ncc", "ncc"), ("sift", "sift")])
@@ -95,7 +103,7 @@ def test_both_methods_verify_each_other(ground, make, frame, prior):
 def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, prices, method):
     fix = make("auto", **prices).locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 1.0
-    assert (fix.stage, fix.method) == ("fine", method)
+    assert (fix.stage, fix.method) == ({"ncc": "refined", "sift": "fine"}[method], method)
 
 
 def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,13 @@ from engine.cli.arguments import check_choice, check_folder, parse_budget, parse
 from engine.cli.checks import check_needs, check_pictures, check_place
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.flight import Flight, FlightFrame, open_flight
+from engine.formats.logs import LogClock, is_log, open_truth
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
-from engine.formats.truth import read_truth
 from engine.matcher import METHODS, PROFILES, MatcherOptions, SceneMatcher
-from engine.navigator import Navigator
+from engine.navigator import BELIEVE_ALL, Navigator
 from engine.orthomap import OrthoMap
+from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
 from engine.types import Fix, NoFix, Prior, Truth
@@ -41,6 +42,11 @@ class Inputs:
     frames: Path
     telemetry: Path | None
     truth: Path | None
+    clock: LogClock | None = None  # when the frames were taken, where the telemetry is a log
+
+    def __post_init__(self) -> None:
+        if self.clock is not None and (self.telemetry is None or not is_log(self.telemetry)):
+            raise OptionError(f"--frame-stamps, --log-offset-s: expected a log as telemetry, got {self.telemetry}")
 
     def find_truth(self) -> Path | None:
         """The truth that was named, else ``truth.csv`` beside the telemetry where there is one."""
@@ -99,11 +105,12 @@ def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = Fa
     matcher = SceneMatcher(site, opened.camera, settings.method, settings.device, options)
     matcher.warmup()
     prepare_folder(out, force, OWNED)
-    navigator = Navigator(matcher, start, budget)
+    navigator = Navigator(matcher, start, budget, BELIEVE_ALL if settings.profile == "paper" else None)
     what = f"{settings.method}, {settings.profile} profile"
-    follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None)
+    attitude = follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None)
     ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
     record = _record(inputs, settings, opened, str(matcher.device), ground)
+    record["attitude"] = None if attitude is None else asdict(attitude)
     # From the rows as they stand in the file, so that evaluate gives the same figures.
     return conclude(out, read_track(out / "track.csv"), opened.truth, site, ground, record)
 
@@ -112,9 +119,10 @@ def _open(inputs: Inputs, settings: Settings, start: Prior | None) -> _Opened:
     """Read what a run needs, and refuse what does not belong together."""
     site = OrthoMap.open(inputs.map, surface=inputs.surface)
     camera = Camera.load(inputs.camera)
-    flight = open_flight(inputs.frames, inputs.telemetry)
+    flight = open_flight(inputs.frames, inputs.telemetry, clock=inputs.clock or LogClock())
     truth_path = inputs.find_truth()
-    truth = read_truth(truth_path) if truth_path is not None else None
+    stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
+    truth = open_truth(truth_path, stamp_ns) if truth_path is not None else None
     check_needs(flight, settings.method, settings.profile)
     check_place("--start", start, site, OptionError)
     if start is None:
@@ -123,6 +131,9 @@ def _open(inputs: Inputs, settings: Settings, start: Prior | None) -> _Opened:
     check_pictures(flight, camera)
     if flight.unused:
         console.say(f"frames without a row in the telemetry, left out: {flight.unused}")
+    if flight.heights:
+        counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
+        console.say(f"height above ground, by source, of {len(flight)} frames: {counts}")
     return _Opened(site, camera, flight, truth_path, truth)
 
 
@@ -139,6 +150,7 @@ def _record(inputs: Inputs, settings: Settings, opened: _Opened, device: str, gr
         "frames": absolute(inputs.frames),
         "telemetry": absolute(inputs.telemetry),
         "truth": absolute(opened.truth_path),
+        "heights": dict(opened.flight.heights),
         "method": settings.method,
         "profile": settings.profile,
         "device": device,
@@ -152,7 +164,7 @@ def _record(inputs: Inputs, settings: Settings, opened: _Opened, device: str, gr
 
 def follow(
     flight: Flight, navigator: Navigator, path: Path, budget: Budget | None, what: str, *, use_priors: bool
-) -> None:
+) -> AttitudeCheck | None:
     """Every frame through the navigator, each row on disk as soon as it is known.
 
     Args:
@@ -163,7 +175,11 @@ def follow(
         what: for the progress bar.
         use_priors: whether the flight may begin at the telemetry's position; once it has begun, the fixes
             carry on.
+
+    Returns:
+        AttitudeCheck | None: what the fixes say of the telemetry's attitude.
     """
+    attitudes: list[AttitudeRow | None] = []
     with TrackWriter(path) as writer:
         for item in console.progress(flight, len(flight), what):
             prior = item.prior if use_priors else None
@@ -173,6 +189,8 @@ def follow(
             use_priors = use_priors and not navigator.tracking
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
+            attitudes.append(attitude_row(item.frame, result))
+    return check_attitude([row for row in attitudes if row is not None])
 
 
 def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:
@@ -215,7 +233,7 @@ def run_evaluate(directory: Path, truth_path: Path | None) -> dict[str, Any]:
         if record["truth"] is None:
             raise TelemetryError(f"{directory}: the track was made without truth; name one with --truth")
         truth_path = Path(record["truth"])
-    truth = read_truth(truth_path)
+    truth = open_truth(truth_path, rows[0].timestamp_ns if rows else None)
     site = OrthoMap.open(record["map"], surface=record["surface"])
     ground = Ground(record["ground_m"], record["ground_amsl_m"])
     return conclude(directory, rows, truth, site, ground, record | {"truth": str(truth_path.resolve())})

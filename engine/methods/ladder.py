@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from engine.landmarks import LandmarkMap
-from engine.methods import laid, ncc, sift
+from engine.methods import laid, ncc, refined, sift
 from engine.methods.bank import is_trusted
 from engine.methods.laid import NccOptions
 from engine.methods.query import Query, level_for
+from engine.methods.samples import SampleMap
 from engine.methods.sift import SiftOptions
 from engine.prepared import PreparedMap
 from engine.types import Fix, NoFix, Reason, Result
@@ -31,11 +32,31 @@ class Tools:
 
     prepared: PreparedMap
     landmarks: LandmarkMap
+    samples: SampleMap
     ncc: NccOptions
     sift: SiftOptions
 
 
 def by_ncc(query: Query, tools: Tools) -> Result:
+    """NCC on the finest level of the map that the time affords, and its fix refined where there is time."""
+    return refine(query, tools, _by_peak(query, tools))
+
+
+def refine(query: Query, tools: Tools, result: Result) -> Result:
+    """The fix of a fine peak with its pose refined, where that is wanted, can be done and is affordable."""
+    if not isinstance(result, Fix) or result.stage != "fine" or not tools.ncc.refine:
+        return result
+    if not is_trusted(query.frame, tools.ncc):
+        return result  # the height that was found is not the frame's
+    work_px = float(query.gray.size)
+    if not query.watch.affords("dense", work_px):
+        query.watch.give_up("dense", price=False)
+        return result
+    with query.watch.rung("dense", work_px):
+        return refined.improve(query, result, tools.samples, tools.ncc)
+
+
+def _by_peak(query: Query, tools: Tools) -> Result:
     """NCC on the finest level of the map that the time affords."""
     if query.frame.height_agl_m is None:
         return ncc.locate(query, tools.prepared, tools.ncc)  # which refuses
@@ -75,26 +96,34 @@ def by_sift(query: Query, tools: Tools, *, second: bool = False) -> Result:
 
 
 def by_both(query: Query, tools: Tools) -> Result:
-    """NCC where height and heading are known, then SIFT where there is time: two fixes must be of one place."""
+    """NCC where height and heading are known, then SIFT where there is time: two fixes must be of one place.
+
+    Refinement comes last: it makes a fix more accurate, and the second method makes it surer.
+    """
     if query.frame.height_agl_m is None or query.frame.heading_deg is None:
         return by_sift(query, tools)
-    first = by_ncc(query, tools)
+    first = _by_peak(query, tools)
     second = by_sift(query, tools, second=isinstance(first, Fix))
-    if isinstance(first, NoFix) or isinstance(second, NoFix):
-        return first if isinstance(first, Fix) or _was_late(second) else second
+    if isinstance(second, NoFix):
+        return refine(query, tools, first) if isinstance(first, Fix) or _was_late(second) else second
+    if isinstance(first, NoFix):
+        return second
     apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
     spread_m2 = (first.covariance_m2 + second.covariance_m2)[:2, :2]
     if float(apart_m @ np.linalg.solve(spread_m2, apart_m)) > _SAME_PLACE:
         detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
         return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
-    return replace(min(first, second, key=lambda fix: fix.sigma_m), stage="verified")
+    first = refine(query, tools, first)
+    fixes = [fix for fix in (first, second) if isinstance(fix, Fix)]
+    return replace(min(fixes, key=lambda fix: fix.sigma_m), stage="verified")
 
 
 def every_rung(query: Query, tools: Tools, method: str) -> None:
     """Run each rung once, so that its price is known; the query has a prior."""
     for coarser, work_px in _window_px(query, tools.ncc).items() if method != "sift" else ():
         with query.watch.rung("ncc", work_px):
-            ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
+            result = ncc.locate(query, tools.prepared, tools.ncc, coarser=coarser)
+        refine(query, tools, _on_stage(result, "coarse" if coarser else "fine"))
     for share in _REDUCED if method != "ncc" else ():
         options = replace(tools.sift, scale=tools.sift.scale * share)
         with query.watch.rung("sift", query.gray.size * options.scale**2):
