@@ -1,0 +1,111 @@
+"""The picture of an audit: the map, how surely each place is matched, and what the others suffer from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from engine.audit import SUITABLE, Audit, Flag, Route
+from engine.report.figures import DPI, TRUTH
+from engine.types import Window
+
+if TYPE_CHECKING:
+    from engine.orthomap import OrthoMap
+
+_MAP_PX = 1600  # longer side of the map as drawn; more would not show
+_WIDTH_IN, _LONGEST_IN = 9.0, 11.0
+_MOST_MARKS_PX = 7.0
+# Apart by shape, and by colours that stay apart under every common colour blindness (Okabe and Ito).
+_MARKS = {
+    Flag.FLAT: ("o", "#56B4E9", "flat, such as water"),
+    Flag.REPEATED: ("s", "#E69F00", "repeated"),
+    Flag.UNSTABLE: ("^", "#009E73", "fine random texture, such as forest"),
+    Flag.WEAK: ("v", "#CC79A7", "weak"),
+    Flag.STALE: ("D", "#D55E00", "stale"),
+    Flag.NODATA: ("x", "#8c8c8c", "no data"),
+    Flag.EDGE: ("+", "#8c8c8c", "too near the edge"),
+}
+
+
+def draw_audit(path: str | Path, audit: Audit, route: Route | None = None, *, title: str = "") -> Path:
+    """Draw an audit as a picture file.
+
+    Args:
+        path: the file, replaced where it exists.
+        audit: what was found.
+        route: drawn where given, in a heavier line where its places are not suitable.
+        title: heading.
+    """
+    from matplotlib.figure import Figure
+
+    site = audit.plan.site
+    scale = site.gsd_m_per_px
+    extent = (0.0, site.width_px * scale, site.height_px * scale, 0.0)
+    height_in = float(np.clip((_WIDTH_IN - 2.0) * site.height_px / site.width_px, 3.0, _LONGEST_IN))
+    figure = Figure(figsize=(_WIDTH_IN, height_in + 1.6), layout="constrained")
+    ax = figure.subplots()
+    ax.imshow(_background(site), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
+    shown = ax.imshow(
+        np.ma.masked_invalid(audit.availability),
+        cmap="viridis",
+        vmin=0.0,
+        vmax=1.0,
+        alpha=0.45,
+        extent=extent,
+        interpolation="nearest",
+    )
+    figure.colorbar(shown, ax=ax, shrink=0.7, label="probability of a fix")
+    _draw_marks(ax, audit)
+    if route is not None:
+        _draw_route(ax, route, scale)
+    ax.set(
+        xlim=extent[:2], ylim=extent[2:], xlabel="metres from the map's left edge", ylabel="metres from its top"
+    )
+    ax.set_title("\n".join(line for line in (title, _figures(audit, route)) if line), fontsize=10.5, loc="left")
+    ax.tick_params(labelsize=9)
+    if ax.get_legend_handles_labels()[0]:
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    path = Path(path)
+    figure.savefig(path, dpi=DPI, facecolor="white")
+    return path
+
+
+def _background(site: OrthoMap) -> Any:
+    """The map in grey at the coarsest level that still shows; white where it has no data."""
+    level = 0
+    while level + 1 < site.levels and max(site.level_shape(level)) > _MAP_PX:
+        level += 1
+    rows, columns = site.level_shape(level)
+    whole = Window(0, 0, columns, rows)
+    gray = site.gray(whole, level)
+    gray[~site.valid(whole, level)] = 255
+    return gray
+
+
+def _draw_marks(ax: Any, audit: Audit) -> None:
+    scale = audit.plan.site.gsd_m_per_px
+    size = float(np.clip(220.0 / max(audit.flags.shape), 1.5, _MOST_MARKS_PX))
+    for flag, (marker, colour, label) in _MARKS.items():
+        places = (audit.plan.places_px[audit.flags == flag] + 0.5) * scale
+        if len(places):
+            ax.plot(
+                *places.T, marker, color=colour, markersize=size, markeredgewidth=1.0, linestyle="", label=label
+            )
+
+
+def _draw_route(ax: Any, route: Route, scale: float) -> None:
+    x, y = (route.xy_px + 0.5).T * scale
+    ax.plot(x, y, color="white", linewidth=3.4, alpha=0.9, zorder=4)
+    ax.plot(x, y, color=TRUTH, linewidth=1.4, label="route", zorder=5)
+    if route.stretches:
+        poor = np.where(route.probability < SUITABLE, y, np.nan)
+        ax.plot(x, poor, color="#D55E00", linewidth=4.0, label="poor stretch", zorder=6, solid_capstyle="round")
+
+
+def _figures(audit: Audit, route: Route | None) -> str:
+    parts = [f"{audit.shares['good']:.0%} of the places suitable"]
+    if route is not None:
+        parts.append(f"{route.availability:.0%} predicted along {route.length_m:,.0f} m of route")
+    return ", ".join(parts)
