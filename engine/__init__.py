@@ -15,7 +15,7 @@ from engine.errors import (
     TelemetryError,
 )
 from engine.matcher import MatcherOptions, SceneMatcher
-from engine.navigator import Navigator, NavigatorOptions
+from engine.navigator import Navigator, NavigatorOptions, NavigatorState
 from engine.orthomap import OrthoMap
 from engine.types import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
@@ -34,6 +34,7 @@ __all__ = [
     "MatcherOptions",
     "Navigator",
     "NavigatorOptions",
+    "NavigatorState",
     "NoFix",
     "OptionError",
     "OrthoMap",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import enum
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -10,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.budget import Budget
-from engine.errors import OptionError, TelemetryError
+from engine.errors import OptionError
+from engine.motion import WIDEST_M, Drift, Moment, Place, Velocity, Way, en_m, is_sound
 from engine.orthomap import OrthoMap
 from engine.types import Fix, Frame, NoFix, Prior, Reason, check_positive
 
 Array = NDArray[np.float64]
+
+_VELOCITY_S = 1.0  # over which the last fixes give a velocity
+_MEMORY_S = 5.0  # over which they must agree with measured velocities
 
 
 class Matcher(Protocol):
@@ -26,17 +32,40 @@ class Matcher(Protocol):
         """Where the camera was when the frame was taken."""
 
 
+class NavigatorState(enum.Enum):
+    """How much a navigator knows.
+
+    ``SEARCHING`` before the first fix, ``TRACKING`` where the newest frame gave a fix, ``COASTING`` on dead
+    reckoning since the last one, ``LOST`` where that leads nowhere any more.
+    """
+
+    SEARCHING = "searching"
+    TRACKING = "tracking"
+    COASTING = "coasting"
+    LOST = "lost"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NavigatorOptions:
-    """How a position is carried from frame to frame.
+    """How a position is carried from frame to frame, and what is believed; ``docs/integrity.md`` has the rules.
 
     Attributes:
         measured_velocity_sigma_mps: of a velocity that came with the frame.
-        acceleration_mps2: how hard the vehicle may accelerate while its velocity is taken from its last fixes.
+        acceleration_mps2: how hard the vehicle accelerates, for a second at a time, while its velocity is taken
+            from its last fixes.
         max_speed_mps: assumed while nothing is known of the velocity.
-        growth: factor on the uncertainty for every refusal in a row.
+        growth: factor on the uncertainty that the window is made for, for every refusal in a row.
         default_interval_s: time between frames that carry no stamp.
+        gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
+        trusted_sigma_m: a prediction that is better known than this may confirm or contradict a fix.
+        confirm: fixes in a row that must agree where no such prediction confirms them.
         lost_after: refusals in a row after which the whole map is searched again.
+        lost_sigma_m: uncertainty of the prediction at which the same is done.
+        search_every: while lost, of so many frames one searches the whole map; the others look where dead
+            reckoning leads.
+        hold_s: how long dead reckoning by measured velocities may contradict fixes that agree with each other.
+        late_s: how much older than the newest frame a frame may be.
+        healthy_s: age of the last fix up to which the navigator calls itself healthy.
     """
 
     measured_velocity_sigma_mps: float = 0.5
@@ -44,7 +73,15 @@ class NavigatorOptions:
     max_speed_mps: float = 15.0
     growth: float = 1.4
     default_interval_s: float = 0.2
+    gate: float = 18.4
+    trusted_sigma_m: float = 50.0
+    confirm: int = 3
     lost_after: int = 12
+    lost_sigma_m: float = 100.0
+    search_every: int = 3
+    hold_s: float = 15.0
+    late_s: float = 2.0
+    healthy_s: float = 1.0
 
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
@@ -52,19 +89,40 @@ class NavigatorOptions:
             raise OptionError(f"growth: expected 1 or more, got {self.growth}")
 
 
-@dataclass(slots=True)
-class _Track:
-    """What is carried over: the last fix, the dead-reckoned way since then, and the refusals since then."""
+BELIEVE_ALL = NavigatorOptions(gate=1e12, confirm=1)
+"""Every match is handed out, as the paper's recipe does: the baseline."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Anchor:
+    """What dead reckoning begins at: the last fix that is believed, or the start of the flight.
+
+    Attributes:
+        place: at that moment.
+        moment: on the way; None where the way has not begun.
+        fix: None for a start.
+        support: fixes that agreed one after the other up to this one.
+    """
+
+    place: Place
+    moment: Moment | None
+    fix: Fix | None = None
+    support: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """The last of some fixes that agree with each other and are not believed yet."""
 
     fix: Fix
-    velocity_mps: Array | None
-    moved_m: Array
-    variance_m2: float
-    refusals: int = 0
+    moment: Moment
+    count: int
 
 
 class Navigator:
     """Follows a flight: each frame is matched in the window where the last fixes say it must lie.
+
+    A fix is handed out where a prediction confirms it, or others in a row; see ``docs/integrity.md``.
 
     Args:
         matcher: matches single frames.
@@ -81,102 +139,262 @@ class Navigator:
         options: NavigatorOptions | None = None,
     ) -> None:
         self._matcher = matcher
-        self._start = start
         self._budget = budget
-        self._options = options or NavigatorOptions()
-        self._track: _Track | None = None
-        self._last_ns: int | None = None
-        self._start_refusals = 0
+        self._options = o = options or NavigatorOptions()
+        self._drift = Drift(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
+        self._way = Way(o.late_s, o.default_interval_s)
+        self._velocity: Velocity | None = None  # by the last fixes
+        self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
+        self._anchor = None if start is None else _Anchor(self._place(start), None)
+        self._held: _Held | None = None
+        self._refusals = 0  # in a row
+        self._frames_lost = 0
+        self._fixed = self._lost = False  # whether the newest frame was; whether the flight is
+        self._resets = 0
+
+    @property
+    def state(self) -> NavigatorState:
+        """How much is known after the last frame."""
+        if self._anchor is None or self._anchor.fix is None:
+            return NavigatorState.SEARCHING
+        if self._lost:
+            return NavigatorState.LOST
+        return NavigatorState.TRACKING if self._fixed else NavigatorState.COASTING
 
     @property
     def tracking(self) -> bool:
         """Whether there is a fix to carry on from."""
-        return self._track is not None
+        return self.state in (NavigatorState.TRACKING, NavigatorState.COASTING)
+
+    @property
+    def anchor_age_s(self) -> float | None:
+        """Age of the last fix when the newest frame was taken, or None before the first."""
+        anchor, now = self._anchor, self._way.last
+        if anchor is None or anchor.fix is None or anchor.moment is None or now is None:
+            return None
+        return now.time_s - anchor.moment.time_s
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the position rests on a fix of the last ``healthy_s`` seconds."""
+        age_s = self.anchor_age_s
+        return self.tracking and age_s is not None and age_s <= self._options.healthy_s
+
+    @property
+    def reset_count(self) -> int:
+        """How often the position was taken up anew, where dead reckoning did not lead; for MAVLink's counter."""
+        return self._resets
+
+    @property
+    def prediction(self) -> Prior | None:
+        """Dead reckoning at the newest frame, with its honest sigma; None where there is nothing to begin at."""
+        now = self._way.last
+        place = None if now is None else self._reckoned(now)
+        return None if place is None else place.prior()
 
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
 
         Args:
-            frame: taken after every frame before it.
+            frame: the newest, or one that comes late by at most ``late_s``. A late one is matched where the
+                vehicle was then, and moves nothing back.
             prior: what somebody else knows of this frame's place; used where it is tighter than what the last
                 fixes say.
             budget: of this frame, in place of the navigator's.
 
         Raises:
-            TelemetryError: the frame is not newer than the last one.
+            TelemetryError: the frame came before, or is older than ``late_s``.
+            CalibrationError: the frame is not of the camera's resolution.
         """
-        interval_s = self._interval_s(frame)
-        own = self._predict(frame, interval_s)
-        if own is None or (prior is not None and prior.sigma_m < own.sigma_m):
-            own = prior if prior is not None else own
-        result = self._matcher.locate(self._with_height(frame), own, budget or self._budget)
-        self._last_ns = frame.timestamp_ns if frame.timestamp_ns is not None else self._last_ns
+        late = self._way.is_late(frame)
+        now = self._way.moment(frame, self._velocity)
+        given = None if prior is None else self._place(prior)
+        asked = self._asked(now, late=late)
+        if prior is not None and given is not None and (asked is None or prior.sigma_m < asked.sigma_m):
+            asked = prior
+        result = self._matcher.locate(self._with_height(frame), asked, budget or self._budget)
+        if self._anchor is not None and self._anchor.moment is None:
+            self._anchor = replace(self._anchor, moment=now)
+        self._way.note(frame, now)
         if isinstance(result, Fix):
-            self._accept(result, frame)
-        elif result.reason is Reason.LATE:
-            pass  # no time to look says nothing of where the vehicle is
-        elif self._track is not None:
-            self._track.refusals += 1
-            if self._track.refusals >= self._options.lost_after:
-                self._track, self._start = None, None
-        else:
-            self._start_refusals += 1
-            if self._start_refusals >= self._options.lost_after:
-                self._start = None
+            result = self._judge(result, now, given, late=late)
+        elif not late and result.reason is not Reason.LATE:
+            self._held = None  # nobody confirmed it
+        if not late:
+            self._fixed = isinstance(result, Fix)
+            if isinstance(result, NoFix) and result.reason is not Reason.LATE:
+                self._refusals += 1  # no time to look says nothing of where the vehicle is
+            self._note_loss(now)
         return result
 
-    def _interval_s(self, frame: Frame) -> float:
-        if frame.timestamp_ns is None or self._last_ns is None:
-            return self._options.default_interval_s
-        interval_s = (frame.timestamp_ns - self._last_ns) * 1e-9
-        if interval_s <= 0:
-            raise TelemetryError(
-                f"timestamp_ns: expected later than {self._last_ns} (the frame before), got {frame.timestamp_ns}"
-            )
-        return interval_s
+    # ------------------------------------------------------------------------------------------ predictions
 
-    def _predict(self, frame: Frame, interval_s: float) -> Prior | None:
-        """Dead reckoning over one interval: where the frame must lie, and how uncertain that is."""
-        options, track = self._options, self._track
-        if track is None:
-            if self._start is None:
+    def _reckoned(self, now: Moment, anchor: _Anchor | None = None) -> Place | None:
+        """Dead reckoning from an anchor, or from the last one."""
+        anchor = anchor or self._anchor
+        if anchor is None or anchor.moment is None:
+            return None if anchor is None else anchor.place
+        drift_m = self._drift.sigma_m(anchor.moment, now, self._velocity)
+        sigma_m = min(math.hypot(anchor.place.sigma_m, drift_m), WIDEST_M)
+        return Place(anchor.place.en_m + now.moved_m - anchor.moment.moved_m, sigma_m)
+
+    def _asked(self, now: Moment, *, late: bool) -> Prior | None:
+        """What the matcher is told; None to search the whole map."""
+        place, options = self._reckoned(now), self._options
+        if self._lost or place is None:
+            held = self._held_place(now)
+            if held is not None:
+                return held.prior()
+            if (
+                place is None
+                or place.sigma_m > options.lost_sigma_m
+                or self._frames_lost % options.search_every == 0
+            ):
                 return None
-            return replace(self._start, sigma_m=self._start.sigma_m * options.growth**self._start_refusals)
-        if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
-            velocity = np.array([frame.east_velocity_mps, frame.north_velocity_mps])
-            step_sigma = options.measured_velocity_sigma_mps * interval_s
-        elif track.velocity_mps is not None:
-            velocity = track.velocity_mps
-            step_sigma = 0.5 * options.acceleration_mps2 * interval_s**2 + 1.0 * interval_s
-        else:
-            velocity = np.zeros(2)
-            step_sigma = options.max_speed_mps * interval_s / 2.0
-        step = velocity * interval_s
-        track.moved_m = track.moved_m + step
-        track.variance_m2 += step_sigma**2
-        place = np.array([track.fix.east_m, track.fix.north_m]) + track.moved_m
-        sigma = math.sqrt(track.variance_m2) * options.growth**track.refusals
-        return Prior(
-            east_m=float(place[0]),
-            north_m=float(place[1]),
-            sigma_m=sigma,
-            moved_east_m=float(step[0]),
-            moved_north_m=float(step[1]),
-        )
+        growth = options.growth ** min(self._refusals, options.lost_after)
+        last = self._way.last
+        return place.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
+
+    def _held_place(self, now: Moment) -> Place | None:
+        """Where a fix that is not believed yet would lead, or None where that says little."""
+        held = self._held
+        if held is None:
+            return None
+        sigma_m = math.hypot(held.fix.sigma_m, self._drift.sigma_m(held.moment, now))
+        if sigma_m > self._options.trusted_sigma_m:
+            return None
+        return Place(en_m(held.fix) + now.moved_m - held.moment.moved_m, sigma_m)
+
+    def _place(self, prior: Prior) -> Place:
+        if prior.east_m is not None and prior.north_m is not None:
+            return Place(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
+        assert prior.lat_deg is not None  # a Prior has one of the two
+        assert prior.lon_deg is not None
+        place = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
+        return Place(np.asarray(place[:2], np.float64), prior.sigma_m)
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
-        if frame.height_agl_m is not None or self._track is None or self._track.fix.up_m is None:
+        fix = None if self._anchor is None or self._lost else self._anchor.fix
+        if frame.height_agl_m is not None or fix is None or fix.up_m is None:
             return frame
-        height = self._track.fix.up_m - self._matcher.site.ground_m
+        height = fix.up_m - self._matcher.site.ground_m
         return replace(frame, height_agl_m=height) if height > 0 else frame
 
-    def _accept(self, fix: Fix, frame: Frame) -> None:
-        """Start the next dead reckoning at this fix."""
-        velocity = None
-        last = self._track
-        if last is not None and fix.timestamp_ns is not None and last.fix.timestamp_ns is not None:
-            moved = np.array([fix.east_m - last.fix.east_m, fix.north_m - last.fix.north_m])
-            velocity = moved / ((fix.timestamp_ns - last.fix.timestamp_ns) * 1e-9)
-        self._track = _Track(fix, velocity, np.zeros(2), fix.sigma_m**2)
-        self._start_refusals = 0
+    # ---------------------------------------------------------------------------------------------- beliefs
+
+    def _judge(self, fix: Fix, now: Moment, given: Place | None, *, late: bool) -> Fix | NoFix:
+        """The fix where it is believed; else it is held, and refused for now."""
+        if not is_sound(fix):
+            return _refusal(fix, Reason.BAD_POSE, "the covariance of the match is not positive definite")
+        own, against = self._reckoned(now), self._against(fix, now)
+        contradicted = against is not None
+        confirmed = own is not None and not self._lost and not contradicted and self._confirms(own, fix)
+        if given is not None and (own is None or self._lost or given.sigma_m < own.sigma_m):
+            confirmed = self._confirms(given, fix)
+        if confirmed:
+            self._believe(fix, now, 1, jump=contradicted)
+            return fix
+        if late:
+            return self._refuse_match(fix, against, 0)
+        before = self._held_place(now)
+        agree = before is not None and self._confirms(before, fix)
+        held = _Held(fix, now, self._held.count + 1 if agree and self._held is not None else 1)
+        if held.count >= self._options.confirm and not (contradicted and self._holds_on(now, held.count)):
+            self._believe(fix, now, held.count, jump=contradicted)
+            return fix
+        self._held = held
+        return self._refuse_match(fix, against, held.count)
+
+    def _confirms(self, place: Place, fix: Fix) -> bool:
+        return place.sigma_m <= self._options.trusted_sigma_m and place.chi_square(fix) <= self._options.gate
+
+    def _against(self, fix: Fix, now: Moment) -> Place | None:
+        """A well-known prediction that a fix contradicts: by the last fix, or by one some seconds ago.
+
+        Step by step a wrong match may lead away slowly enough; over seconds, measured velocities show it.
+        """
+        predictions = [self._reckoned(now)]
+        if self._recent and now.blind_s == _moment(self._recent[0]).blind_s:
+            predictions.append(self._reckoned(now, self._recent[0]))
+        for place in predictions:
+            known = place is not None and place.sigma_m <= self._options.trusted_sigma_m
+            if place is not None and known and place.chi_square(fix) > self._options.gate:
+                return place
+        return None
+
+    def _holds_on(self, now: Moment, against: int) -> bool:
+        """Whether dead reckoning outweighs so many fixes that agree with each other and not with it."""
+        anchor = self._anchor
+        if anchor is None or anchor.moment is None or now.blind_s > anchor.moment.blind_s:
+            return False  # it was not measured
+        return against <= anchor.support and now.time_s - anchor.moment.time_s <= self._options.hold_s
+
+    def _believe(self, fix: Fix, now: Moment, count: int, *, jump: bool) -> None:
+        """Dead reckoning goes on from this fix."""
+        last = self._anchor
+        known = last is not None and last.fix is not None
+        if known and last is not None and last.moment is not None and now.time_s < last.moment.time_s:
+            return  # a late one
+        jump = jump or self._lost
+        self._resets += known and jump
+        support = count if last is None or jump else last.support + count
+        self._anchor = _Anchor(Place(en_m(fix), fix.sigma_m), now, fix, support)
+        self._note_velocity(self._anchor, jump=jump)
+        self._refusals, self._frames_lost, self._held, self._lost = 0, 0, None, False
+
+    def _note_velocity(self, anchor: _Anchor, *, jump: bool) -> None:
+        """The velocity by the fixes of about the last second."""
+        if jump:
+            self._recent.clear()
+        self._recent.append(anchor)
+        now_s = _moment(anchor).time_s
+        while len(self._recent) > 2 and _moment(self._recent[1]).time_s <= now_s - _MEMORY_S:
+            self._recent.popleft()
+        long_ago = (a for a in reversed(self._recent) if _moment(a).time_s <= now_s - _VELOCITY_S)
+        first = next(long_ago, self._recent[0])
+        interval_s = now_s - _moment(first).time_s
+        self._velocity = None
+        if interval_s > 0.0:
+            sigma_m = math.hypot(anchor.place.sigma_m, first.place.sigma_m)
+            self._velocity = self._drift.velocity(anchor.place.en_m - first.place.en_m, sigma_m, interval_s)
+
+    def _refuse_match(self, fix: Fix, against: Place | None, count: int) -> NoFix:
+        """What is said of a match that is not believed."""
+        if against is not None:
+            apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
+            sigma_m = math.hypot(against.sigma_m, fix.sigma_m)
+            detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
+            return _refusal(fix, Reason.INCONSISTENT, detail)
+        detail = f"{count} of the {self._options.confirm} matches in a row that must agree"
+        return _refusal(fix, Reason.UNCONFIRMED, detail)
+
+    def _note_loss(self, now: Moment) -> None:
+        """Declare the flight lost, or its start forgotten, where it is time to."""
+        anchor, options = self._anchor, self._options
+        if anchor is None or self._fixed:
+            return
+        place = self._reckoned(now)
+        far = place is not None and place.sigma_m > options.lost_sigma_m
+        if anchor.fix is not None:
+            self._frames_lost += self._lost
+            self._lost = self._lost or far or self._refusals >= options.lost_after
+        elif self._refusals >= options.lost_after:
+            self._anchor = None
+
+
+def _moment(anchor: _Anchor) -> Moment:
+    assert anchor.moment is not None  # a fix has one
+    return anchor.moment
+
+
+def _refusal(fix: Fix, reason: Reason, detail: str) -> NoFix:
+    return NoFix(
+        reason=reason,
+        detail=detail,
+        timestamp_ns=fix.timestamp_ns,
+        method=fix.method,
+        score=fix.score,
+        window=fix.window,
+        timings=fix.timings,
+    )

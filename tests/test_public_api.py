@@ -27,6 +27,7 @@ PUBLIC = [
     "MatcherOptions",
     "Navigator",
     "NavigatorOptions",
+    "NavigatorState",
     "NoFix",
     "OptionError",
     "OrthoMap",

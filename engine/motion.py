@@ -1,0 +1,206 @@
+"""Dead reckoning: the way flown between fixes, by measured velocities or by none, and how far it may be off."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import TelemetryError
+from engine.types import Fix, Frame, Prior
+
+Array = NDArray[np.float64]
+
+WIDEST_M = 1e6
+"""Uncertainty beyond which no map goes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A moment on the way.
+
+    Attributes:
+        time_s: since the first frame.
+        moved_m: (2,) east and north since then, by dead reckoning.
+        blind_s: of that time, how long no velocity was measured.
+    """
+
+    time_s: float
+    moved_m: Array
+    blind_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Velocity:
+    """A velocity (2,) east and north, and one standard deviation of each of the two."""
+
+    mps: Array
+    sigma_mps: float
+
+
+class Way:
+    """When the frames were taken, and the way flown meanwhile.
+
+    Args:
+        late_s: how much older than the newest frame a frame may be.
+        default_interval_s: time between frames that carry no stamp.
+    """
+
+    def __init__(self, late_s: float, default_interval_s: float) -> None:
+        self._late_s, self._default_interval_s = late_s, default_interval_s
+        self._moments: deque[Moment] = deque()  # of the last late_s
+        self._stamps: deque[int] = deque()  # of the same
+        self._newest_ns: int | None = None
+        self._measured: Array | None = None  # velocity of the newest frame, where it had one
+
+    @property
+    def last(self) -> Moment | None:
+        """The moment of the newest frame, or None before the first."""
+        return self._moments[-1] if self._moments else None
+
+    def is_late(self, frame: Frame) -> bool:
+        """Whether a frame is older than the newest one.
+
+        Raises:
+            TelemetryError: it came before, or is older than ``late_s``.
+        """
+        stamp, newest = frame.timestamp_ns, self._newest_ns
+        if stamp is None or newest is None or stamp > newest:
+            return False
+        if stamp in self._stamps:
+            raise TelemetryError(f"timestamp_ns: expected a frame that did not come before, got {stamp} again")
+        least = newest - round(self._late_s * 1e9)
+        if stamp < least:
+            raise TelemetryError(
+                f"timestamp_ns: expected {least} or later ({newest} was the newest frame), got {stamp}"
+            )
+        return True
+
+    def moment(self, frame: Frame, velocity: Velocity | None) -> Moment:
+        """Where on the way a frame was taken; the way is left as it is.
+
+        Args:
+            frame: a new one, or a late one.
+            velocity: taken where the frame came without one; None stands still.
+        """
+        last = self.last
+        if last is None:
+            return Moment(0.0, np.zeros(2), 0.0)
+        interval_s = self._default_interval_s
+        if frame.timestamp_ns is not None and self._newest_ns is not None:
+            interval_s = (frame.timestamp_ns - self._newest_ns) * 1e-9
+        if interval_s < 0.0:
+            return self._between(last.time_s + interval_s)
+        measured = _velocity_of(frame)
+        if measured is not None:
+            mean = measured if self._measured is None else 0.5 * (measured + self._measured)
+            return Moment(last.time_s + interval_s, last.moved_m + mean * interval_s, last.blind_s)
+        step = np.zeros(2) if velocity is None else velocity.mps * interval_s
+        return Moment(last.time_s + interval_s, last.moved_m + step, last.blind_s + interval_s)
+
+    def note(self, frame: Frame, moment: Moment) -> None:
+        """Take in a frame that was matched."""
+        stamp, newest = frame.timestamp_ns, self._newest_ns
+        if stamp is not None:
+            self._stamps.append(stamp)
+            if newest is not None and stamp <= newest:
+                return  # late
+            self._newest_ns = stamp
+            self._stamps = deque(known for known in self._stamps if known >= stamp - self._late_s * 1e9)
+        self._measured = _velocity_of(frame)
+        self._moments.append(moment)
+        while len(self._moments) > 2 and self._moments[1].time_s < moment.time_s - self._late_s:
+            self._moments.popleft()
+
+    def _between(self, time_s: float) -> Moment:
+        """A moment between two frames; the first of all before them."""
+        times = [moment.time_s for moment in self._moments]
+        rows = np.array([(*moment.moved_m, moment.blind_s) for moment in self._moments])
+        east, north, blind = (float(np.interp(time_s, times, column)) for column in rows.T)
+        return Moment(time_s, np.array([east, north]), blind)
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How fast dead reckoning is led astray.
+
+    Attributes:
+        measured_sigma_mps: of a measured velocity. Such errors last: they add up with time, not with its root.
+        acceleration_mps2: how hard the vehicle accelerates, for a second at a time and then some other way, while
+            its velocity is not measured.
+        max_speed_mps: where nothing is known of it.
+    """
+
+    measured_sigma_mps: float
+    acceleration_mps2: float
+    max_speed_mps: float
+
+    def sigma_m(self, start: Moment, end: Moment, velocity: Velocity | None = None) -> float:
+        """One standard deviation, per axis, of the way between two moments.
+
+        Args:
+            start: either of the two.
+            end: the other.
+            velocity: with which the way goes on where none was measured; None where it stands still.
+        """
+        blind_s = abs(end.blind_s - start.blind_s)
+        measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s)
+        blind_m = 0.5 * self.max_speed_mps * blind_s
+        if velocity is not None:
+            changed_m = self.acceleration_mps2 * math.sqrt(blind_s**3 / 3.0)  # a random walk of the velocity
+            blind_m = min(velocity.sigma_mps * blind_s + changed_m, 2.0 * blind_m)
+        return self.measured_sigma_mps * measured_s + blind_m
+
+    def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> Velocity:
+        """The velocity at the later of two fixes.
+
+        Args:
+            apart_m: (2,) from one to the other.
+            sigma_m: of that, per axis.
+            interval_s: between them.
+        """
+        changed_mps = self.acceleration_mps2 * math.sqrt(interval_s / 3.0)
+        return Velocity(apart_m / interval_s, sigma_m / interval_s + changed_mps)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the vehicle should be: (2,) east and north, and one standard deviation of each."""
+
+    en_m: Array
+    sigma_m: float
+
+    def chi_square(self, fix: Fix) -> float:
+        """Squared distance of a fix in units of both covariances: two degrees of freedom."""
+        apart_m = en_m(fix) - self.en_m
+        spread_m2 = fix.covariance_m2[:2, :2] + self.sigma_m**2 * np.eye(2)
+        return float(apart_m @ np.linalg.solve(spread_m2, apart_m))
+
+    def prior(self, widened: float = 1.0, moved_m: Array | None = None) -> Prior:
+        """The same as a matcher is told it, ``widened`` times as uncertain; no wider than any map."""
+        east, north = (float(v) for v in self.en_m)
+        moved_east, moved_north = (0.0, 0.0) if moved_m is None else (float(v) for v in moved_m)
+        sigma_m = min(self.sigma_m * widened, WIDEST_M)
+        return Prior(
+            east_m=east, north_m=north, sigma_m=sigma_m, moved_east_m=moved_east, moved_north_m=moved_north
+        )
+
+
+def en_m(fix: Fix) -> Array:
+    """(2,) east and north of a fix."""
+    return np.array([fix.east_m, fix.north_m])
+
+
+def is_sound(fix: Fix) -> bool:
+    """Whether the place is finite and the covariance positive definite."""
+    finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
+    return finite and bool(np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0)
+
+
+def _velocity_of(frame: Frame) -> Array | None:
+    if frame.east_velocity_mps is None or frame.north_velocity_mps is None:
+        return None
+    return np.array([frame.east_velocity_mps, frame.north_velocity_mps])

@@ -1,0 +1,73 @@
+"""Sequences of frames as nobody should send them: each ends in a fix, a refusal or a documented error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench.sequences import IMAGES, METHODS, PRIORS, STAMPS, TELEMETRY, Ground, Step, fly, is_sound, random_steps
+from engine import Fix, Navigator, NavigatorState
+
+RIGHT = Step("right", "next", "none", "right")
+STEPS = st.builds(Step, *map(st.sampled_from, (IMAGES, STAMPS, PRIORS, TELEMETRY)))
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return Ground()
+
+
+@given(steps=st.lists(STEPS, min_size=1, max_size=10), method=st.sampled_from(METHODS), start=st.booleans())
+@settings(max_examples=60)
+def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
+    fly(tiny, steps, method, start=start)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_random_sequences_end_in_documented_ways_and_some_in_fixes(tiny, method):
+    """A slice of ``python -m bench.sequences``."""
+    endings = sum((sequence(tiny, seed, method) for seed in range(12)), start=sequence(tiny, 99, method))
+    assert endings["fix"] > 0
+    assert endings["TelemetryError"] > 0
+    assert endings["no_texture"] > 0
+
+
+def sequence(tiny, seed, method):
+    rng = np.random.default_rng(seed)
+    return fly(tiny, random_steps(rng, int(rng.integers(1, 24))), method, start=bool(rng.integers(2)))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fault", ["noise", "flat", "black", "saturated", "small", "float", "rgba", "empty"])
+def test_one_bad_frame_costs_one_frame(tiny, method, fault):
+    steps = [RIGHT] * 4 + [replace(RIGHT, image=fault)] + [RIGHT] * 3
+    endings = fly(tiny, steps, method, start=True)
+    assert endings["fix"] == 7
+
+
+@pytest.mark.parametrize(
+    "words", [{"stamp": "same"}, {"stamp": "long before"}, {"prior": "NaN"}, {"telemetry": "NaN"}]
+)
+def test_a_call_that_is_an_error_costs_nothing(tiny, words):
+    steps = [RIGHT] * 4 + [replace(RIGHT, **words)] * 30 + [RIGHT] * 3
+    endings = fly(tiny, steps, "ncc", start=True)
+    assert endings["fix"] == 7
+    assert endings.total() == 37
+
+
+def test_a_flight_over_the_tiny_map_is_found_from_nowhere(tiny):
+    """Three matches of the whole map that agree, and then a fix a frame, each where the frame was cut out."""
+    navigator = Navigator(tiny.matchers["ncc"])
+    for number in range(8):
+        stamp = 200_000_000 * number
+        result = navigator.update(tiny.frame(RIGHT, stamp, stamp))
+        assert isinstance(result, Fix) == (number >= 2), (number, result)
+        if isinstance(result, Fix):
+            true = tiny.prior(replace(RIGHT, prior="right"), stamp)
+            assert np.hypot(result.east_m - true.east_m, result.north_m - true.north_m) < 1.0
+            assert is_sound(result.covariance_m2)
+    assert navigator.state is NavigatorState.TRACKING
