@@ -1,0 +1,198 @@
+"""``bridge mavlink`` and its parameter files: a camera and an autopilot in, fixes to the autopilot out."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from engine import device as devices
+from engine.adapters.links import parse_connection
+from engine.adapters.parameters import parameter_file
+from engine.adapters.pictures import Picture, capture, replay
+from engine.camera import Camera
+from engine.cli import console
+from engine.cli.arguments import check_choice, parse_position
+from engine.cli.checks import check_place
+from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
+from engine.live import LiveOptions
+from engine.matcher import METHODS, SceneMatcher
+from engine.navigator import Navigator
+from engine.orthomap import OrthoMap
+from engine.types import Prior
+
+if TYPE_CHECKING:
+    from engine.adapters.mavlink import Bridge, Status
+    from engine.adapters.mavlink_out import Outgoing
+
+_SAY_EVERY_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The map, the camera, and where pictures come from: files or a camera, one of the two."""
+
+    map: Path
+    surface: Path | None
+    camera: Path
+    frames: Path | None
+    telemetry: Path | None
+    source: str | None
+    rate_hz: float
+    exposure_to_grab_ms: float
+
+    def __post_init__(self) -> None:
+        if (self.frames is None) == (self.source is None):
+            raise OptionError("--frames: expected either --frames or --camera-source")
+        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise OptionError(f"--rate-hz: expected a number above 0, got {self.rate_hz:g}")
+
+    def pictures(self) -> Iterator[Picture]:
+        """Pictures as they are captured."""
+        if self.frames is not None:
+            return replay(self.frames, self.telemetry, rate_hz=self.rate_hz)
+        assert self.source is not None  # one of the two is given
+        return capture(self.source, exposure_to_grab_ms=self.exposure_to_grab_ms)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wire:
+    """How the autopilot is reached and what it is told, as the command line has it."""
+
+    connect: str
+    listen_anywhere: bool
+    system_id: int
+    key: Path | None
+    firmware: str
+    message: str
+    max_sigma_m: float
+    set_origin: bool
+    origin_alt_m: float | None
+    use_velocity: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matching:
+    """How frames are matched, as the command line has it."""
+
+    method: str
+    device: str
+    start: str | None
+    deadline_ms: float
+    seconds: float | None
+
+
+def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool) -> None:
+    """Bridge until the pictures end, the time is over or somebody interrupts, and print what was done."""
+    _need_pymavlink()
+    from engine.adapters.mavlink import Bridge
+    from engine.adapters.packets import read_key
+
+    connection = parse_connection(wire.connect, listen_anywhere=wire.listen_anywhere)
+    options = _outgoing(wire.firmware, wire.message, wire.max_sigma_m)
+    check_choice("--method", matching.method, METHODS)
+    devices.resolve(matching.device)
+    start = parse_position("--start", matching.start)
+    key = None if wire.key is None else read_key(wire.key)
+    site, camera = OrthoMap.open(inputs.map, surface=inputs.surface), Camera.load(inputs.camera)
+    check_place("--start", start, site, OptionError)
+    matcher = SceneMatcher(site, camera, matching.method, matching.device)
+    matcher.warmup()
+
+    def make_navigator(prior: Prior | None) -> Navigator:
+        return Navigator(matcher, prior)
+
+    try:
+        bridge = Bridge(
+            connection, make_navigator, options, start, LiveOptions(deadline_ms=matching.deadline_ms),
+            origin=_origin(site, wire), use_velocity=wire.use_velocity, system_id=wire.system_id, key=key,
+        )  # fmt: skip
+    except OSError as error:
+        raise BackendError(f"--connect: {wire.connect} cannot be opened: {error.strerror or error}") from None
+    with bridge:
+        _follow(bridge, inputs.pictures(), camera, matching.seconds)
+        status = bridge.status
+    console.facts(asdict(status), as_json, title=f"{options.kind} to {wire.connect}")
+
+
+def write_parameters(
+    firmware: str, message: str, out: Path, *, delay_ms: int, max_sigma_m: float, force: bool
+) -> None:
+    """Write the parameter file of a firmware."""
+    _need_pymavlink()
+    options = _outgoing(firmware, message, max_sigma_m)
+    text = parameter_file(firmware, options.kind, delay_ms=delay_ms, max_sigma_m=max_sigma_m)
+    if out.exists() and not force:
+        raise OptionError(f"--out: {out} exists; choose another file, or add --force to replace it")
+    out.write_text(text, encoding="utf-8")
+    console.say(f"written to {out}")
+
+
+def _need_pymavlink() -> None:
+    try:
+        import pymavlink  # noqa: F401
+    except ImportError:
+        raise BackendError(
+            "bridge: expected pymavlink to be installed: pip install 'scenematch[mavlink]'"
+        ) from None
+
+
+def _outgoing(firmware: str, message: str, max_sigma_m: float) -> Outgoing:
+    from engine.adapters.mavlink_out import Outgoing
+
+    try:
+        return Outgoing(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
+    except OptionError as error:
+        raise OptionError("--" + str(error).replace("_", "-", str(error).split(":")[0].count("_"))) from None
+
+
+def _origin(site: OrthoMap, wire: Wire) -> Any:
+    """The map's, at the height of its ground where none is told."""
+    from engine.adapters.mavlink_in import Origin
+
+    if not wire.set_origin:
+        return None
+    alt_m = site.ground_m if wire.origin_alt_m is None else wire.origin_alt_m
+    return Origin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
+
+
+def _follow(bridge: Bridge, pictures: Iterator[Picture], camera: Camera, seconds: float | None) -> None:
+    """Every picture to the bridge; now and then a line of what it does."""
+    begin = said = time.monotonic()
+    count = 0
+    for image, captured_ns in pictures:
+        count += 1
+        try:
+            camera.check_size(image.shape)
+        except CalibrationError as error:
+            raise CalibrationError(f"picture {count}: {error}") from None
+        bridge.submit(image, captured_ns)
+        now = time.monotonic()
+        if now - said >= _SAY_EVERY_S:
+            said = now
+            console.say(_line(bridge.status))
+        if seconds is not None and now - begin >= seconds:
+            return
+    if count == 0:
+        raise TelemetryError("--frames: expected at least one picture, got none")
+    _wait_for_answers(lambda: bridge.status.answered, count)
+
+
+def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
+    """The last frame's answer; those that newer frames replaced have none."""
+    before, until = -1, time.monotonic() + 2.0
+    while answered() not in (before, count) and time.monotonic() < until:
+        before = answered()
+        time.sleep(0.3)
+
+
+def _line(status: Status) -> str:
+    from engine.adapters.mavlink import LEAST_HZ
+
+    reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"
+    heard = "autopilot heard" if status.connected else "no autopilot"
+    slow = f" (below {LEAST_HZ:g} Hz an estimator may let go)" if status.rate_hz < LEAST_HZ else ""
+    return f"{heard}; sent {status.sent}, {status.rate_hz:.1f} Hz{slow}; not sent: {reasons}"
