@@ -38,7 +38,7 @@ class AssumedErrors:
     height_share: float = 0.01
     heading_deg: float = 1.0
     tilt_deg: float = 0.5
-    unknown_tilt_deg: float = 2.0
+    unknown_tilt_deg: float = 4.0
     map_m: float = 0.3
     surface_slope_deg: float = 0.1
     unknown_slope_deg: float = 2.0

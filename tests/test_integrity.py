@@ -159,7 +159,7 @@ def test_a_tilt_that_nobody_measured_is_less_sure():
     unknown_roll = Frame(BLANK, 0, 150.0, 0.0, None, 0.0)
     gain = errors_for(unknown_roll) - errors_for(level)
     # Heading north, roll moves the axis east and west.
-    assert gain[0, 0] == pytest.approx((150.0 * math.tan(math.radians(2.0))) ** 2 - 1.309**2, rel=1e-2)
+    assert gain[0, 0] == pytest.approx((150.0 * math.tan(math.radians(4.0))) ** 2 - 1.309**2, rel=1e-2)
     assert gain[1, 1] == pytest.approx(0.0, abs=1e-9)
 
 

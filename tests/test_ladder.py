@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, Navigator, NoFix, Prior, Reason, SceneMatcher
+from engine import Budget, Fix, Navigator, NoFix, OrthoMap, Prior, Reason, SceneMatcher
 from engine.methods import sift
 
 NADIR = np.array([315.0, 296.0])
@@ -31,10 +31,17 @@ class Prices:
         pass
 
 
+@pytest.fixture(scope="module")
+def site(ground):
+    """The ground with a surface model that says how flat it is: only then is a pose refined."""
+    flat = np.zeros(ground.gray.shape, np.float32)
+    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
+
+
 @pytest.fixture
-def make(ground, camera):
+def make(site, camera):
     def made(method, **per_unit):
-        matcher = SceneMatcher(ground.site, camera, method, "cpu")
+        matcher = SceneMatcher(site, camera, method, "cpu")
         matcher._costs = Prices(**per_unit)
         return matcher
 
@@ -154,8 +161,8 @@ def test_a_price_that_is_refused_fades_until_it_is_tried_again(ground, camera, f
     assert isinstance(results[-1], Fix)
 
 
-def test_after_warmup_nothing_is_made_in_flight(ground, camera):
-    matcher = SceneMatcher(ground.site, camera, "auto", "cpu")
+def test_after_warmup_nothing_is_made_in_flight(ground, site, camera):
+    matcher = SceneMatcher(site, camera, "auto", "cpu")
     matcher.warmup()
     before = matcher.one_off_work
     assert all(count > 0 for count in before.values())

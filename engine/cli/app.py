@@ -19,6 +19,8 @@ app = typer.Typer(
 )
 map_app = typer.Typer(help="Facts about a map.")
 app.add_typer(map_app, name="map")
+bridge_app = typer.Typer(help="Live, beside an autopilot.")
+app.add_typer(bridge_app, name="bridge")
 
 # typer brings its own copy of click, or depends on click: what it raises is found by descent, not by import.
 _UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
@@ -46,6 +48,21 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace the results 
 JsonOption = Annotated[bool, typer.Option("--json", help="Results as JSON on standard output.")]
 ThreadsOption = Annotated[
     int, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.", show_default=True)
+]
+
+FirmwareOption = Annotated[
+    str, typer.Option("--firmware", metavar="ardupilot|px4", help="What the autopilot runs.")
+]
+MessageOption = Annotated[
+    str,
+    typer.Option(
+        "--message",
+        metavar="NAME",
+        help="What is sent; without it vision_position_estimate or global_position_sensor.",
+    ),
+]
+MaxSigmaOption = Annotated[
+    float, typer.Option("--max-sigma-m", metavar="M", help="A fix that is less certain is not sent.")
 ]
 
 
@@ -114,12 +131,23 @@ def track(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
     telemetry: Annotated[
         Path | None,
-        typer.Option("--telemetry", metavar="FILE", help="telemetry.csv; without it the photographs' EXIF."),
+        typer.Option(
+            "--telemetry", metavar="FILE", help="telemetry.csv, or a log: .BIN, .ulg, .SRT; without it EXIF."
+        ),
     ] = None,
+    frame_stamps: Annotated[
+        Path | None,
+        typer.Option("--frame-stamps", metavar="FILE", help="With a log: a CSV with timestamp_ns and frame."),
+    ] = None,
+    log_offset: Annotated[
+        float, typer.Option("--log-offset-s", metavar="S", help="With a log: added to the frames' own stamps.")
+    ] = 0.0,
     surface: SurfaceOption = None,
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", metavar="FILE", help="truth.csv; without it the one beside the telemetry."),
+        typer.Option(
+            "--truth", metavar="FILE", help="truth.csv, or a log; without it the one beside the telemetry."
+        ),
     ] = None,
     method: MethodOption = "ncc",
     start: Annotated[
@@ -139,9 +167,11 @@ def track(
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
     from engine.cli.track import Inputs, Settings, run_track
+    from engine.formats.logs import LogClock
 
     _threads(threads)
-    inputs = Inputs(map_path, surface, camera, frames, telemetry, truth)
+    clock = LogClock(frame_stamps, log_offset) if frame_stamps is not None or log_offset else None
+    inputs = Inputs(map_path, surface, camera, frames, telemetry, truth, clock)
     settings = Settings(method=method, profile=profile, device=device, start=start, budget_ms=budget_ms)
     result = run_track(inputs, out, settings, force=force)
     console.report(result, as_json, title=f"{method} ({profile} profile) on {frames}", out=out)
@@ -199,6 +229,25 @@ def evaluate(
     console.report(run_evaluate(directory, truth), as_json, title=f"track in {directory}", out=directory)
 
 
+@app.command()
+def export(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
+    kind: Annotated[str, typer.Option("--format", metavar="gpx|geojson|kml|tum|nmea", help="What is written.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Without it track.FORMAT in the folder.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A finished track as GPX, GeoJSON, KML, TUM, NMEA.
+
+    Refused frames leave gaps. Times of day are written where the frames' stamps are UTC.
+    """
+    from engine.cli.export import run_export
+
+    console.facts(run_export(directory, kind, out, force=force), as_json, title=f"track in {directory}")
+
+
 @map_app.command("info")
 def map_info(
     map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
@@ -209,6 +258,151 @@ def map_info(
     from engine.orthomap import OrthoMap
 
     console.facts(OrthoMap.open(map_path, surface=surface).info(), as_json, title=str(map_path))
+
+
+@map_app.command("audit")
+def map_audit(
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
+    surface: SurfaceOption = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", metavar="FILE", help="Calibration; without it 300 x 300 px with 60 degrees."),
+    ] = None,
+    height_agl: Annotated[
+        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground; 150 unless told.")
+    ] = None,
+    route: Annotated[
+        Path | None,
+        typer.Option("--route", metavar="FILE", help="GeoJSON LineString, or a QGroundControl .plan."),
+    ] = None,
+    other: Annotated[
+        Path | None,
+        typer.Option("--other", metavar="FILE", help="The same ground at another date; finds what is stale."),
+    ] = None,
+    sigma: Annotated[
+        float, typer.Option("--sigma-m", metavar="M", help="How well the position is known before a match.")
+    ] = 10.0,
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Where frames can be matched, and where not.
+
+    Writes matchability.tif (probability of a fix by NCC), audit.png and summary.json. With --route the
+    availability along it is predicted, and its poor stretches are listed.
+    """
+    from engine.cli.audit import Inputs, run_audit
+
+    _threads(threads)
+    inputs = Inputs(map_path, surface, camera, route, other, height_agl)
+    run_audit(inputs, out, sigma_m=sigma, force=force, as_json=as_json)
+
+
+@bridge_app.command("mavlink")
+def bridge_mavlink(
+    connect: Annotated[
+        str,
+        typer.Option(
+            "--connect",
+            metavar="LINK",
+            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+        ),
+    ],
+    map_path: MapOption,
+    camera: CameraOption,
+    surface: SurfaceOption = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
+    ] = None,
+    telemetry: Annotated[
+        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
+    ] = None,
+    rate: Annotated[
+        float, typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps.")
+    ] = 10.0,
+    source: Annotated[
+        str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
+    ] = None,
+    grab: Annotated[
+        float,
+        typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
+    ] = 0.0,
+    firmware: FirmwareOption = "ardupilot",
+    message: MessageOption = "",
+    max_sigma: MaxSigmaOption = 10.0,
+    system_id: Annotated[
+        int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
+    ] = 1,
+    key: Annotated[
+        Path | None,
+        typer.Option("--key", metavar="FILE", help="Secret of MAVLink's signing; unsigned is ignored."),
+    ] = None,
+    listen_anywhere: Annotated[
+        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
+    ] = False,
+    set_origin: Annotated[
+        bool, typer.Option("--set-origin/--no-set-origin", help="Give an autopilot without an origin the map's.")
+    ] = True,
+    origin_alt: Annotated[
+        float | None,
+        typer.Option("--origin-alt-m", metavar="M", help="Its height above sea level; else the map's ground."),
+    ] = None,
+    use_velocity: Annotated[
+        bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is believed.")
+    ] = True,
+    method: MethodOption = "auto",
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
+    ] = None,
+    device: DeviceOption = "auto",
+    deadline: Annotated[
+        float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
+    ] = 121.0,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Fixes to an autopilot by MAVLink.
+
+    Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
+    played at their own pace, until they end.
+    """
+    from engine.cli.bridge import Inputs, Matching, Wire, run_bridge
+
+    _threads(threads)
+    inputs = Inputs(map_path, surface, camera, frames, telemetry, source, rate, grab)
+    wire = Wire(
+        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
+        message=message, max_sigma_m=max_sigma, set_origin=set_origin, origin_alt_m=origin_alt,
+        use_velocity=use_velocity,
+    )  # fmt: skip
+    matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
+    run_bridge(inputs, wire, matching, as_json=as_json)
+
+
+@bridge_app.command("mavlink-params")
+def bridge_mavlink_params(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, made by this run.")],
+    firmware: FirmwareOption = "ardupilot",
+    message: MessageOption = "",
+    delay: Annotated[
+        int, typer.Option("--delay-ms", metavar="MS", help="From capture to arrival; the bridge prints it.")
+    ] = 100,
+    max_sigma: MaxSigmaOption = 10.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+) -> None:
+    """Parameters for an autopilot.
+
+    Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
+    """
+    from engine.cli.bridge import write_parameters
+
+    write_parameters(firmware, message, out, delay_ms=delay, max_sigma_m=max_sigma, force=force)
 
 
 @app.command()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from engine.camera import Camera
 from engine.errors import TelemetryError
 from engine.formats.frames import FrameSource, VideoFile, exif_telemetry, open_frames
 from engine.formats.geotiff import write_geotiff
+from engine.formats.logs import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
+from engine.formats.resampling import telemetry_at
 from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
 from engine.formats.truth import write_truth
 from engine.geo import wrap_heading_deg
@@ -46,12 +48,14 @@ class Flight:
     Attributes:
         source: where pictures come from.
         rows: the telemetry, one row a frame; empty where there is none.
+        heights: how many rows have their height from which source, where a log was read.
         names: the frames, in order.
         unused: how many pictures no row names.
     """
 
     source: FrameSource
     rows: list[TelemetryRow]
+    heights: Mapping[str, int] = field(default_factory=dict)
     names: list[str] = field(init=False)
     unused: int = field(init=False)
 
@@ -84,27 +88,38 @@ def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
     )
 
 
-def open_flight(frames: str | Path, telemetry: str | Path | None = None, camera: Camera | None = None) -> Flight:
+def open_flight(
+    frames: str | Path,
+    telemetry: str | Path | None = None,
+    camera: Camera | None = None,
+    clock: LogClock = AS_LOGGED,
+) -> Flight:
     """Open a flight and check up front that its parts belong together.
 
     Args:
         frames: a folder of pictures, or a video.
-        telemetry: telemetry.csv; without it the photographs' EXIF, and where that has no times the pictures
-            in natural order with nothing known.
+        telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT) whose quantities are brought to the frames'
+            moments; without it the photographs' EXIF, and where that has no times the pictures in natural
+            order with nothing known.
         camera: refuses the flight at once where the first picture has another size than the calibration.
+        clock: when the frames were taken, where the telemetry is a log.
 
     Raises:
         TelemetryError: a file cannot be read, or a row names a frame that is not there.
         CalibrationError: the first picture is of another size than the camera's.
     """
     source = open_frames(frames)
-    if telemetry is not None:
+    heights: dict[str, int] = {}
+    if telemetry is not None and is_log(telemetry):
+        log = open_log(telemetry)
+        rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
+    elif telemetry is not None:
         rows = read_telemetry(telemetry, source, source.described)
     elif isinstance(source, VideoFile):
         rows = []
     else:
         rows = exif_telemetry([source.path / name for name in source.names])
-    flight = Flight(source, rows)
+    flight = Flight(source, rows, heights)
     if camera is not None:
         camera.check_size(source.read(flight.names[0]).shape)
     return flight

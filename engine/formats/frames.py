@@ -7,6 +7,7 @@ Convention:
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from abc import ABC, abstractmethod
@@ -123,6 +124,26 @@ class VideoFile(FrameSource):
     def described(self) -> str:
         """The indices that there are."""
         return f"an index from 0 to {len(self.names) - 1} of the video"
+
+    def stamps_ns(self) -> list[int]:
+        """When each frame is shown, from the start of the video; where it does not say, by its frame rate.
+
+        Raises:
+            TelemetryError: the video tells neither.
+        """
+        import cv2
+
+        self._reset()
+        stamps_ns: list[int] = []
+        while len(stamps_ns) < len(self.names) and self._capture.grab():
+            stamps_ns.append(round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
+        rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
+        self._reset()
+        if len(stamps_ns) > 1 and all(a < b for a, b in itertools.pairwise(stamps_ns)):
+            return stamps_ns
+        if not (math.isfinite(rate_hz) and rate_hz > 0.0):
+            raise TelemetryError(f"{self.path}: expected a video that tells its frames' times, got none")
+        return [round(i * 1e9 / rate_hz) for i in range(len(stamps_ns))]
 
     def _reset(self) -> None:
         import cv2
@@ -316,19 +337,27 @@ def _heading_deg(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> float | No
 
 
 def _gimbal_attitude(xmp: Mapping[str, float]) -> dict[str, float | None] | None:
+    try:
+        angles = (xmp["GimbalRollDegree"], xmp["GimbalPitchDegree"], xmp["GimbalYawDegree"])
+    except KeyError:
+        return None
+    return dict(zip(("roll_deg", "pitch_deg", "heading_deg"), nadir_attitude(*angles), strict=True))
+
+
+def nadir_attitude(
+    gimbal_roll_deg: float, gimbal_pitch_deg: float, gimbal_yaw_deg: float
+) -> tuple[float, float, float]:
     """Attitude of the body on which the gimbal's camera would be mounted looking down, top to the nose.
 
     DJI's angles turn the camera's own forward, right and down, in which a pitch of -90 degrees looks at the
     ground. Its forward is that body's down, and its up the body's forward; with a roll of 180 degrees, as
     some models write it, the same rotation comes out.
+
+    Returns:
+        tuple[float, float, float]: roll, pitch and heading.
     """
-    try:
-        angles = (xmp["GimbalRollDegree"], xmp["GimbalPitchDegree"], xmp["GimbalYawDegree"])
-    except KeyError:
-        return None
-    forward, right, down = enu_from_body(*angles).T
-    roll_deg, pitch_deg, heading_deg = attitude_from_rotation(np.stack([-down, right, forward], axis=1))
-    return {"roll_deg": roll_deg, "pitch_deg": pitch_deg, "heading_deg": heading_deg}
+    forward, right, down = enu_from_body(gimbal_roll_deg, gimbal_pitch_deg, gimbal_yaw_deg).T
+    return attitude_from_rotation(np.stack([-down, right, forward], axis=1))
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -46,8 +46,10 @@ def refine(query: Query, tools: Tools, result: Result) -> Result:
     """The fix of a fine peak with its pose refined, where that is wanted, can be done and is affordable."""
     if not isinstance(result, Fix) or result.stage != "fine" or not tools.ncc.refine:
         return result
-    if not is_trusted(query.frame, tools.ncc):
-        return result  # the height that was found is not the frame's
+    if not is_trusted(query.frame, tools.ncc) or not query.site.has_surface:
+        return (
+            result  # the height that was found is not the frame's; a slope nobody knows would be taken for a tilt
+        )
     work_px = float(query.gray.size)
     if not query.watch.affords("dense", work_px):
         query.watch.give_up("dense", price=False)

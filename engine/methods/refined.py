@@ -42,8 +42,6 @@ def improve(query: Query, fix: Fix, samples: SampleMap, options: NccOptions) -> 
         samples: of the map.
         options: of the correlation.
     """
-    if not _told_tilt(query) and not query.site.has_surface:
-        return fix  # nothing tells a tilt from a slope of the ground
     belief = _belief(query, fix, options.errors)
     with query.watch.stage("dense"):
         fit = _through_levels(query, belief, samples, options)
@@ -114,8 +112,7 @@ def _belief(query: Query, fix: Fix, errors: AssumedErrors) -> Belief:
     ]
     about_body = np.radians([*tilts, errors.heading_deg]) ** -2.0
     precision[3:6, 3:6] = (mount.T * about_body) @ mount
-    slope_deg = errors.surface_slope_deg if query.site.has_surface else errors.unknown_slope_deg
-    precision[[6, 7], [6, 7]] = math.tan(math.radians(slope_deg)) ** -2.0
+    precision[[6, 7], [6, 7]] = math.tan(math.radians(errors.surface_slope_deg)) ** -2.0
     center = np.array([fix.east_m, fix.north_m, query.site.ground_m + height_m])
     return Belief(Pose(rotation, center, np.zeros(2)), precision)
 

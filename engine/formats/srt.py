@@ -1,0 +1,78 @@
+"""DJI's subtitles (.SRT): what a drone wrote beside its video, a cue a frame or a cue a second.
+
+Convention:
+    The clock is the video's, from its first frame. Both syntaxes are read: ``[latitude: ..] [longitude: ..]
+    [rel_alt: .. abs_alt: ..] [gb_yaw: ..]``, and ``GPS(lon, lat, ..) BAROMETER: ..`` or ``H ..m``. Heights
+    are above the place of take-off. The third number of GPS() is an altitude on some models and a count of
+    satellites on others, and is not read; nor is HOME().
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from engine.errors import TelemetryError
+from engine.formats.frames import nadir_attitude
+from engine.formats.resampling import Log, Series, make_log, make_position, make_series
+
+_NUMBER = r"([+-]?[0-9]{1,18}(?:\.[0-9]{1,18})?)"
+_TIME = r"([0-9]{1,3}):([0-9]{2}):([0-9]{2})[,.]([0-9]{3})"
+# Every repetition is bounded, so that no text, however made, takes more than a time in proportion to its length.
+_CUE = re.compile(rf"^[ \t]{{0,8}}{_TIME}[ \t]{{0,8}}-->[ \t]{{0,8}}{_TIME}.*$", re.MULTILINE)
+_PAIR = re.compile(rf"\b([A-Za-z_.]{{1,20}})[ \t]{{0,3}}[: ][ \t]{{0,3}}{_NUMBER}")
+_GPS = re.compile(rf"\bGPS ?\( ?{_NUMBER} ?, ?{_NUMBER} ?(?:,[^)]{{0,40}})?\)")
+_HEIGHT = re.compile(rf"\bBAROMETER ?: ?{_NUMBER}|\bH {_NUMBER} ?m\b")
+_MARKUP = re.compile(r"<[^>]{0,200}>")
+_ANGLES = ("gb_roll", "gb_pitch", "gb_yaw")
+
+
+def read_srt(path: Path) -> Log:
+    """Read the telemetry in a video's subtitles.
+
+    Raises:
+        TelemetryError: the file is no UTF-8 text, has no cues, or its cues tell nothing of a flight.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise TelemetryError(
+            f"{path}: expected subtitles as UTF-8 text, got the byte {error.object[error.start]:#04x}"
+        ) from None
+    starts = list(_CUE.finditer(text))
+    if not starts:
+        raise TelemetryError(f"{path}: expected subtitles with 00:00:00,000 --> 00:00:00,033, got none")
+    ends = [match.start() for match in starts[1:]] + [len(text)]
+    cues = [_values(text[match.end() : end]) for match, end in zip(starts, ends, strict=True)]
+    stamps_ns = [_time_ns(match) for match in starts]
+
+    def series(name: str) -> Series | None:
+        return make_series(stamps_ns, [cue.get(name, float("nan")) for cue in cues])
+
+    nan = [float("nan")] * len(cues)
+    lat_deg = [cue.get("latitude", none) for cue, none in zip(cues, nan, strict=True)]
+    lon_deg = [cue.get("longitude", none) for cue, none in zip(cues, nan, strict=True)]
+    angles = {name: series(name) for name in ("roll_deg", "pitch_deg", "heading_deg")}
+    known = angles | {"alt_amsl_m": series("abs_alt")} | make_position(stamps_ns, lat_deg, lon_deg)
+    return make_log(path, known, {"take-off": series("rel_alt")})
+
+
+def _time_ns(match: re.Match[str]) -> int:
+    hours, minutes, seconds, milliseconds = (int(part) for part in match.groups()[:4])
+    return (((hours * 60 + minutes) * 60 + seconds) * 1000 + milliseconds) * 1_000_000
+
+
+def _values(cue: str) -> dict[str, float]:
+    """Numbers of one cue by name, those of the older syntax under the names of the newer one."""
+    cue = _MARKUP.sub(" ", cue)
+    values = {key.lower(): float(value) for key, value in _PAIR.findall(cue)}
+    if "longtitude" in values:  # so written by some models
+        values["longitude"] = values["longtitude"]
+    if gps := _GPS.search(cue):
+        values["longitude"], values["latitude"] = float(gps.group(1)), float(gps.group(2))
+    if "rel_alt" not in values and (height := _HEIGHT.search(cue)):
+        values["rel_alt"] = float(height.group(1) or height.group(2))
+    if all(name in values for name in _ANGLES):
+        roll_deg, pitch_deg, heading_deg = nadir_attitude(*(values[name] for name in _ANGLES))
+        values |= {"roll_deg": roll_deg, "pitch_deg": pitch_deg, "heading_deg": heading_deg}
+    return values

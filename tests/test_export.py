@@ -1,0 +1,191 @@
+"""Tracks in other programs' formats, read back by other parsers: places, times, gaps, checksums, rounding."""
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from functools import reduce
+from operator import xor
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from engine.cli.app import run
+from engine.errors import TelemetryError
+from engine.formats import export
+from engine.formats.track import TrackRow, write_track
+
+T0 = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
+GPX = "{http://www.topografix.com/GPX/1/1}"
+KML = "{http://www.opengis.net/kml/2.2}"
+
+
+def fix(k, lat_deg=32.5, lon_deg=35.25, *, start_ns=T0, up_m=None):
+    return TrackRow(
+        timestamp_ns=None if start_ns is None else start_ns + k * 250_000_000,
+        frame=f"<{k}>&.png",
+        status="fix",
+        lat_deg=lat_deg + k * 1e-5,
+        lon_deg=lon_deg - k * 2e-5,
+        east_m=1.5 * k,
+        north_m=-0.5 * k,
+        up_m=up_m,
+        sigma_east_m=0.25,
+        sigma_north_m=0.5,
+        covariance_en_m2=0.01,
+        score=0.8,
+        method="ncc",
+    )
+
+
+def refusal(k):
+    return TrackRow(timestamp_ns=T0 + k * 250_000_000, frame=f"{k}.png", status="no_fix", reason="low_score")
+
+
+ROWS = [fix(0), fix(1), refusal(2), fix(3), refusal(4), refusal(5), fix(6), fix(7), fix(8)]
+
+
+def test_a_refusal_ends_a_segment():
+    assert [[row.frame for row in run] for run in export.segments(ROWS)] == [
+        ["<0>&.png", "<1>&.png"],
+        ["<3>&.png"],
+        ["<6>&.png", "<7>&.png", "<8>&.png"],
+    ]
+    assert export.segments([refusal(0)]) == []
+
+
+def test_the_180th_meridian_ends_a_segment_and_longitudes_stay_on_their_circle():
+    rows = [fix(0, lon_deg=179.9999), fix(0, lon_deg=180.0001), fix(0, lon_deg=-179.9998)]
+    assert [len(run) for run in export.segments(rows)] == [1, 2]
+    points = json.loads(export.to_geojson(rows))["features"][1:]
+    assert [p["geometry"]["coordinates"][0] for p in points] == pytest.approx([179.9999, -179.9999, -179.9998])
+
+
+def test_gpx_has_a_segment_a_run_and_its_elements_in_the_order_of_the_schema():
+    rows = [fix(0, up_m=12.5), fix(1, up_m=None), refusal(2), fix(3, up_m=-1.0)]
+    root = ElementTree.fromstring(export.to_gpx(rows))
+    assert (root.tag, root.attrib["version"]) == (f"{GPX}gpx", "1.1")
+    runs = root.findall(f"{GPX}trk/{GPX}trkseg")
+    assert [len(run) for run in runs] == [2, 1]
+    first, second = runs[0]
+    assert [child.tag.removeprefix(GPX) for child in first] == ["ele", "time", "name"]
+    assert [child.tag.removeprefix(GPX) for child in second] == ["time", "name"]
+    assert (first.attrib["lat"], first.attrib["lon"]) == ("32.500000000", "35.250000000")
+    assert [child.text for child in first] == ["12.500", "2023-11-14T22:13:20.000000Z", "<0>&.png"]
+    assert root.find(f"{GPX}trk")[0].tag == f"{GPX}name"
+
+
+def test_geojson_has_lines_of_two_points_or_more_and_every_fix_with_its_sigma():
+    line, *points = json.loads(export.to_geojson(ROWS))["features"]
+    assert line["geometry"]["type"] == "MultiLineString"
+    assert [len(part) for part in line["geometry"]["coordinates"]] == [2, 3]
+    assert [p["properties"]["frame"] for p in points] == [row.frame for row in ROWS if row.fixed]
+    for point, row in zip(points, (row for row in ROWS if row.fixed), strict=True):
+        assert point["geometry"]["coordinates"] == pytest.approx([row.lon_deg, row.lat_deg], abs=1e-9)
+        assert (point["properties"]["sigma_east_m"], point["properties"]["sigma_north_m"]) == (0.25, 0.5)
+        assert point["properties"]["timestamp_ns"] == row.timestamp_ns
+    assert all(f["geometry"]["type"] == "Point" for f in json.loads(export.to_geojson([fix(0)]))["features"])
+
+
+def test_kml_is_longitude_first_with_a_line_a_run():
+    root = ElementTree.fromstring(export.to_kml(ROWS))
+    lines = [e.text.split() for e in root.iterfind(f".//{KML}LineString/{KML}coordinates")]
+    assert [len(line) for line in lines] == [2, 3]
+    assert lines[0][0] == "35.250000000,32.500000000"
+    assert len(root.findall(f".//{KML}Folder/{KML}Placemark")) == 6
+    assert root.find(f".//{KML}when").text == "2023-11-14T22:13:20.000000Z"
+
+
+def test_tum_keeps_every_nanosecond_and_says_that_the_attitude_is_not_known():
+    rows = [fix(0, start_ns=T0 + 1, up_m=3.25), refusal(1), fix(2, start_ns=-600_000_000), fix(0, start_ns=5)]
+    head, *lines = export.to_tum(rows).splitlines()
+    assert head.startswith("#")
+    assert "quaternion is unity" in head
+    assert lines == [
+        "1700000000.000000001 0.0000 0.0000 3.2500 0 0 0 1",
+        "-0.100000000 3.0000 -1.0000 0.0000 0 0 0 1",
+        "0.000000005 0.0000 0.0000 0.0000 0 0 0 1",
+    ]
+    with pytest.raises(TelemetryError, match="timestamp_ns: expected a stamp for the format tum"):
+        export.to_tum([fix(0, start_ns=None)])
+
+
+def test_the_checksum_is_that_of_a_sentence_known_from_the_standards_example():
+    body = "GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
+    assert export.nmea_sentence(body) == f"${body}*47"
+
+
+def test_nmea_sentences_are_valid_and_a_refusal_is_void():
+    text = export.to_nmea([fix(0, -32.5, -35.25, up_m=7.125), refusal(1)])
+    assert text.endswith("\r\n")
+    sentences = text.split("\r\n")[:-1]
+    for sentence in sentences:
+        body, checksum = re.fullmatch(r"\$(.+)\*([0-9A-F]{2})", sentence).groups()
+        assert reduce(xor, body.encode()) == int(checksum, 16)
+        assert len(body.split(",")) == (15 if body.startswith("GPGGA") else 13)
+    assert sentences[0].startswith("$GPGGA,221320.00,3230.000000,S,03515.000000,W,1,00,,7.12,M,")
+    assert sentences[1].startswith("$GPRMC,221320.00,A,3230.000000,S,03515.000000,W,,,141123,,,A*")
+    assert sentences[2].startswith("$GPGGA,221320.25,,,,,0,00,,,")
+    assert sentences[3].startswith("$GPRMC,221320.25,V,,,,,,,141123,,,N*")
+
+
+def test_times_of_day_are_rounded_over_midnight_and_blank_without_utc():
+    before_midnight_ns = 1_700_006_399_998_000_000
+    gga, rmc = export.to_nmea([fix(0, start_ns=before_midnight_ns)]).split("\r\n")[:2]
+    assert gga.split(",")[1] == "000000.00"
+    assert (rmc.split(",")[1], rmc.split(",")[9]) == ("000000.00", "151123")
+    boot = [fix(0, start_ns=12_000_000_000), fix(0, start_ns=None)]
+    for sentence in export.to_nmea(boot).split("\r\n")[:-1]:
+        assert sentence.split(",")[1] == ""
+    assert "<time>" not in export.to_gpx(boot)
+    assert "<when>" not in export.to_kml(boot)
+
+
+def test_minutes_carry_into_degrees():
+    assert export.degrees_minutes(48.117300, 2) == "4807.038000"
+    assert export.degrees_minutes(59.99999 / 60, 2) == "0059.999990"
+    assert export.degrees_minutes((60 - 1e-8) / 60, 3) == "00100.000000"
+    assert export.degrees_minutes(9.9999999999, 3) == "01000.000000"
+
+
+@given(st.floats(-180, 180))
+def test_minutes_stay_below_sixty_and_read_back_to_two_millimetres(value_deg):
+    text = export.degrees_minutes(value_deg, 3)
+    degrees, minutes = int(text[:3]), float(text[3:])
+    assert minutes < 60
+    assert degrees + minutes / 60 == pytest.approx(abs(value_deg), abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", export.WRITERS)
+def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_path, capfd):
+    write_track(tmp_path / "track.csv", ROWS)
+    arguments = ["export", str(tmp_path), "--format", kind, "--json"]
+    assert run(arguments) == 0
+    told = json.loads(capfd.readouterr().out)
+    assert (told["fixes"], told["segments"]) == (6, 3)
+    written = tmp_path / f"track.{kind}"
+    assert written.stat().st_size > 100
+    written.write_text("mine")
+    assert run(arguments) == 2
+    assert "exists; choose another file, or add --force" in capfd.readouterr().err
+    assert written.read_text() == "mine"
+    assert run([*arguments, "--force"]) == 0
+    assert written.stat().st_size > 100
+
+
+def test_the_command_refuses_in_one_line(tmp_path, capfd):
+    def refused(*arguments):
+        code, error = run(["export", str(tmp_path), *arguments]), capfd.readouterr().err
+        assert len(error.splitlines()) == 1
+        return code, error
+
+    code, error = refused("--format", "gpx")
+    assert (code, "no such file" in error) == (1, True)
+    write_track(tmp_path / "track.csv", [refusal(0)])
+    code, error = refused("--format", "gpx")
+    assert (code, "expected a track with a fix, got 1 rows without" in error) == (1, True)
+    code, error = refused("--format", "shp")
+    assert (code, "--format: expected one of gpx, geojson, kml, tum, nmea, got 'shp'" in error) == (2, True)
+    write_track(tmp_path / "track.csv", ROWS)
+    code, error = refused("--format", "gpx", "--out", str(tmp_path / "none" / "x.gpx"))
+    assert (code, "cannot be written" in error) == (1, True)
