@@ -18,6 +18,7 @@ from bench.map_views import map_pairs
 from bench.scenes import flight
 from bench.views import Size, warped_pairs
 from engine import Fix, MatcherOptions, SceneMatcher, device
+from engine.methods.laid import NccOptions
 from engine.methods.sift import SiftOptions
 
 SIZES: list[Size] = [(150, 150), (300, 300), (640, 480)]
@@ -95,7 +96,8 @@ def test_features(benchmark: Any, peer: str, batch: int, size: Size, threads: in
 
 
 def _engine(method: str, profile: str = "engine", **sift: Any) -> SceneMatcher:
-    scene, options = flight(), MatcherOptions(profile=profile, sift=SiftOptions(**sift))
+    scene, peak = flight(), NccOptions(refine=False)
+    options = MatcherOptions(profile=profile, ncc=peak, sift=SiftOptions(**sift))
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", options)
     matcher.warmup()
     return matcher
