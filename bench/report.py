@@ -28,8 +28,8 @@ INTRO = (
     "results were shown to be the same, or where the quality of the results stands beside them: the peers' peaks "
     "lie on the same pixel, the score's error against the float64 reference stands beside its time, and so do the "
     "figures of the features. No GPU was measured. NCC is its peak alone here, without the dense refinement. "
-    "Table I with its tails and the trade-off of accuracy against budget are in [latency](latency.md), whole flights "
-    "by SIFT in [flights](flights.md)."
+    "Table I with its tails and the trade-off of accuracy against budget are in [latency](latency.md), whole "
+    "flights by SIFT in [flights](flights.md)."
 )
 
 
