@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test check bench bench-flights bench-latency clean
+.PHONY: demo test check bench integrity bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -36,6 +36,9 @@ bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks
 	$(BIN)/python -m pytest bench --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
 	$(BIN)/python -m bench.report .benchmarks/run.json
+
+integrity: $(VENV)/dev.stamp
+	$(BIN)/python -m bench.integrity
 
 bench-flights: $(VENV)/dev.stamp
 	$(BIN)/python -m bench.flights

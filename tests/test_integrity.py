@@ -64,7 +64,7 @@ def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
 
 
 def test_the_same_score_is_worth_more_over_a_larger_patch():
-    weak = peak(0.3, 0.2)
+    weak = peak(0.3, 0.1)
     assert judge_peak(weak, 4 * PIXELS, PeakRule(), whole_map=False) is None
     assert judge_peak(weak, PIXELS, PeakRule(), whole_map=False)[0] is Reason.LOW_SCORE
 

@@ -29,6 +29,7 @@ from engine import (
     Reason,
     SceneMatcher,
 )
+from engine.integrity import PeakRule
 from engine.methods import sift
 from engine.methods.ncc import NccOptions
 from engine.methods.sift import SiftOptions
@@ -632,3 +633,13 @@ def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, make_g
             places = fixes_m(site, ground.site.frame, camera, method, frames, priors)
             assert np.hypot(*(places - truth).mean(axis=0)) < 0.1, (method, name)
             assert np.hypot(*(places - truth).T).max() < most_m, (method, name)
+
+
+def test_a_place_that_contradicts_its_prior_must_vouch_for_itself(ground, camera, frame):
+    """Then the margin of a whole-map search is asked for; here one that no peak has."""
+    rule = PeakRule(min_margin_sigmas_whole_map=1e3)
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(rule=rule)))
+    assert isinstance(matcher.locate(frame, ground.prior(NADIR, sigma_m=2.0, off_m=(5.0, -4.0))), Fix)
+    refused = matcher.locate(frame, ground.prior(NADIR, sigma_m=2.0, off_m=(9.0, -8.0)))
+    assert isinstance(refused, NoFix)
+    assert refused.reason is Reason.AMBIGUOUS

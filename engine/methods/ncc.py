@@ -50,12 +50,20 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser:
         return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
     if query.watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
-    whole_map = query.prior is None
+    unexpected = query.prior is None or _off_prior(query, aligned, peak) > options.rule.max_prior_chi_square
     pixels = aligned.template.numel()
-    refusal = judge_peak(peak, pixels, options.rule, whole_map=whole_map, searched=not trusted)
+    refusal = judge_peak(peak, pixels, options.rule, whole_map=unexpected, searched=not trusted)
     if refusal is not None:
         return query.refuse(*refusal, METHOD, score=peak.score, window=window)
     return _fix(query, aligned, peak, window, options)
+
+
+def _off_prior(query: Query, aligned: Aligned, peak: Peak) -> float:
+    """Chi-square, of two degrees of freedom, of the place that the peak means against the prior."""
+    assert query.prior is not None
+    assert query.prior_px is not None
+    apart = query.jacobian @ (nadir_px(query, peak, aligned) - query.prior_px)
+    return float(apart @ apart) / query.prior.sigma_m**2
 
 
 def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions) -> Fix:
