@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
+from engine.evidence import Evidence, probability
 from engine.geo import transport_covariance
 from engine.types import Frame, Peak, Reason, check_positive
 
@@ -78,6 +79,7 @@ class PeakRule:
         min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
             another town, turned until they fit, look like these.
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
+        min_confidence: probability of :func:`engine.evidence.probability` below which a peak is not believed.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
@@ -88,6 +90,7 @@ class PeakRule:
     max_prior_chi_square: float = 18.4
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
+    min_confidence: float = 0.97
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 
@@ -119,6 +122,18 @@ def judge_peak(
         rival = f"a rival reaches {peak.second_score:.3f}"
         return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
     return None
+
+
+def judge_evidence(evidence: Evidence, rule: PeakRule) -> tuple[Reason, str] | None:
+    """The reason to refuse a peak that is not probable enough, with its figures, or None where it is believed."""
+    confidence = probability(evidence)
+    if confidence >= rule.min_confidence:
+        return None
+    figures = (
+        f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}, chi-square {evidence.off_prior:.1f}"
+    )
+    asked = f"{rule.min_confidence:g} is asked for"
+    return Reason.AMBIGUOUS, f"right with a probability of {confidence:.3f}, {asked} ({figures} from the prior)"
 
 
 def peak_covariance_px(peak: Peak, pixels: int) -> Array:

@@ -219,6 +219,8 @@ class Fix:
         map_xy_px: the camera's nadir in map pixels (x, y).
         stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "refined" in all of the
             pose, "verified" by both methods.
+        confidence: probability in (0, 1) that the place is right, where the method has one that is calibrated
+            (see ``docs/integrity.md``); None where it has none.
     """
 
     timestamp_ns: int | None
@@ -235,6 +237,7 @@ class Fix:
     timings: Timings
     map_xy_px: tuple[float, float]
     stage: str = "fine"
+    confidence: float | None = None
 
     @property
     def sigma_m(self) -> float:

@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from engine.integrity import judge_peak, ncc_covariance_m2, peak_covariance_px
+import numpy as np
+
+from engine.evidence import Evidence, evidence_of, probability
+from engine.integrity import judge_evidence, judge_peak, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.methods import bank
 from engine.methods.laid import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
 from engine.methods.query import Query, level_for
 from engine.prepared import PreparedMap
-from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
+from engine.types import Attitude, Fix, NoFix, Peak, Prior, Reason, Window
 
 
-def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Fix | NoFix:
-    """One frame to a fix by correlation; needs its height, and its heading or the time to search for it.
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A peak that is not judged yet.
 
-    Args:
-        query: the frame.
-        prepared: the map.
-        options: settings.
-        coarser: levels above the one whose pixels are like the frame's, for an answer that is quicker and cruder.
+    Attributes:
+        peak: in pixels of the aligned level.
+        aligned: the hypothesis that it belongs to.
+        fix: what the peak means, if it is believed.
+        trusted: neither heading nor height was searched for.
+        evidence: what speaks for it; None where more was searched than a window at one heading and height.
     """
+
+    peak: Peak
+    aligned: Aligned
+    fix: Fix
+    trusted: bool
+    evidence: Evidence | None
+
+
+def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Found | NoFix:
+    """The highest peak of one frame with its evidence, or a refusal where there is none. As :func:`locate`."""
     frame = query.frame
     if frame.height_agl_m is None:
         return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
@@ -50,20 +65,44 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser:
         return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
     if query.watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
-    unexpected = query.prior is None or _off_prior(query, aligned, peak) > options.rule.max_prior_chi_square
-    pixels = aligned.template.numel()
-    refusal = judge_peak(peak, pixels, options.rule, whole_map=unexpected, searched=not trusted)
+    fix = _fix(query, aligned, peak, window, options)
+    evidence = None
+    if trusted and query.prior is not None:
+        evidence = evidence_of(peak, score_sigma(aligned.template.numel()), _off_prior(query, query.prior, fix))
+    return Found(peak, aligned, fix, trusted, evidence)
+
+
+def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Fix | NoFix:
+    """One frame to a fix by correlation; needs its height, and its heading or the time to search for it.
+
+    Args:
+        query: the frame.
+        prepared: the map.
+        options: settings.
+        coarser: levels above the one whose pixels are like the frame's, for an answer that is quicker and cruder.
+    """
+    found = find(query, prepared, options, coarser=coarser)
+    if isinstance(found, NoFix):
+        return found
+    evidence, pixels = found.evidence, found.aligned.template.numel()
+    # A place that contradicts the prior is vouched for by the match alone, as on a search of the whole map.
+    unexpected = (
+        query.prior is None or _off_prior(query, query.prior, found.fix) > options.rule.max_prior_chi_square
+    )
+    refusal = judge_peak(found.peak, pixels, options.rule, whole_map=unexpected, searched=not found.trusted)
+    if refusal is None and evidence is not None:
+        refusal = judge_evidence(evidence, options.rule)
     if refusal is not None:
-        return query.refuse(*refusal, METHOD, score=peak.score, window=window)
-    return _fix(query, aligned, peak, window, options)
+        return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
+    return found.fix if evidence is None else replace(found.fix, confidence=probability(evidence))
 
 
-def _off_prior(query: Query, aligned: Aligned, peak: Peak) -> float:
-    """Chi-square, of two degrees of freedom, of the place that the peak means against the prior."""
-    assert query.prior is not None
+def _off_prior(query: Query, prior: Prior, fix: Fix) -> float:
+    """Chi-square, of two degrees of freedom, of a fix against the prior, by the errors of both."""
     assert query.prior_px is not None
-    apart = query.jacobian @ (nadir_px(query, peak, aligned) - query.prior_px)
-    return float(apart @ apart) / query.prior.sigma_m**2
+    apart = np.array([fix.east_m, fix.north_m]) - query.site.enu_from_pixel(query.prior_px)
+    allowed = fix.covariance_m2[:2, :2] + prior.sigma_m**2 * np.eye(2)
+    return float(apart @ np.linalg.solve(allowed, apart))
 
 
 def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions) -> Fix:
