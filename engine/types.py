@@ -9,7 +9,7 @@ import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -307,16 +307,3 @@ def check_positive(options: object, *names: str) -> None:
         value = getattr(options, name)
         if not (math.isfinite(value) and value > 0):
             raise OptionError(f"{name}: expected a number above 0, got {value}")
-
-
-def options_from_mapping(cls: type[Any], values: Mapping[str, Any]) -> Any:
-    """Build an options dataclass from names and values; an unknown name is refused by name.
-
-    Raises:
-        OptionError: a name is not an option of ``cls``.
-    """
-    known = list(cls.__dataclass_fields__)
-    for name in values:
-        if name not in known:
-            raise OptionError(f"{name}: not an option of {cls.__name__}; known are {', '.join(known)}")
-    return cls(**values)

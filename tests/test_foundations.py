@@ -37,7 +37,7 @@ from engine import (
 )
 from engine.budget import Deadline
 from engine.device import resolve, set_threads, synchronise
-from engine.types import Peak, options_from_mapping
+from engine.types import Peak
 
 IMAGE = np.zeros((4, 6), np.uint8)
 
@@ -284,14 +284,6 @@ def test_the_sigma_of_a_fix_is_the_longer_axis_of_its_ellipse():
 def test_reasons_are_an_enum_of_their_own_names():
     assert issubclass(Reason, enum.Enum)
     assert all(reason.value == reason.name.lower() for reason in Reason)
-
-
-def test_options_come_from_mappings_and_unknown_names_are_refused():
-    assert options_from_mapping(NavigatorOptions, {"growth": 1.2}) == NavigatorOptions(growth=1.2)
-    with pytest.raises(OptionError, match=r"^grwoth: not an option of NavigatorOptions; known are .*growth"):
-        options_from_mapping(NavigatorOptions, {"grwoth": 1.2})
-    with pytest.raises(OptionError, match=r"^growth: "):
-        options_from_mapping(NavigatorOptions, {"growth": 0.1})
 
 
 # Errors

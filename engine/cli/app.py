@@ -37,9 +37,6 @@ MethodOption = Annotated[
     str, typer.Option("--method", metavar="ncc|sift|auto", help="auto is ncc, and sift where ncc refuses.")
 ]
 DeviceOption = Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live.")]
-ProfileOption = Annotated[
-    str, typer.Option("--profile", metavar="engine|paper", help="paper is the paper's own recipe, the baseline.")
-]
 BudgetOption = Annotated[
     float | None,
     typer.Option("--budget-ms", metavar="MS", help="Time that one frame may take; later answers are refused."),
@@ -50,6 +47,10 @@ ThreadsOption = Annotated[
     int, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.", show_default=True)
 ]
 
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option("--settings", metavar="FILE", help="Settings from init; options given here count more."),
+]
 FirmwareOption = Annotated[
     str, typer.Option("--firmware", metavar="ardupilot|px4", help="What the autopilot runs.")
 ]
@@ -149,14 +150,25 @@ def track(
             "--truth", metavar="FILE", help="truth.csv, or a log; without it the one beside the telemetry."
         ),
     ] = None,
-    method: MethodOption = "ncc",
+    settings_path: SettingsOption = None,
+    method: Annotated[
+        str | None,
+        typer.Option("--method", metavar="ncc|sift|auto", help="ncc, unless the settings say otherwise."),
+    ] = None,
     start: Annotated[
         str | None,
         typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
     ] = None,
-    device: DeviceOption = "auto",
+    device: Annotated[
+        str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
+    ] = None,
     budget_ms: BudgetOption = None,
-    profile: ProfileOption = "engine",
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile", metavar="engine|paper", help="paper is the paper's own recipe; engine unless told."
+        ),
+    ] = None,
     threads: ThreadsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -166,15 +178,31 @@ def track(
     Writes track.csv (one row a frame), summary.json and figures into the output folder. Without --start the
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
-    from engine.cli.track import Inputs, Settings, run_track
+    from engine.cli.track import Inputs, run_track, settings_from
     from engine.formats.logs import LogClock
 
     _threads(threads)
     clock = LogClock(frame_stamps, log_offset) if frame_stamps is not None or log_offset else None
     inputs = Inputs(map_path, surface, camera, frames, telemetry, truth, clock)
-    settings = Settings(method=method, profile=profile, device=device, start=start, budget_ms=budget_ms)
+    settings = settings_from(
+        settings_path, method=method, profile=profile, device=device, start=start, budget_ms=budget_ms
+    )
     result = run_track(inputs, out, settings, force=force)
-    console.report(result, as_json, title=f"{method} ({profile} profile) on {frames}", out=out)
+    console.report(result, as_json, title=f"{settings.method} ({settings.profile} profile) on {frames}", out=out)
+
+
+@app.command()
+def init(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file.")] = Path("scenematch.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+) -> None:
+    """Settings file with every option.
+
+    Each with its unit, its default and what it means; track takes the file with --settings.
+    """
+    from engine.cli.init import run_init
+
+    run_init(out, force=force)
 
 
 @app.command()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,13 @@ from engine.cli.checks import check_needs, check_pictures, check_place
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.flight import Flight, FlightFrame, open_flight
 from engine.formats.logs import LogClock, is_log, open_truth
+from engine.formats.settings import changed, read_settings
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
 from engine.matcher import METHODS, PROFILES, MatcherOptions, SceneMatcher
-from engine.navigator import BELIEVE_ALL, Navigator
+from engine.methods.laid import NccOptions
+from engine.methods.sift import SiftOptions
+from engine.navigator import BELIEVE_ALL, Navigator, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from engine.report.figures import draw_figures
@@ -58,18 +61,32 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How a flight is followed, as the command line has it.
+    """How a flight is followed: all that a settings file holds.
+
+    Attributes:
+        method: "ncc", "sift" or "auto".
+        profile: "engine", or "paper" for the paper's own recipe, the baseline.
+        device: where tensors live: "auto", "cpu" or "cuda".
+        start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none takes the first
+            position of the telemetry, and where that has none the whole map is searched.
+        budget_ms: time that one frame may take, later answers are refused; none does not hurry.
+        ncc: settings of the NCC method.
+        sift: settings of the SIFT method.
+        navigator: how a position is carried from frame to frame; the paper's profile has none of it.
 
     Raises:
         OptionError: a name or a number is none of those that are expected.
         DeviceError: the device is missing.
     """
 
-    method: str
+    method: str = "ncc"
     profile: str = "engine"
     device: str = "auto"
     start: str | None = None
     budget_ms: float | None = None
+    ncc: NccOptions = field(default_factory=NccOptions)
+    sift: SiftOptions = field(default_factory=SiftOptions)
+    navigator: NavigatorOptions = field(default_factory=NavigatorOptions)
 
     def __post_init__(self) -> None:
         check_choice("--method", self.method, METHODS)
@@ -79,6 +96,16 @@ class Settings:
         parse_position("--start", self.start)
         parse_budget("--budget-ms", self.budget_ms)
         devices.resolve(self.device)
+
+
+def settings_from(path: Path | None, **given: Any) -> Settings:
+    """The settings of a file, or the defaults, with what the command line was given (not None) in their place.
+
+    Raises:
+        OptionError, OSError: see :func:`engine.formats.settings.read_settings`.
+    """
+    settings = Settings() if path is None else read_settings(path, Settings)
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True)
@@ -101,11 +128,13 @@ def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = Fa
     start, budget = parse_position("--start", settings.start), parse_budget("--budget-ms", settings.budget_ms)
     opened = _open(inputs, settings, start)
     site, flight = opened.site, opened.flight
-    options = MatcherOptions(profile=settings.profile)
+    options = MatcherOptions(profile=settings.profile, ncc=settings.ncc, sift=settings.sift)
     matcher = SceneMatcher(site, opened.camera, settings.method, settings.device, options)
     matcher.warmup()
     prepare_folder(out, force, OWNED)
-    navigator = Navigator(matcher, start, budget, BELIEVE_ALL if settings.profile == "paper" else None)
+    navigator = Navigator(
+        matcher, start, budget, BELIEVE_ALL if settings.profile == "paper" else settings.navigator
+    )
     what = f"{settings.method}, {settings.profile} profile"
     attitude = follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None)
     ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
@@ -156,6 +185,7 @@ def _record(inputs: Inputs, settings: Settings, opened: _Opened, device: str, gr
         "device": device,
         "start": settings.start,
         "budget_ms": settings.budget_ms,
+        "changed": changed(settings),
         "origin": {"lat_deg": opened.site.frame.lat_deg, "lon_deg": opened.site.frame.lon_deg},
         "ground_m": ground.ground_m,
         "ground_amsl_m": ground.ground_amsl_m,
