@@ -192,6 +192,53 @@ def track(
 
 
 @app.command()
+def compare(
+    map_path: MapOption,
+    camera: CameraOption,
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR|VIDEO", help="Folder of pictures, or a video.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
+    telemetry: Annotated[
+        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
+    ] = None,
+    surface: SurfaceOption = None,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", metavar="FILE", help="truth.csv; else the one beside the telemetry.")
+    ] = None,
+    runs: Annotated[
+        list[str] | None,
+        typer.Option("--run", metavar="METHOD[/PROFILE]|FILE", help="Once a run; without it the paper's Table I."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
+    ] = None,
+    budget_ms: BudgetOption = None,
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Several methods or settings over one flight.
+
+    Follows the flight once a run, each into a folder of its own as track does, and tells them apart in one table
+    and one chart.
+    """
+    from engine.cli.compare import parse_runs, print_comparison, run_compare
+    from engine.cli.track import Inputs
+
+    _threads(threads)
+    wanted = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
+    results = run_compare(Inputs(map_path, surface, camera, frames, telemetry, truth), out, wanted, force=force)
+    if as_json:
+        console.print_json(results)
+    else:
+        print_comparison(results, str(frames))
+        console.say(f"written to {out}")
+
+
+@app.command()
 def init(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file.")] = Path("scenematch.toml"),
     force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,

@@ -1,0 +1,89 @@
+"""compare: several runs over one flight, in one table and one chart."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from engine import OptionError
+from engine.cli.app import run
+from engine.cli.compare import USUAL, parse_runs
+from engine.cli.demo import write_flight
+from engine.formats.track import read_track
+from engine.report.comparison import draw_comparison
+from engine.sim import plan_flight
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare") / "flight"
+    write_flight(folder, plan_flight(frames=4))
+    return folder
+
+
+def command(flight, out, *more):
+    names = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames"}
+    files = [f"--{option}={flight / name}" for option, name in names.items()]
+    return ["compare", *files, f"--telemetry={flight / 'telemetry.csv'}", f"--out={out}", *more]
+
+
+def picture(path):
+    with Image.open(path) as opened:
+        return np.asarray(opened)
+
+
+def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
+    (tmp_path / "few.toml").write_text('method = "sift"\n[sift]\nmax_keypoints = 120\n', encoding="utf-8")
+    out, runs = tmp_path / "out", ["--run=ncc", "--run=sift/paper", f"--run={tmp_path / 'few.toml'}"]
+    assert run(command(flight, out, *runs)) == 0
+    printed = capsys.readouterr().out
+    table = json.loads((out / "table.json").read_text(encoding="utf-8"))
+    assert list(table) == ["ncc", "sift-paper", "few"]
+    assert table["few"]["settings"]["changed"] == {"method": "sift", "sift.max_keypoints": 120}
+    for name, summary in table.items():
+        assert name in printed
+        assert summary == json.loads((out / name / "summary.json").read_text(encoding="utf-8"))
+        assert len(read_track(out / name / "track.csv")) == summary["frames"] == 4
+    assert f"{table['ncc']['rms_m']:.2f}" in printed
+    assert picture(out / "comparison.png").shape[1] > 500
+
+    assert run(command(flight, out, "--run=ncc")) == 2
+    assert "--force" in capsys.readouterr().err
+    assert run(command(flight, out, "--run=sift", "--force", "--json")) == 0
+    assert list(json.loads(capsys.readouterr().out)) == ["sift"]
+
+
+def test_the_usual_runs_are_table_one():
+    assert [run.name for run in parse_runs([])] == ["ncc-paper", "ncc-engine", "sift-paper", "sift-engine"]
+    assert len(USUAL) == 4
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        (["orb"], "--run: expected ncc, sift, auto, one of them with /paper, or a settings file, got 'orb'"),
+        (["ncc", "ncc"], "--run: expected runs of different names, got 'ncc' twice"),
+        (["ncc/fast"], "--profile: expected one of engine, paper, got 'fast'"),
+        (["auto/paper"], "--method: expected ncc or sift with --profile paper, got 'auto'"),
+    ],
+)
+def test_a_run_that_cannot_be_is_refused(runs, message):
+    with pytest.raises(OptionError) as caught:
+        parse_runs(runs)
+    assert str(caught.value) == message
+
+
+def test_what_the_command_line_gives_holds_for_every_run(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("budget_ms = 40\n", encoding="utf-8")
+    runs = parse_runs(["ncc", str(path)], budget_ms=121.0, start=None)
+    assert [run.settings.budget_ms for run in runs] == [121.0, 121.0]
+
+
+def test_a_chart_without_truth_and_without_a_single_fix(flight, tmp_path):
+    out = tmp_path / "late"
+    assert run(command(flight, out, "--run=ncc", "--budget-ms=0.001")) == 0
+    rows = read_track(out / "ncc" / "track.csv")
+    draw_comparison(tmp_path / "none.png", {"ncc": rows}, None)
+    assert picture(tmp_path / "none.png").std() > 0
