@@ -1,10 +1,10 @@
-# make demo | test | check | bench | bench-flights | bench-latency: each sets itself up in .venv and is quick the second time.
+# make demo | test | check | package | bench | bench-flights | bench-latency: each sets itself up in .venv and is quick the second time.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test check bench integrity bench-flights bench-latency clean
+.PHONY: demo test check package bench integrity bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -31,6 +31,14 @@ check: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The wheel as a stranger gets it: built, installed beside nothing else, and flown from another folder.
+package: $(VENV)/dev.stamp
+	rm -rf dist build/clean build/flown
+	$(BIN)/python -m build --outdir dist .
+	$(PYTHON) -m venv build/clean
+	build/clean/bin/pip --disable-pip-version-check install --quiet dist/*.whl
+	cd build && clean/bin/scenematch doctor && clean/bin/scenematch demo --frames 4 --out flown
 
 bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks
