@@ -21,7 +21,8 @@ from engine.sim import (
     plan_flight,
     render_frame,
 )
-from engine.sim.render import LIGHTS, grid_from_enu, sun_visibility, transformer
+from engine.sim.light import LIGHTS, sun_visibility
+from engine.sim.render import grid_from_enu, transformer
 from engine.sim.vehicle import STEP_S, fly, leg_accelerations
 from engine.types import Attitude
 

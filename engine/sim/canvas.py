@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.sim.render import Array, Float32, Image, Light, box_sides
+from engine.sim.light import Array, Float32, Image, Light, box_sides
 
 Colour = tuple[float, float, float]
 GRASS, ASPHALT, PAVING, ROOF, CROP, WATER, CANOPY = range(7)

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import LocalFrame
-from engine.sim.render import Sensor, render_frame, transformer
-from engine.sim.town import GROUND_AMSL_M, Town, build_town, generator
-from engine.sim.vehicle import FlightStyle, Motion, SensorNoise, fly, measure
+from engine.sim.conditions import Condition
+from engine.sim.light import Image
+from engine.sim.optics import Optics, Sensor, Sway, take_picture
+from engine.sim.render import transformer
+from engine.sim.town import Town, build_town, generator
+from engine.sim.vehicle import STEP_S, FlightStyle, Motion, SensorNoise, fly, measure
 from engine.types import Attitude, Frame, Truth
 
 Array = NDArray[np.float64]
@@ -37,6 +40,46 @@ DRONE_SENSOR = Sensor(
 """The drone's camera: cooler and harder than the map's."""
 
 
+def grid_at(town: Town, origin: LocalFrame, east_north_m: Array) -> tuple[float, float]:
+    """Easting and northing in the town's CRS of a place (2,) or (3,) in the local frame."""
+    lat, lon = origin.geodetic_from_enu(float(east_north_m[0]), float(east_north_m[1]))
+    easting, northing = transformer(town.crs_epsg).transform(float(lon), float(lat))
+    return easting, northing
+
+
+def picture_at(
+    town: Town,
+    camera: Camera,
+    origin: LocalFrame,
+    east_north_up_m: Array,
+    attitude: Attitude,
+    rng: np.random.Generator,
+    *,
+    sensor: Sensor | None = None,
+    optics: Optics | None = None,
+    sway: Sway | None = None,
+) -> Image:
+    """The picture (H, W, 3) RGB that a camera at a place delivers.
+
+    Args:
+        town: what it looks at.
+        camera: intrinsics and mount.
+        origin: of the local east-north-up frame.
+        east_north_up_m: (3,) the camera's place in it, up above the world's height 0.
+        attitude: of the body, about true north.
+        rng: of the sensor's noise and exposure.
+        sensor: how light becomes grey levels; None takes the drone's, as it is in the town's condition.
+        optics: exposure time, shutter and gain; None is an ideal camera.
+        sway: motion while the picture is taken.
+
+    Raises:
+        OptionError: the camera looks above the horizon, or is not above the highest roof.
+    """
+    grid, up = grid_at(town, origin, east_north_up_m), float(east_north_up_m[2])
+    sensor = sensor or town.condition.sensor(DRONE_SENSOR)
+    return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, optics=optics, sway=sway)
+
+
 @dataclass(frozen=True)
 class Plan:
     """A flight before its pictures are drawn.
@@ -44,11 +87,13 @@ class Plan:
     Attributes:
         town: what it flies over.
         camera: what it looks through.
-        origin: of the local east-north-up frame of its motions: the map's centre.
+        origin: of the local east-north-up frame of its motions: the map's centre; up from the world's height 0.
         truth: the exact motion, one entry a frame.
         telemetry: the same as the sensors have it.
         timestamps_ns: capture times.
         seed: of the camera's noise.
+        optics: what else happens in the camera; None is nothing.
+        sways: motion while each picture is taken, where the optics show it.
     """
 
     town: Town
@@ -58,6 +103,8 @@ class Plan:
     telemetry: Motion
     timestamps_ns: tuple[int, ...]
     seed: int
+    optics: Optics | None = None
+    sways: tuple[Sway, ...] = ()
 
     def __len__(self) -> int:
         return len(self.timestamps_ns)
@@ -70,21 +117,22 @@ class Plan:
 
     def _frame(self, k: int, rng: np.random.Generator) -> Frame:
         truth, told = self.truth, self.telemetry
-        east, north, up = truth.position_m[k]
-        lat, lon = self.origin.geodetic_from_enu(east, north)
-        grid = transformer(self.town.crs_epsg).transform(float(lon), float(lat))
         attitude = Attitude(float(truth.roll_deg[k]), float(truth.pitch_deg[k]), float(truth.heading_deg[k]))
-        seen = render_frame(self.town.world, self.camera, grid, float(up), attitude)
+        place, sway = truth.position_m[k], self.sways[k] if self.sways else None
         return Frame(
-            DRONE_SENSOR.develop(seen, rng),
+            picture_at(self.town, self.camera, self.origin, place, attitude, rng, optics=self.optics, sway=sway),
             timestamp_ns=self.timestamps_ns[k],
-            height_agl_m=float(told.position_m[k, 2]),
+            height_agl_m=float(told.position_m[k, 2]) - self._ground_m(k),
             heading_deg=float(told.heading_deg[k]),
             roll_deg=float(told.roll_deg[k]),
             pitch_deg=float(told.pitch_deg[k]),
             east_velocity_mps=float(told.velocity_mps[k, 0]),
             north_velocity_mps=float(told.velocity_mps[k, 1]),
         )
+
+    def _ground_m(self, k: int) -> float:
+        """The bare ground below the vehicle, above the world's height 0."""
+        return self.town.world.ground_at(grid_at(self.town, self.origin, self.truth.position_m[k]))
 
     def truth_rows(self) -> list[Truth]:
         """Where the camera really was, one row a frame."""
@@ -95,8 +143,8 @@ class Plan:
                 timestamp_ns=stamp,
                 lat_deg=float(lat[k]),
                 lon_deg=float(lon[k]),
-                alt_amsl_m=GROUND_AMSL_M + float(motion.position_m[k, 2]),
-                height_agl_m=float(motion.position_m[k, 2]),
+                alt_amsl_m=self.town.datum_amsl_m + float(motion.position_m[k, 2]),
+                height_agl_m=float(motion.position_m[k, 2]) - self._ground_m(k),
                 roll_deg=float(motion.roll_deg[k]),
                 pitch_deg=float(motion.pitch_deg[k]),
                 heading_deg=float(motion.heading_deg[k]),
@@ -147,6 +195,21 @@ def _check_frames(frames: int | None, rate_hz: float) -> None:
         raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
 
 
+def _sways(motion: Motion, time_s: Array) -> tuple[Sway, ...]:
+    """Velocity and turn at each time, from the motion a hundredth of a second before and after."""
+    before, now, after = (motion.at(time_s + step) for step in (-STEP_S, 0.0, STEP_S))
+
+    def rate(ends: tuple[Array, Array]) -> Array:
+        return ((ends[1] - ends[0] + 180.0) % 360.0 - 180.0) / (2.0 * STEP_S)
+
+    angles = ("roll_deg", "pitch_deg", "heading_deg")
+    turns = np.column_stack([rate((getattr(before, name), getattr(after, name))) for name in angles])
+    return tuple(
+        Sway((float(v[0]), float(v[1]), float(v[2])), (float(w[0]), float(w[1]), float(w[2])))
+        for v, w in zip(now.velocity_mps, turns, strict=True)
+    )
+
+
 def plan_flight(
     seed: int = 1,
     *,
@@ -157,6 +220,12 @@ def plan_flight(
     style: FlightStyle | None = None,
     town: Town | None = None,
     camera: Camera | None = None,
+    condition: str | Condition | None = None,
+    map_condition: str | Condition = "noon",
+    relief_m: float = 0.0,
+    river: bool = False,
+    changed: float = 0.0,
+    optics: Optics | None = None,
 ) -> Plan:
     """Plan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
 
@@ -164,27 +233,46 @@ def plan_flight(
         seed: of town, path, sensors and camera.
         frames: how many, from take-off on; None flies to the end (about 150).
         rate_hz: frames per second.
-        light: of the frames, "noon" or "evening"; ignored where a town is given.
+        light: of the frames, "noon" or "evening".
         noise: of the telemetry; None takes the defaults, as for the style.
         style: of flying.
-        town: to fly over; None builds the seed's.
+        town: to fly over; None builds the seed's. Light, conditions, relief and river are of one that is built.
         camera: None takes the paper's, 300 x 300 px with 60 degrees.
+        condition: of the frames, in place of the light: see :func:`engine.sim.build_town`.
+        map_condition: of the map.
+        relief_m: height of the hills. The flight keeps its height above the ground where it begins.
+        river: whether one crosses the town.
+        changed: share of the houses that the map and the flight do not have in common.
+        optics: exposure time, shutter and gain of the camera; None is an ideal one.
 
     Raises:
         OptionError: an argument is out of range, or the map is too small for the height.
     """
     _check_frames(frames, rate_hz)
     style, camera = style or FlightStyle(), camera or Camera.from_fov(300, 300, 60.0)
-    town = town or build_town(seed, light=light)
+    town = town or build_town(
+        seed,
+        light=light,
+        condition=condition,
+        map_condition=map_condition,
+        relief_m=relief_m,
+        river=river,
+        changed=changed,
+    )
     rng = generator(seed, 0xF1)
+    middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
+    lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
+    origin = LocalFrame(lat, lon)
     motion = fly(_waypoints(town, camera, style.height_agl_m, rng), style, rng)
+    motion.position_m[:, 2] += town.world.ground_at(grid_at(town, origin, motion.position_m[0]))
     count = int(motion.time_s[-1] * rate_hz) + 1
     stamps = np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz).astype(np.int64)
     truth = motion.at(stamps * 1e-9)
-    middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
-    lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
     told = measure(truth, noise or SensorNoise(), generator(seed, 0x5E))
-    return Plan(town, camera, LocalFrame(lat, lon), truth, told, tuple((START_NS + stamps).tolist()), seed)
+    sways = () if optics is None else _sways(motion, stamps * 1e-9)
+    return Plan(
+        town, camera, origin, truth, told, tuple((START_NS + stamps).tolist()), seed, optics=optics, sways=sways
+    )
 
 
 def paper_flight(
@@ -197,15 +285,34 @@ def paper_flight(
     style: FlightStyle | None = None,
     town: Town | None = None,
     camera: Camera | None = None,
+    condition: str | Condition | None = None,
+    map_condition: str | Condition = "noon",
+    relief_m: float = 0.0,
+    river: bool = False,
+    changed: float = 0.0,
+    optics: Optics | None = None,
 ) -> SimulatedFlight:
     """Fly the paper's flight and draw it; the arguments and errors are those of :func:`plan_flight`."""
     plan = plan_flight(
-        seed, frames=frames, rate_hz=rate_hz, light=light, noise=noise, style=style, town=town, camera=camera
+        seed,
+        frames=frames,
+        rate_hz=rate_hz,
+        light=light,
+        noise=noise,
+        style=style,
+        town=town,
+        camera=camera,
+        condition=condition,
+        map_condition=map_condition,
+        relief_m=relief_m,
+        river=river,
+        changed=changed,
+        optics=optics,
     )
+    day = light if condition is None else condition if isinstance(condition, str) else "a day of your own"
     names = [f"frame_{k:06d}.png" for k in range(len(plan))]
     height = (style or FlightStyle()).height_agl_m
     description = (
-        f"Simulated town (seed {seed}, {light}): "
-        f"{len(plan)} frames at {rate_hz:g} Hz from {height:g} m above ground"
+        f"Simulated town (seed {seed}, {day}): {len(plan)} frames at {rate_hz:g} Hz from {height:g} m above ground"
     )
     return SimulatedFlight(plan.town, plan.camera, list(plan.iter_frames()), plan.truth_rows(), names, description)

@@ -1,4 +1,4 @@
-"""What a world looks like: sun, shadows, and the picture that a camera takes of a height field.
+"""The picture that an ideal camera takes of a world: rays against a height field, the air and water between.
 
 Convention:
     A world is a raster seen from straight above: colour and height of the highest surface at every pixel.
@@ -9,7 +9,6 @@ Convention:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
@@ -21,60 +20,41 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError, ShapeError
 from engine.geo import LocalFrame, enu_from_body
+from engine.sim.light import Array, Float32, Image, Light
 from engine.types import Attitude
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 LAYER_M = 1.0
 """Height step of the search for the first surface that a ray meets; narrower things may be missed."""
+SLOPE_VARIANCE, GLINT = 0.02, 0.9
+"""Variance of the slopes of ripples in a light breeze, and how bright the sun is where all facets mirror it."""
 FLOOR_M = 3.0
 """Height of one storey: the pitch of the rows of windows."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Light:
-    """A sun and a sky.
+@dataclass(frozen=True)
+class Air:
+    """Air that is looked through: a contrast fades by exp(-3.912 d / visibility) (Koschmieder).
 
     Attributes:
-        azimuth_deg: where the sun stands, clockwise from the raster's up direction.
-        elevation_deg: above the horizon.
-        sun_rgb: strength of the sun on a surface that faces it.
-        sky_rgb: strength of the light that reaches shadows too.
+        visibility_m: distance at which 2 % of a contrast is left.
+        rgb: the air's own colour in grey levels.
     """
 
-    azimuth_deg: float
-    elevation_deg: float
-    sun_rgb: tuple[float, float, float]
-    sky_rgb: tuple[float, float, float]
-
-    @property
-    def towards_sun(self) -> tuple[float, float, float]:
-        """Unit vector to the sun in raster axes: right, down the picture, up."""
-        azimuth, elevation = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
-        flat = math.cos(elevation)
-        return flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)
+    visibility_m: float
+    rgb: tuple[float, float, float]
 
 
-LIGHTS = {
-    "noon": Light(azimuth_deg=158.0, elevation_deg=52.0, sun_rgb=(0.80, 0.78, 0.74), sky_rgb=(0.34, 0.37, 0.42)),
-    "evening": Light(
-        azimuth_deg=262.0, elevation_deg=17.0, sun_rgb=(1.05, 0.76, 0.46), sky_rgb=(0.25, 0.28, 0.36)
-    ),
-}
-"""The lights that a flight can be flown in."""
+@dataclass(frozen=True, eq=False)
+class Glint:
+    """The sun on water: facets of ripples that mirror it to the lens (Cox and Munk's Gaussian slopes).
 
-
-def light_by_name(name: str) -> Light:
-    """The light of that name.
-
-    Raises:
-        OptionError: there is none.
+    Attributes:
+        light: whose sun it is.
+        water: (H, W) above 0 where there is water.
     """
-    if name not in LIGHTS:
-        raise OptionError(f"light: expected one of {', '.join(LIGHTS)}, got {name!r}")
-    return LIGHTS[name]
+
+    light: Light
+    water: Image
 
 
 @dataclass(frozen=True)
@@ -84,9 +64,13 @@ class World:
     Attributes:
         rgb: (H, W, 3) colours as seen from above, light and shadows included.
         sides: (H, W, 4) colour of the vertical face next to a pixel; the fourth is 255 in columns of windows.
-        height_m: (H, W) of the highest surface, 0 on the ground, never below.
+        height_m: (H, W) of the highest surface above the world's height 0, never below; 0 on flat ground.
         pixel_to_crs: (2, 3) affine from pixels (x, y), centres at integers, to the projected CRS.
         crs_epsg: code of that CRS.
+        ground_m: (H, W) of the bare ground where it is not flat at 0.
+        air: what is looked through; None is perfectly clear.
+        glint: the sun on water; None has none.
+        gsd_m_per_px: a pixel in grid metres.
 
     Raises:
         ShapeError: the rasters do not fit together.
@@ -97,124 +81,37 @@ class World:
     height_m: Float32
     pixel_to_crs: Array
     crs_epsg: int
+    ground_m: Float32 | None = None
+    air: Air | None = None
+    glint: Glint | None = None
     gsd_m_per_px: float = field(init=False)
 
     def __post_init__(self) -> None:
         size, rgb, sides = self.height_m.shape, self.rgb.shape, self.sides.shape
         if len(size) != 2 or rgb != (*size, 3) or sides != (*size, 4):
             raise ShapeError(f"world: expected (H, W, 3), (H, W, 4) and (H, W), got {rgb}, {sides} and {size}")
+        water = None if self.glint is None else self.glint.water
+        for name, raster in (("ground_m", self.ground_m), ("water", water)):
+            if raster is not None and raster.shape != size:
+                raise ShapeError(f"{name}: expected {size} as the heights, got {raster.shape}")
         if self.pixel_to_crs.shape != (2, 3):
             raise ShapeError(f"pixel_to_crs: expected (2, 3), got {self.pixel_to_crs.shape}")
         area = abs(float(np.linalg.det(self.pixel_to_crs[:, :2])))
         object.__setattr__(self, "gsd_m_per_px", math.sqrt(area))
+
+    def ground_at(self, grid_m: tuple[float, float]) -> float:
+        """Height of the bare ground at (easting, northing), of the nearest pixel; beyond the edge, the edge's."""
+        if self.ground_m is None:
+            return 0.0
+        xy = np.linalg.inv(self.pixel_to_crs[:, :2]) @ (np.asarray(grid_m) - self.pixel_to_crs[:, 2])
+        x, y = xy.astype(np.float32)[:, None]
+        return float(_nearest(self.ground_m, x, y)[0])
 
     @cached_property
     def _coarse_height(self) -> tuple[Image, float]:
         """Heights in whole units of a byte, and that unit in metres: what the layer search reads."""
         unit = max(float(self.height_m.max()), 1e-3) / 254.0
         return np.ceil(self.height_m / np.float32(unit)).astype(np.uint8), unit
-
-
-def sun_visibility(height_m: Float32, gsd_m_per_px: float, light: Light) -> Float32:
-    """Share of the sun that reaches every pixel (H, W), in [0, 1].
-
-    The raster is turned until light travels along its rows; the shadow's height is then a running maximum of
-    the heights less the sun's descent, which one pass finds exactly for any length of shadow.
-    """
-    h, w = height_m.shape
-    east, down, up = light.towards_sun
-    flat = math.hypot(east, down)
-    along = np.array([-east / flat, -down / flat])
-    turn = np.array([along, [-along[1], along[0]]])
-    corners = turn @ np.array([[0, w, 0, w], [0, 0, h, h]], float)
-    low = corners.min(axis=1)
-    size = np.ceil(corners.max(axis=1) - low).astype(int) + 1
-    matrix = np.hstack([turn, -low[:, None]])
-    turned: Any = cv2.warpAffine(height_m, matrix, (int(size[0]), int(size[1])), flags=cv2.INTER_NEAREST)
-    descent = np.arange(size[0], dtype=np.float32) * np.float32(gsd_m_per_px * up / flat)
-    turned += descent
-    np.maximum.accumulate(turned, axis=1, out=turned)
-    turned -= descent
-    shadow: Any = cv2.warpAffine(turned, matrix, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    # Half a metre of blur in height stands for the sun's disc and keeps roofs from shadowing themselves.
-    return np.asarray(np.clip(1.3 - 2.0 * (shadow - height_m), 0.0, 1.0), dtype=np.float32)
-
-
-def illuminate(albedo: Image, height_m: Float32, gsd_m_per_px: float, light: Light) -> Image:
-    """Colours (H, W, 3) of a height field under a light: Lambert shading, cast shadows, sky."""
-    step = 1.0 / (2.0 * gsd_m_per_px)
-    kernel = np.array([[-step, 0.0, step]], np.float32)
-    slope_x = np.clip(cv2.filter2D(height_m, cv2.CV_32F, kernel), -1.5, 1.5)
-    slope_y = np.clip(cv2.filter2D(height_m, cv2.CV_32F, kernel.T), -1.5, 1.5)
-    east, down, up = (np.float32(v) for v in light.towards_sun)
-    facing = (up - east * slope_x - down * slope_y) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    sun = np.maximum(facing, np.float32(0.0)) * sun_visibility(height_m, gsd_m_per_px, light)
-    lit = np.empty_like(albedo)
-    for channel in range(3):
-        strength = sun * np.float32(light.sun_rgb[channel]) + np.float32(light.sky_rgb[channel])
-        lit[..., channel] = np.clip(albedo[..., channel] * strength, 0.0, 255.0)
-    return lit
-
-
-def box_sides(
-    ab_m: tuple[Array, Array], size_m: tuple[float, float], axis: Array, wall: Sequence[float], light: Light
-) -> Image:
-    """Colours (H, W, 4) of a box's walls as :attr:`World.sides` has them, each given to the pixels nearest it.
-
-    Args:
-        ab_m: offsets (H, W) of the pixels from the box's centre along its length and its width.
-        size_m: length and width.
-        axis: (2,) direction of the length in raster axes.
-        wall: (3,) RGB of the plaster.
-        light: what falls on it; walls in the shadow of others are not darkened.
-    """
-    a, b = ab_m
-    end = size_m[0] / 2 - np.abs(a) < size_m[1] / 2 - np.abs(b)
-    side = np.where(end, np.where(a > 0, 0, 2), np.where(b > 0, 1, 3))
-    across = np.array([-axis[1], axis[0]])
-    facing = np.maximum(np.array([axis, across, -axis, -across]) @ light.towards_sun[:2], 0.0)
-    strength = facing[:, None] * np.array(light.sun_rgb) + 0.9 * np.array(light.sky_rgb)
-    shades = np.column_stack([np.minimum(np.asarray(wall) * strength, 250.0), np.zeros(4)])
-    sides = shades[side].astype(np.uint8)
-    sides[..., 3] = np.where(np.mod(np.where(end, b, a), 2.6) < 1.3, 255, 0)
-    return sides
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensor:
-    """How a camera turns light into grey levels.
-
-    Attributes:
-        gamma: exponent of the response.
-        balance_rgb: gain of each channel.
-        haze: grey levels added everywhere.
-        vignette: share of light lost in the corners.
-        exposure_sd: standard deviation of the exposure from picture to picture, as a share.
-        blur_px: standard deviation of the lens's blur.
-        noise_sd: standard deviation of the noise in grey levels.
-    """
-
-    gamma: float
-    balance_rgb: tuple[float, float, float]
-    haze: float
-    vignette: float
-    exposure_sd: float
-    blur_px: float
-    noise_sd: float
-
-    def develop(self, seen: Image, rng: np.random.Generator) -> Image:
-        """The picture (H, W, 3) that this sensor takes of an ideal one."""
-        h, w = seen.shape[:2]
-        y, x = np.ogrid[:h, :w]
-        far = ((x - (w - 1) / 2) ** 2 + (y - (h - 1) / 2) ** 2) * (4.0 / (w**2 + h**2))
-        gain = ((1.0 - self.vignette * far) * (1.0 + self.exposure_sd * rng.standard_normal())).astype(np.float32)
-        response = (255.0 * (np.arange(256) / 255.0) ** self.gamma).astype(np.float32)
-        picture: Any = cv2.GaussianBlur(response[seen], (0, 0), self.blur_px)
-        picture *= gain[..., None] * np.array(self.balance_rgb, np.float32)
-        picture += np.float32(self.noise_sd) * rng.standard_normal(picture.shape, np.float32) + np.float32(
-            self.haze
-        )
-        return np.asarray(np.clip(np.rint(picture), 0, 255), dtype=np.uint8)
 
 
 @lru_cache(maxsize=8)
@@ -332,10 +229,57 @@ def _refine(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, ste
 def _wall_colours(world: World, x: Float32, y: Float32, z_m: Float32) -> Image:
     """Colours (N, 3) of points on vertical faces: plaster darkening towards the street, rows of windows."""
     sides = _nearest(world.sides, x, y)
+    if world.ground_m is not None:
+        z_m = np.maximum(z_m - _nearest(world.ground_m, x, y), np.float32(0.0))
     storey = np.mod(z_m, np.float32(FLOOR_M))
     window = (sides[:, 3] > 0) & (storey > 0.9) & (storey < 2.3)
     shade = np.where(window, np.float32(0.45), np.float32(0.78) + np.minimum(z_m, 8.0) * np.float32(0.0275))
     return (sides[:, :3] * shade[:, None]).astype(np.uint8)
+
+
+def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tuple[Float32, Float32]) -> None:
+    """Let the sun flash on water, in place.
+
+    Args:
+        picture: (H, W, 3) to be changed.
+        glint: sun and water.
+        x: (H, W) columns of the world that are seen.
+        y: (H, W) rows of it.
+        toward: metres (H, W) right and down that each ray travels per metre of height, seen from the lens.
+    """
+    where = _nearest(glint.water, x, y) > 0
+    if not where.any():
+        return
+    right, down = (component[where] for component in toward)
+    length = np.sqrt(right**2 + down**2 + np.float32(1.0))
+    # The facet that mirrors the sun to the lens lies halfway between both directions.
+    half = [-right / length, -down / length, 1.0 / length]
+    half = [part + np.float32(sun) for part, sun in zip(half, glint.light.towards_sun, strict=True)]
+    slope = (half[0] ** 2 + half[1] ** 2) / half[2] ** 2
+    flash = np.exp(-slope / np.float32(SLOPE_VARIANCE)) * np.float32(GLINT)
+    lit = picture[where] + flash[:, None] * np.array(glint.light.sun_rgb, np.float32) * np.float32(255.0)
+    picture[where] = np.minimum(lit, 255.0).astype(np.uint8)
+
+
+def _seen_through(air: Air, picture: Image, slant_m: Float32) -> Image:
+    """The picture (H, W, 3) after its light has come a way (H, W) through air."""
+    left = np.exp(np.float32(-3.912 / air.visibility_m) * slant_m)[..., None]
+    mixed: Float32 = picture * left + np.array(air.rgb, np.float32) * (np.float32(1.0) - left)
+    return mixed.astype(np.uint8)
+
+
+def _after_light(
+    world: World, picture: Image, at: tuple[Float32, Float32], per_metre: tuple[Float32, Float32], drop: Float32
+) -> Image:
+    """What lies between the surface and the lens: mirrored sun on water, then air."""
+    if world.glint is None and world.air is None:
+        return picture
+    right, down = (pixels * np.float32(world.gsd_m_per_px) for pixels in per_metre)
+    if world.glint is not None:
+        _add_glint(picture, world.glint, *at, (right, down))
+    if world.air is not None:
+        picture = _seen_through(world.air, picture, drop * np.sqrt(1.0 + right**2 + down**2))
+    return picture
 
 
 def _check_view(world: World, camera: Camera, height_agl_m: float) -> None:
@@ -362,7 +306,7 @@ def render_frame(
         world: what is there; beyond its edge lies its outermost pixel on flat ground.
         camera: intrinsics and mount, without distortion.
         grid_m: the camera's (easting, northing) in the world's CRS.
-        height_agl_m: above the flat ground, and above everything that stands on it.
+        height_agl_m: above the world's height 0 (the flat ground), and above everything that stands there.
         attitude: of the body, about true north.
         supersample: rays per pixel and axis; None takes as many as the world's raster deserves (1 to 4).
 
@@ -374,15 +318,17 @@ def render_frame(
         supersample = int(np.clip(round(height_agl_m / camera.focal_px / world.gsd_m_per_px), 1, 4))
     rays = _Rays.cast(world, camera, grid_m, height_agl_m, attitude, supersample)
     found, heights = _first_layer(world, rays)
-    x, y = rays.per_metre()
-    where = np.flatnonzero(found)
+    per_metre = x, y = rays.per_metre()
+    # On flat ground a ray that met no layer ends at 0; on hills every ray looks for its own ground.
+    where = np.flatnonzero(found) if world.ground_m is None else np.arange(found.size)
     far_x, far_y = x.ravel()[where], y.ravel()[where]
     z_m, wall = _refine(world, rays, far_x, far_y, heights[found.ravel()[where]], float(heights[1]))
     drop = np.full(found.shape, height_agl_m, np.float32)
     drop.reshape(-1)[where] -= z_m
     x, y = x * drop + np.float32(rays.nadir_px[0]), y * drop + np.float32(rays.nadir_px[1])
-    picture = cv2.remap(world.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    picture: Any = cv2.remap(world.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     walls = where[wall]
     picture.reshape(-1, 3)[walls] = _wall_colours(world, x.ravel()[walls], y.ravel()[walls], z_m[wall])
+    picture = _after_light(world, picture, (x, y), per_metre, drop)
     size = (camera.width_px, camera.height_px)
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -1,15 +1,13 @@
 """A town that does not exist: streets, houses, parks and fields from one seed, with its map and surface model.
 
 Convention:
-    Town coordinates (u, v) are those of :mod:`engine.sim.canvas`; a block is its centre and its sides du, dv.
-    Everything is drawn twice as fine as the map.
+    Town coordinates (u, v) are those of :mod:`engine.sim.canvas`. Everything is drawn twice as fine as the map.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -17,41 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.sim.canvas import (
-    ASPHALT,
-    CROP,
-    GRASS,
-    PAVING,
-    WATER,
-    Canvas,
-    Colour,
-    building,
-    grove,
-    tree,
-)
-from engine.sim.render import (
-    LIGHTS,
-    Array,
-    Float32,
-    Image,
-    Sensor,
-    World,
-    illuminate,
-    light_by_name,
-    transformer,
-)
+from engine.sim.blocks import fill_blocks
+from engine.sim.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
+from engine.sim.conditions import CONDITIONS, Condition, condition_by_name, dress
+from engine.sim.light import Array, Float32, Image, Light, illuminate, light_by_name
+from engine.sim.optics import Sensor
+from engine.sim.render import Glint, World, transformer
+from engine.sim.terrain import draw_river, hills, lay_on
 
 CRS_EPSG = 32633
 """UTM zone 33 north; the town lies 1.45 degrees east of its central meridian: convergence +1.08 degrees."""
 CENTRE_LAT_DEG, CENTRE_LON_DEG = 48.25, 16.45
 GROUND_AMSL_M = 155.0
-"""The flat ground's height above mean sea level."""
+"""Height of the flat or lowest ground above mean sea level."""
 MARGIN_M = 40.0
 """How far the drawn world reaches beyond the map, so that a tilted camera still sees a town."""
 MAP_SENSOR = Sensor(
     gamma=0.92, balance_rgb=(0.97, 0.94, 0.88), haze=8.0, vignette=0.0, exposure_sd=0.0, blur_px=0.55, noise_sd=2.2
 )
 """The camera of the map's survey: warmer and softer than the drone's."""
+LAMP_M = 6.0
+"""Height of street lamps: what is higher is not lit by them."""
+RELIEF_MAX_M = 80.0
+_EARTH: Colour = (146, 126, 98)
 _CARS: tuple[Colour, ...] = (
     (236, 236, 236), (40, 42, 46), (150, 154, 158), (132, 44, 44), (58, 72, 104), (206, 206, 200), (90, 92, 96),
 )  # fmt: skip
@@ -63,11 +49,13 @@ class Town:
 
     Attributes:
         ortho: (H, W, 3) RGB orthophoto, another photograph than any frame.
-        surface_m: (H, W) metres above the flat ground.
+        surface_m: (H, W) metres above the world's height 0, which is the ground where it is flat.
         pixel_to_crs: (2, 3) affine of map pixels (x, y), centres at integers, to the CRS.
         crs_epsg: projected CRS.
         gsd_m_per_px: map pixel in grid metres.
         world: what a camera sees on the day of the flight.
+        condition: that day's light, season and air, which are in the world; its noise is the camera's.
+        datum_amsl_m: the world's height 0 above mean sea level.
     """
 
     ortho: Image
@@ -76,6 +64,8 @@ class Town:
     crs_epsg: int
     gsd_m_per_px: float
     world: World
+    condition: Condition = CONDITIONS["noon"]
+    datum_amsl_m: float = GROUND_AMSL_M
 
 
 def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array, float]]]:
@@ -139,169 +129,6 @@ def _markings(canvas: Canvas, line: Array, width: float, crossings: Image) -> No
         last = count
 
 
-def _houses(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """Detached houses with paths, sheds and trees."""
-    rng = canvas.rng
-    for row, turn in ((-dv / 2 + 10.5, 1), (dv / 2 - 10.5, -1)):
-        at = -du / 2 + rng.uniform(8, 11)
-        while at < du / 2 - 6:
-            length, width = rng.uniform(9, 15), rng.uniform(8, 11)
-            canvas.rect(u + at, v + row, 15.5, 19.0, canvas.tint((108, 122, 78), 11), material=GRASS)
-            canvas.rect(
-                u + at + length / 2 + 1.4,
-                v + row - turn * 4,
-                2.6,
-                13,
-                canvas.tint((156, 150, 142)),
-                material=PAVING,
-            )
-            kind, angle = (
-                str(rng.choice(["gable", "hip", "gable"])),
-                rng.choice([0, math.pi / 2]) + rng.normal(0, 0.05),
-            )
-            building(
-                canvas, u + at, v + row + rng.uniform(-1.5, 1.5), length, width, rng.uniform(5, 8), kind, angle
-            )
-            if rng.random() < 0.7:
-                building(canvas, u + at + rng.uniform(-5, 5), v + row + turn * 12, 5.5, 3.5, 2.4, "flat")
-            at += rng.uniform(15.5, 20)
-    grove(canvas, u, v, du, dv, 170, (1.2, 3.4))
-
-
-def _bars(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """Blocks of flats, 12 to 25 m high, on lawns with paths."""
-    rng = canvas.rng
-    for _ in range(2):
-        canvas.rect(
-            u + rng.uniform(-0.4, 0.4) * du, v, 2.5, dv, canvas.tint((168, 160, 146)), rng.normal(0, 0.2), PAVING
-        )
-    for at in np.arange(-du / 2 + 14, du / 2 - 8, rng.uniform(25, 31)):
-        length = (dv - 9) * rng.uniform(0.5, 0.95)
-        building(canvas, u + at, v, rng.uniform(11, 15), length, rng.uniform(12, 25), "flat", rng.normal(0, 0.03))
-    grove(canvas, u, v, du, dv, 130, (1.8, 4.2))
-
-
-def _perimeter(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """Old town houses wall to wall around a court."""
-    rng = canvas.rng
-    canvas.rect(u, v, du - 6, dv - 6, canvas.tint((150, 142, 130)), material=PAVING)
-    for across, room, turn in ((dv, du, 0.0), (du, dv - 30, math.pi / 2)):
-        for side in (-1, 1):
-            at = -room / 2 + 2
-            while at < room / 2 - 8:
-                length = min(rng.uniform(11, 20), room / 2 - at - 1)
-                place = np.array([at + length / 2, side * (across / 2 - 8.5)])
-                uv = (u + place[0], v + place[1]) if not turn else (u + place[1], v + place[0])
-                kind = "flat" if rng.random() < 0.2 else "gable"
-                # Neighbours share a wall: the gap that keeps houses apart is a metre and a half of alley here.
-                building(canvas, *uv, length - 1.3, rng.uniform(11, 13), rng.uniform(9, 17), kind, turn)
-                at += length
-    grove(canvas, u, v, 0.6 * du, 0.6 * dv, 160, (1.5, 3.5))
-
-
-def _commerce(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """A hall with a car park: bays in white."""
-    rng = canvas.rng
-    canvas.rect(u, v, du, dv, canvas.tint((112, 112, 114), 7), material=ASPHALT)
-    for row in np.arange(-dv / 2 + 6, dv / 2 - 4, 15.0):
-        for at in np.arange(-du / 2 + 3, du * 0.1, 2.7):
-            canvas.rect(u + at, v + row, 0.2, 5.0, (206, 206, 202))
-    building(canvas, u + du * 0.28, v, du * 0.38, dv - 8, rng.uniform(6, 11), "flat")
-    building(canvas, u - du * 0.2, v + dv * 0.32, du * 0.3, dv * 0.22, rng.uniform(5, 8), "flat")
-
-
-def _park(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """Lawns, winding paths, a pond, trees."""
-    rng = canvas.rng
-    canvas.rect(u, v, du + 2, dv + 2, canvas.tint((100, 120, 66), 8), material=GRASS)
-    t = np.linspace(-0.5, 0.5, 40)
-    for swing in (1, -1):
-        wave = 0.22 * np.sin(t * rng.uniform(5, 9) + rng.uniform(0, 6)) + swing * t * 0.6
-        line = canvas.px(np.column_stack([u + t * du, v + wave * dv]))
-        points = [np.rint(line * 16).astype(np.int32)]
-        cv2.polylines(
-            canvas.rgb, points, False, canvas.tint((188, 172, 142)), round(2.6 / canvas.gsd), cv2.LINE_AA, 4
-        )
-    around = np.linspace(0, 2 * math.pi, 60)
-    radius = dv * 0.19 * (1 + 0.2 * np.sin(2 * around + rng.uniform(0, 6)) + 0.1 * np.sin(5 * around))
-    shore = np.column_stack([u + du * 0.2 + 1.5 * radius * np.cos(around), v + radius * np.sin(around)])
-    canvas.fill(shore, (62, 82, 84), WATER, busy=True)
-    grove(canvas, u, v, du, dv, 75, (1.5, 5.0))
-
-
-def _fields(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """Allotments: strips of different crops in rows."""
-    rng, at = canvas.rng, -du / 2
-    while at < du / 2 - 4:
-        wide = min(rng.uniform(7, 19), du / 2 - at)
-        colour = canvas.tint(
-            ((122, 132, 70), (150, 132, 92), (92, 112, 58), (172, 160, 104))[int(rng.integers(4))]
-        )
-        canvas.rect(u + at + wide / 2, v, wide - 0.8, dv, colour, material=CROP)
-        for row in np.arange(at + 1.0, at + wide - 1.0, 1.7 if rng.random() < 0.6 else 3.4):
-            dark = (colour[0] * 0.8, colour[1] * 0.82, colour[2] * 0.8)
-            canvas.rect(u + row, v + rng.uniform(-1, 1), 0.6, dv * rng.uniform(0.86, 1.0), dark)
-        if rng.random() < 0.5:
-            building(canvas, u + at + wide / 2, v + rng.uniform(-0.4, 0.4) * dv, 5.0, 4.0, 2.8, "gable")
-        at += wide
-
-
-def _square(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """An open square: paving in a pattern, a fountain, a tower, rows of trees."""
-    rng = canvas.rng
-    canvas.rect(u, v, du, dv, (176, 166, 150), material=PAVING)
-    for at in np.arange(-0.5, 0.45, 0.125):
-        canvas.rect(u + at * du, v, 1.2, dv, canvas.tint((146, 134, 122), 5))
-        canvas.rect(u, v + at * dv, du, 0.8, canvas.tint((152, 142, 130), 5))
-    ring = np.linspace(0, 2 * math.pi, 40)
-    for radius, colour in ((8.0, (132, 116, 104)), (6.0, (204, 198, 186)), (5.0, (74, 108, 118))):
-        canvas.fill(np.column_stack([u - du * 0.15 + radius * np.cos(ring), v + radius * np.sin(ring)]), colour)
-    building(canvas, u + du * 0.3, v + dv * 0.1, 9, 9, 25.0, "hip")
-    building(canvas, u + du * 0.3, v - dv * 0.25, 24, 13, 12.0, "gable")
-    for at in np.arange(-0.44, 0.45, 0.09):
-        tree(canvas, u + at * du, v + dv * 0.44, rng.uniform(2.2, 2.8))
-
-
-def _pitch(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
-    """A football pitch, a hard court and a gymnasium."""
-    long, wide = du * 0.62, dv * 0.74
-    u0 = u - du * 0.14
-    canvas.rect(u0, v, long + 8, wide + 8, (164, 92, 70), material=PAVING)
-    for k in range(10):
-        green = (88, 124, 58) if k % 2 else (100, 138, 68)
-        canvas.rect(u0 + (k - 4.5) * long / 10, v, long / 10, wide, green, material=GRASS)
-    lines = [(0.0, 0.5 * side, 1.0, 0.0) for side in (-1, 1)] + [
-        (0.5 * side, 0.0, 0.0, 1.0) for side in (-1, 0, 1)
-    ]
-    lines += [(0.42 * end, 0.2 * side, 0.16, 0.0) for end in (-1, 1) for side in (-1, 1)]
-    for x, y, dx, dy in lines:
-        canvas.rect(u0 + x * long, v + y * wide, dx * long + 0.3, dy * wide + 0.3, (228, 230, 224))
-    canvas.rect(u + du * 0.36, v - dv * 0.24, du * 0.2, dv * 0.4, (52, 98, 122), material=PAVING)
-    building(canvas, u + du * 0.36, v + dv * 0.25, du * 0.2, dv * 0.36, 9.0, "flat")
-
-
-_KINDS = (_houses, _bars, _perimeter, _commerce, _park, _fields, _square, _pitch)
-_SHARES = np.array([0.31, 0.17, 0.22, 0.13, 0.09, 0.05, 0.01, 0.02])
-
-
-def _blocks(canvas: Canvas, edges_u: list[float], edges_v: list[float]) -> None:
-    """Fill the blocks between the streets; those near the centre hold one of the rarer kinds each."""
-    rng, road, before = canvas.rng, canvas.busy > 0, (canvas.rgb.copy(), canvas.material.copy())
-    cells = [
-        ((a + b) / 2, (c + d) / 2, b - a - 18.5, d - c - 17.0)
-        for a, b in itertools.pairwise(edges_u) for c, d in itertools.pairwise(edges_v)
-    ]  # fmt: skip
-    cells.sort(key=lambda cell: math.hypot(cell[0], cell[1]))
-    first = [int(k) for k in rng.permutation([6, 4, 2, 7, 1, 0, 3, 5, 2, 0])]
-    for index, cell in enumerate(cells):
-        kind = first[index] if index < len(first) else int(rng.choice(len(_KINDS), p=_SHARES))
-        if math.hypot(cell[0], cell[1]) < canvas.reach_m + 40:
-            _KINDS[kind](canvas, *cell)
-    # The winding road cuts through blocks: give it back what they painted over, but for crowns above it.
-    road &= canvas.height == 0.0
-    canvas.rgb[road], canvas.material[road] = before[0][road], before[1][road]
-
-
 def _park_cars(canvas: Canvas, roads: list[tuple[Array, float]]) -> tuple[Image, Image]:
     """Colours on the day of the map and on the day of the flight: a third of the cars have moved."""
     rng = canvas.rng
@@ -352,6 +179,104 @@ def _check_size(width_px: int, height_px: int, gsd: float) -> None:
         raise OptionError(f"town: expected 16 px or more at 0.1 to 5 m/px, got {got}")
 
 
+def _lamp_light(canvas: Canvas, roads: list[tuple[Array, float]]) -> Float32:
+    """Light (H, W) of street lamps in [0, 1], one every 27 m on alternating sides, on what is lower than they."""
+    pools = np.zeros(canvas.shape, np.float32)
+    for line, width in roads:
+        for k, (u, v, angle) in enumerate(_stations(line, 27.0)):
+            aside = (width / 2 + 0.5) * (1 if k % 2 else -1)
+            x, y = np.rint(canvas.px(np.array([[u - math.sin(angle) * aside, v + math.cos(angle) * aside]]))[0])
+            if 0 <= x < pools.shape[1] and 0 <= y < pools.shape[0]:
+                pools[int(y), int(x)] = 1.0
+    sigma = 4.5 / canvas.gsd
+    pools = np.asarray(cv2.GaussianBlur(pools, (0, 0), sigma) * np.float32(2.0 * math.pi * sigma**2))
+    return np.minimum(pools, np.float32(1.0))
+
+
+@dataclass(frozen=True)
+class _Day:
+    """Drawn colours (H, W, 3), heights and materials (H, W) of a town on one day."""
+
+    rgb: Image
+    height_m: Float32
+    material: Image
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A finished canvas, on the day of the map and on that of the flight."""
+
+    canvas: Canvas
+    then: _Day
+    today: _Day
+    ground_m: Float32 | None
+    lamps: Float32
+
+
+def _without(day: _Day, gone: NDArray[np.bool_], ground_m: Float32 | None, rng: np.random.Generator) -> _Day:
+    """The day with bare earth where (H, W) something is not there."""
+    rgb, height, material = day.rgb.copy(), day.height_m.copy(), day.material.copy()
+    count = int(gone.sum())
+    rgb[gone] = np.clip(np.array(_EARTH) * (1.0 + 0.07 * rng.standard_normal((count, 1))), 0, 255)
+    height[gone] = 0.0 if ground_m is None else ground_m[gone]
+    material[gone] = CROP
+    return _Day(rgb, height, material)
+
+
+def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
+    """The town with a share of its houses put up, and as many pulled down, between the map and the flight."""
+    roofs = (drawn.canvas.material == ROOF).astype(np.uint8)
+    count, labels = cv2.connectedComponents(roofs, connectivity=4)
+    fate = rng.random(count)
+    fate[0] = 1.0  # what is no house
+    new, gone = (fate < changed / 2)[labels], ((fate >= changed / 2) & (fate < changed))[labels]
+    then, today = _without(drawn.then, new, drawn.ground_m, rng), _without(drawn.today, gone, drawn.ground_m, rng)
+    return replace(drawn, then=then, today=today)
+
+
+def _draw(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    gsd: float,
+    light: Light,
+    relief_m: float,
+    river_rng: np.random.Generator | None,
+    hill_rng: np.random.Generator,
+) -> _Drawn:
+    """Streets, blocks and cars on a canvas, and the hills below them."""
+    canvas = Canvas(rng, size, gsd, light)
+    river = None if river_rng is None else draw_river(canvas, river_rng)
+    edges_u, edges_v, roads = _streets(canvas)
+    fill_blocks(canvas, edges_u, edges_v)
+    canvas.texture()
+    then, today = _park_cars(canvas, roads)
+    lamps = _lamp_light(canvas, roads) * (canvas.height < LAMP_M)
+    ground = lay_on(canvas, hills(size, gsd, relief_m, hill_rng), river) if relief_m else None
+    height, material = canvas.height, canvas.material
+    return _Drawn(canvas, _Day(then, height, material), _Day(today, height, material), ground, lamps)
+
+
+def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generator) -> tuple[Image, Float32]:
+    """Colours and heights of a town on a day."""
+    gsd = drawn.canvas.gsd
+    dressed, height = dress(day.rgb, day.height_m, day.material, drawn.ground_m, condition, gsd, rng)
+    lamps = drawn.lamps * np.float32(condition.lamps) if condition.lamps else None
+    return illuminate(dressed, height, gsd, condition.light, shade=condition.shade, lamps=lamps), height
+
+
+def _world(drawn: _Drawn, condition: Condition, pixel_to_crs: Array, rng: np.random.Generator) -> World:
+    """What a camera sees of a town on a day."""
+    seen, height = _lit(drawn, drawn.today, condition, rng)
+    sides, material = drawn.canvas.sides, drawn.today.material
+    if condition.shade:  # crowns are drawn as at noon; those of the two first lights stay as published
+        crowns = material == CANOPY
+        sides[crowns, :3] = seen[crowns] // 2
+    glint = Glint(condition.light, (material == WATER).astype(np.uint8)) if condition.shade else None
+    return World(
+        seen, sides, height, pixel_to_crs, CRS_EPSG, ground_m=drawn.ground_m, air=condition.air, glint=glint
+    )
+
+
 def build_town(
     seed: int = 1,
     *,
@@ -359,6 +284,11 @@ def build_town(
     height_px: int = 1000,
     gsd_m_per_px: float = 0.53,
     light: str = "noon",
+    condition: str | Condition | None = None,
+    map_condition: str | Condition = "noon",
+    relief_m: float = 0.0,
+    river: bool = False,
+    changed: float = 0.0,
 ) -> Town:
     """A town from a seed; the same seed gives the same bytes.
 
@@ -368,26 +298,38 @@ def build_town(
         height_px: rows of the map.
         gsd_m_per_px: a map pixel in metres on the grid.
         light: a name of :data:`LIGHTS`, for the frames; the map's is noon.
+        condition: a name of :data:`engine.sim.CONDITIONS` or one of your own, for the frames; it takes the place
+            of the light.
+        map_condition: the day on which the map was taken; another one than the frames' even if it is the same.
+        relief_m: height of the hills under the town, from the lowest ground to the highest; 0 is flat.
+        river: whether one crosses the town.
+        changed: share of the houses that were put up or pulled down between the map and the flight.
 
     Raises:
         OptionError: an argument is out of range.
     """
     _check_size(width_px, height_px, gsd_m_per_px)
-    flight_light, rng = light_by_name(light), generator(seed, 0x70)
+    if not 0.0 <= relief_m <= RELIEF_MAX_M:
+        raise OptionError(f"relief_m: expected 0 to {RELIEF_MAX_M:g}, got {relief_m}")
+    if not 0.0 <= changed <= 1.0:
+        raise OptionError(f"changed: expected 0 to 1, got {changed}")
+    light_by_name(light)
+    today, surveyed = (
+        condition_by_name(light if condition is None else condition),
+        condition_by_name(map_condition),
+    )
     fine = max(1, round(gsd_m_per_px / 0.265))
     margin = math.ceil(MARGIN_M / gsd_m_per_px)
     size = ((height_px + 2 * margin) * fine, (width_px + 2 * margin) * fine)
-    canvas = Canvas(rng, size, gsd_m_per_px / fine, flight_light)
-    edges_u, edges_v, roads = _streets(canvas)
-    _blocks(canvas, edges_u, edges_v)
-    canvas.texture()
-    then, today = _park_cars(canvas, roads)
+    rng, water_rng = generator(seed, 0x70), generator(seed, 0x71) if river else None
+    drawn = _draw(rng, size, gsd_m_per_px / fine, today.light, relief_m, water_rng, generator(seed, 0x72))
+    if changed:
+        drawn = _rebuilt(drawn, changed, generator(seed, 0x75))
     inner = (slice(margin * fine, -margin * fine),) * 2
-    then = illuminate(then, canvas.height, canvas.gsd, LIGHTS["noon"])[inner]
-    ortho, surface = MAP_SENSOR.develop(_shrink(then, fine), rng), _shrink(canvas.height[inner], fine)
+    then, heights = _lit(drawn, drawn.then, surveyed, generator(seed, 0x73))
+    ortho, surface = MAP_SENSOR.develop(_shrink(then[inner], fine), rng), _shrink(heights[inner], fine)
     to_crs = _georeference(width_px, height_px, gsd_m_per_px)
     first = -margin - 0.5 + 0.5 / fine
     fine_to_crs = np.column_stack([to_crs[:, :2] / fine, to_crs @ (first, first, 1.0)])
-    seen = illuminate(today, canvas.height, canvas.gsd, flight_light)
-    world = World(seen, canvas.sides, canvas.height, fine_to_crs, CRS_EPSG)
-    return Town(ortho, surface, to_crs, CRS_EPSG, gsd_m_per_px, world)
+    world = _world(drawn, today, fine_to_crs, generator(seed, 0x74))
+    return Town(ortho, surface, to_crs, CRS_EPSG, gsd_m_per_px, world, today)
