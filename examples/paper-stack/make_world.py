@@ -1,0 +1,115 @@
+"""Drapes a map over the ground of the Gazebo world: a mesh with the map as its picture, as model://map_ground."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from engine.adapters.vehicle import Origin, north_east_m
+from engine.orthomap import OrthoMap
+
+MODEL = """<?xml version="1.0"?>
+<sdf version="1.6">
+  <model name="map_ground">
+    <static>true</static>
+    <link name="link">
+      <collision name="collision">
+        <geometry>
+          <plane>
+            <normal>0 0 1</normal>
+            <size>{width_m:.1f} {height_m:.1f}</size>
+          </plane>
+        </geometry>
+      </collision>
+      <visual name="visual">
+        <cast_shadows>false</cast_shadows>
+        <geometry>
+          <mesh>
+            <uri>model://map_ground/meshes/ground.obj</uri>
+          </mesh>
+        </geometry>
+      </visual>
+    </link>
+  </model>
+</sdf>
+"""
+CONFIG = """<?xml version="1.0"?>
+<model>
+  <name>map_ground</name>
+  <version>1.0</version>
+  <sdf version="1.6">model.sdf</sdf>
+  <description>A map draped over the ground.</description>
+</model>
+"""
+# Lit by the ambient light alone, it looks as the photograph does.
+MATERIAL = "newmtl ground\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd ../materials/textures/map.png\n"
+
+
+def vertices(site: OrthoMap, step_px: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """The mesh: places (N, 3) in metres, places in the picture (N, 2) in [0, 1] from its bottom left, its shape.
+
+    The metres are ArduPilot's, about the middle of the map: so the simulated vehicle's latitude is the map's.
+    """
+    columns, rows = (np.r_[np.arange(0, n, step_px), n] - 0.5 for n in (site.width_px, site.height_px))
+    xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    lat, lon = site.geodetic_from_pixel(xy)
+    origin = Origin(site.frame.lat_deg, site.frame.lon_deg, 0.0)
+    north_east = np.array([north_east_m(*place, origin, "ardupilot") for place in zip(lat, lon, strict=True)])
+    up = site.surface_at(xy) - site.ground_m
+    places = np.column_stack([north_east[:, 1], north_east[:, 0], up])
+    in_picture = (xy + 0.5) / (site.width_px, site.height_px)
+    return places, np.column_stack([in_picture[:, 0], 1.0 - in_picture[:, 1]]), (len(rows), len(columns))
+
+
+def obj(places: np.ndarray, in_picture: np.ndarray, shape: tuple[int, int]) -> str:
+    """The mesh as a Wavefront file; faces are counter-clockwise from above."""
+    lines = ["mtllib ground.mtl", "o ground"]
+    lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in places]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in in_picture]
+    lines += ["vn 0 0 1", "usemtl ground"]
+    index = np.arange(1, len(places) + 1).reshape(shape)
+    corners = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]  # rows go south
+    for nw, sw, se, ne in zip(*(corner.ravel() for corner in corners), strict=True):
+        lines += ["f " + " ".join(f"{k}/{k}/1" for k in face) for face in ((nw, sw, se), (nw, se, ne))]
+    return "\n".join(lines) + "\n"
+
+
+def write_ground(map_path: Path, surface: Path | None, models: Path, step_px: int) -> OrthoMap:
+    """Write the model's folder."""
+    import rasterio
+    from PIL import Image
+
+    site = OrthoMap.open(map_path, surface=surface)
+    folder = models / "map_ground"
+    for name in ("meshes", "materials/textures"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    with rasterio.open(map_path) as source:
+        picture = np.moveaxis(source.read([1, 2, 3] if source.count >= 3 else [1]), 0, 2)
+    if picture.shape[:2] != (site.height_px, site.width_px):
+        raise SystemExit(f"{map_path}: expected a map on a metric grid, which is not resampled when it is opened")
+    Image.fromarray(picture.squeeze()).save(folder / "materials/textures/map.png")
+    places, in_picture, shape = vertices(site, step_px)
+    extent_m = np.ptp(places[:, :2], axis=0)
+    (folder / "model.sdf").write_text(MODEL.format(width_m=extent_m[0], height_m=extent_m[1]), encoding="utf-8")
+    (folder / "model.config").write_text(CONFIG, encoding="utf-8")
+    (folder / "meshes/ground.obj").write_text(obj(places, in_picture, shape), encoding="utf-8")
+    (folder / "meshes/ground.mtl").write_text(MATERIAL, encoding="utf-8")
+    return site
+
+
+def main() -> None:
+    """Write the model, and print where SITL has to begin."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("map", type=Path, help="GeoTIFF of 8 bits")
+    parser.add_argument("--surface", type=Path, help="surface model; without it the ground is flat")
+    parser.add_argument("--models", type=Path, default=Path(__file__).parent / "models")
+    parser.add_argument("--step-px", type=int, default=8, help="of the mesh, in pixels of the map")
+    wanted = parser.parse_args()
+    site = write_ground(wanted.map, wanted.surface, wanted.models, wanted.step_px)
+    print(f"--custom-location={site.frame.lat_deg:.7f},{site.frame.lon_deg:.7f},0,0")
+
+
+if __name__ == "__main__":
+    main()
