@@ -6,7 +6,7 @@ The rules are few and documented in ``docs/integrity.md``; their thresholds were
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.evidence import Evidence, probability
 from engine.geo import transport_covariance
+from engine.orthomap import OrthoMap
 from engine.types import Frame, Peak, Reason, check_positive
 
 Array = NDArray[np.float64]
@@ -30,15 +31,15 @@ class AssumedErrors:
         heading_deg: of the heading.
         tilt_deg: of roll and of pitch, where the frame came with them.
         unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
-        map_m: of the map's georeference, per axis.
-        surface_slope_deg: of the ground under one frame, where a surface model gives its height.
+        map_m: of the map's georeference, per axis, where the map does not say it (:func:`told_by_map`).
+        surface_slope_deg: of the ground under one frame, where a surface model gives its height and does not say.
         unknown_slope_deg: the same where flat ground is assumed.
     """
 
     height_m: float = 0.5
     height_share: float = 0.01
     heading_deg: float = 1.0
-    tilt_deg: float = 0.5
+    tilt_deg: float = 0.37
     unknown_tilt_deg: float = 4.0
     map_m: float = 0.3
     surface_slope_deg: float = 0.1
@@ -46,6 +47,15 @@ class AssumedErrors:
 
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
+
+
+def told_by_map(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
+    """The errors with what the map says of itself in place of what is assumed of any map."""
+    return replace(
+        errors,
+        map_m=errors.map_m if site.georeference_sigma_m is None else site.georeference_sigma_m,
+        surface_slope_deg=errors.surface_slope_deg if site.slope_sigma_deg is None else site.slope_sigma_deg,
+    )
 
 
 # Neighbouring pixels share their noise: so many of them, squared, count as one.
@@ -90,7 +100,7 @@ class PeakRule:
     max_prior_chi_square: float = 18.4
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
-    min_confidence: float = 0.97
+    min_confidence: float = 0.93
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 
@@ -130,7 +140,8 @@ def judge_evidence(evidence: Evidence, rule: PeakRule) -> tuple[Reason, str] | N
     if confidence >= rule.min_confidence:
         return None
     figures = (
-        f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}, chi-square {evidence.off_prior:.1f}"
+        f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}, "
+        f"chi-square {evidence.expected.off_prior:.1f}"
     )
     asked = f"{rule.min_confidence:g} is asked for"
     return Reason.AMBIGUOUS, f"right with a probability of {confidence:.3f}, {asked} ({figures} from the prior)"
@@ -150,6 +161,26 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
     values, vectors = np.linalg.eigh(information)
     variances = np.clip(1.0 / np.maximum(values, 1e-9), 0.05**2, 5.0**2)
     return np.asarray((vectors * variances) @ vectors.T, dtype=np.float64)
+
+
+def pull_px2(peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors) -> Array:
+    """(2, 2) covariance, in square pixels, of a peak whose patch is turned or scaled against the map.
+
+    An error of heading or height moves every part of the patch by an amount of its own. Where the parts stay
+    within the width of the peak, it lies at their mean, and nothing is lost; where they do not, it follows the
+    part that is seen best, which may lie anywhere. The share between the two is u^2 / (u^2 + width^2).
+
+    Args:
+        peak: of the patch.
+        shape: (rows, columns) of the patch.
+        height_m: above the ground.
+        errors: what is assumed of height and heading.
+    """
+    share = math.hypot(errors.height_share, errors.height_m / height_m, math.radians(errors.heading_deg))
+    apart = share**2 * (shape[0] ** 2 + shape[1] ** 2) / 24.0  # mean over the patch of one axis
+    bend = -float(np.trace(peak.curvature)) / 2.0
+    width = max(peak.score, 0.05) / max(bend, 1e-9)
+    return np.asarray(apart * apart / (apart + width) * np.eye(2), dtype=np.float64)
 
 
 def ncc_covariance_m2(

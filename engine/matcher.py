@@ -15,8 +15,10 @@ from engine.camera import Camera
 from engine.costs import Costs
 from engine.errors import OptionError
 from engine.features import loops_compiled, plans_made
+from engine.integrity import told_by_map
 from engine.landmarks import LandmarkMap
-from engine.methods import ladder, paper
+from engine.methods import explained, ladder, paper
+from engine.methods.explained import Explanation
 from engine.methods.laid import NccOptions
 from engine.methods.query import Query, Stopwatch, level_crop, level_for
 from engine.methods.samples import SampleMap
@@ -50,6 +52,15 @@ class MatcherOptions:
             raise OptionError(f"profile: expected one of {', '.join(PROFILES)}, got {self.profile!r}")
 
 
+def _told_by_map(site: OrthoMap, options: MatcherOptions) -> MatcherOptions:
+    ncc, sift = options.ncc, options.sift
+    return replace(
+        options,
+        ncc=replace(ncc, errors=told_by_map(site, ncc.errors)),
+        sift=replace(sift, errors=told_by_map(site, sift.errors)),
+    )
+
+
 class SceneMatcher:
     """Matches single frames against one map with one camera.
 
@@ -59,7 +70,7 @@ class SceneMatcher:
         method: "ncc" (needs height and heading), "sift" (needs neither), or "auto": NCC where height and heading
             are known, then SIFT where there is time; where both have a fix they must agree.
         device: "cpu", "cuda" or "auto".
-        options: settings; the defaults serve.
+        options: settings; the defaults serve. What the map says of its accuracy counts more than they do.
 
     Raises:
         OptionError: the method is unknown.
@@ -76,7 +87,7 @@ class SceneMatcher:
     ) -> None:
         if method not in METHODS:
             raise OptionError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
-        self.options = options or MatcherOptions()
+        self.options = _told_by_map(site, options or MatcherOptions())
         if self.options.profile == "paper" and method == "auto":
             raise OptionError("method: the paper's profile has ncc and sift, got 'auto'")
         self.site = site
@@ -159,6 +170,25 @@ class SceneMatcher:
                 Reason.LATE, "the answer came after the budget", result.method, window=result.window
             )
         return replace(result, timings=query.watch.timings)
+
+    def explain(self, frame: Frame, window: Window, method: str | None = None) -> Explanation:
+        """What the match of a frame in a window looks like: its surface or its matches, for reports.
+
+        Args:
+            frame: of the camera's resolution.
+            window: that was searched, in map pixels.
+            method: "ncc" or "sift"; None takes the matcher's own, and NCC of "auto".
+        """
+        middle_px = np.array([window.x0, window.y0]) + np.array([window.width_px, window.height_px]) / 2.0
+        east, north = self.site.enu_from_pixel(middle_px)
+        prior = Prior(east_m=float(east), north_m=float(north), sigma_m=0.0)
+        query = self._query(frame, prior, Deadline(Budget()))
+        method = method or self.method
+        if self.options.profile == "paper":
+            return explained.by_paper(query, method, window)
+        if method == "sift":
+            return explained.by_sift(query, self._landmarks, window, self.options.sift)
+        return explained.by_ncc(query, self._prepared, window, self.options.ncc)
 
     def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
         watch = Stopwatch(deadline, self.device, self._costs)

@@ -10,107 +10,40 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine.errors import DtypeError, MapError, ShapeError
 from engine.geo import LocalFrame
 from engine.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
 from engine.metric_copy import open_metric_copy
-from engine.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Mask, open_source, read_surface
+from engine.pyramid import Pyramid, Read
+from engine.rasters import (
+    GEOREFERENCE_TAG,
+    SLOPE_TAG,
+    Gray,
+    GrayReader,
+    Mask,
+    open_source,
+    read_surface,
+    stated_sigma,
+)
 from engine.types import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Read = Callable[[Window], tuple[Gray, Mask]]
-
 GROUND_PERCENT = 20.0
 """Percentile of the surface over the map that is taken as the level of the ground."""
-SMALLEST_LEVEL_PX = 16
 GSD_RANGE_M = (1e-3, 1e3)
-
-
-class _Pyramid:
-    """Grey and validity at every level: in memory from the first level that is small enough, read below it."""
-
-    def __init__(self, width_px: int, height_px: int, read: Read) -> None:
-        self._size, self._read = (height_px, width_px), read
-        self.levels = max(1, int(math.log2(max(1.0, min(self._size) / SMALLEST_LEVEL_PX))) + 1)
-        self._base = 0
-        while self._base < self.levels - 1 and math.prod(self.shape(self._base)) > MEMORY_LIMIT_PX:
-            self._base += 1
-        self._kept: dict[int, tuple[Gray, Mask]] = {}
-        self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
-        if self._base == 0:
-            self._kept[0] = self._streamed(0)
-
-    def shape(self, level: int) -> tuple[int, int]:
-        if not 0 <= level < self.levels:
-            raise OptionError(f"level: expected 0 to {self.levels - 1}, got {level}")
-        return self._size[0] >> level, self._size[1] >> level
-
-    def _streamed(self, level: int) -> tuple[Gray, Mask]:
-        """A whole level, read in strips so that colour and masks of the file never lie in memory at once."""
-        height, width = self.shape(level)
-        gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
-        rows = max(1, 1024 >> level)
-        for y0 in range(0, height, rows):
-            strip = Window(0, y0, width, min(rows, height - y0))
-            gray[y0 : y0 + rows], valid[y0 : y0 + rows] = self._from_file(strip, level)
-        return gray, valid
-
-    def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
-        both = self._read(Window(*(v << level for v in (window.x0, window.y0, window.width_px, window.height_px))))
-        for _ in range(level):
-            both = _halved(*both)
-        return both
-
-    def _level(self, level: int) -> tuple[Gray, Mask]:
-        if level not in self._kept:
-            at_base = level == self._base
-            self._kept[level] = self._streamed(level) if at_base else _halved(*self._level(level - 1))
-        return self._kept[level]
-
-    def crop(self, window: Window, level: int) -> tuple[Gray, Mask]:
-        """Grey and validity (h, w) of a window in pixels of a level."""
-        height, width = self.shape(level)
-        x1, y1 = window.x0 + window.width_px, window.y0 + window.height_px
-        if not (0 <= window.x0 < x1 <= width and 0 <= window.y0 < y1 <= height):
-            raise OptionError(f"window: expected one inside {width} x {height} px of level {level}, got {window}")
-        if level >= self._base:
-            gray, valid = self._level(level)
-            return gray[window.y0 : y1, window.x0 : x1], valid[window.y0 : y1, window.x0 : x1]
-        last = self._last
-        if last is None or last[0] != (window, level):  # grey and validity are often asked in turn
-            last = self._last = ((window, level), self._from_file(window, level))
-        return last[1]
-
-    @cached_property
-    def nodata_share(self) -> float:
-        """Share of the pixels that are not valid, at the finest level in memory."""
-        return 1.0 - float(self._level(self._base)[1].mean())
-
-    def valid_at(self, xy_px: Array) -> Mask:
-        """Validity (...,) of the nearest pixel at the finest level in memory."""
-        height, width = self.shape(self._base)
-        x, y = np.moveaxis(xy_px.astype(np.intp) >> self._base, -1, 0)
-        return np.asarray(self._level(self._base)[1][np.minimum(y, height - 1), np.minimum(x, width - 1)])
-
-
-def _halved(gray: Gray, valid: Mask) -> tuple[Gray, Mask]:
-    """2 x 2 area averages; valid where all four are. An odd last row or column is left out."""
-    import cv2
-
-    height, width = gray.shape[0] // 2, gray.shape[1] // 2
-    even = slice(0, 2 * height), slice(0, 2 * width)
-    small = cv2.resize(gray[even], (width, height), interpolation=cv2.INTER_AREA)
-    all_four = np.asarray(valid[even].reshape(height, 2, width, 2).all(axis=(1, 3)))
-    return np.asarray(small, np.uint8), all_four
+GROUND_REACH_M = 30.0
+"""So far about a place its ground is looked for: wider than what stands there, narrower than a hill."""
+_GROUND_PLACES = 15  # a side of the lattice on which it is
+_PLANE_ROUNDS = 8
+_PLANE_M = 0.3  # heights closer to the plane than this lie on it
+_ROUGH_M = 1.0  # heights about a place that differ by this much halve its weight
 
 
 class _Surface:
@@ -154,7 +87,12 @@ class OrthoMap:
         ground_m: level of the ground in the surface's datum: the 20th percentile of the surface over the valid
             part of the map, below roofs and crowns but not at the bottom of a pit; 0.0 without a surface.
         levels: number of levels of the pyramid.
+        georeference_sigma_m: one standard deviation of where the map lies, per axis; None where it does not say.
+        slope_sigma_deg: the same of how far the ground under a frame leans against the surface.
     """
+
+    georeference_sigma_m: float | None = None
+    slope_sigma_deg: float | None = None
 
     def __init__(
         self, name: str, grid: Grid, read: Read, source_crs: CRS, facts: dict[str, Any] | None = None
@@ -177,7 +115,7 @@ class OrthoMap:
         lonlat = self._to_geodetic(grid.lattice())
         (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
         self.bounds_deg = (float(west), float(south), float(east), float(north))
-        self._pyramid = _Pyramid(grid.width_px, grid.height_px, read)
+        self._pyramid = Pyramid(grid.width_px, grid.height_px, read)
         self.levels = self._pyramid.levels
 
     @classmethod
@@ -189,6 +127,8 @@ class OrthoMap:
         bounds_deg: tuple[float, float, float, float] | None = None,
         crs: Any = None,
         cache_dir: str | os.PathLike[str] | None = None,
+        georeference_sigma_m: float | None = None,
+        slope_sigma_deg: float | None = None,
     ) -> OrthoMap:
         """Open a GeoTIFF, or a picture whose place is given, with an optional surface model.
 
@@ -201,9 +141,13 @@ class OrthoMap:
             bounds_deg: west, south, east, north of the outer edges of a picture without georeference.
             crs: of a file that names none.
             cache_dir: where resampled maps are kept.
+            georeference_sigma_m: how well the map lies; None takes what the file says, see
+                :data:`engine.rasters.GEOREFERENCE_TAG`.
+            slope_sigma_deg: how well the surface leans; None takes what its file says.
 
         Raises:
             MapError: a file cannot be read or placed on the Earth, or the surface lies elsewhere.
+            OptionError: an accuracy is not a number above 0.
         """
         original = used = open_source(path, bounds_deg=bounds_deg, crs=crs)
         reader = GrayReader(original)
@@ -222,8 +166,13 @@ class OrthoMap:
             "surface_path": None if surface is None else os.fspath(surface),
         }
         site = cls(original.path.name, used.grid, reader.read, original.grid.crs, facts)
-        if surface is not None:
-            heights, lies = read_surface(open_source(surface, "surface"), site._grid)
+        site.georeference_sigma_m = stated_sigma(
+            georeference_sigma_m, original, GEOREFERENCE_TAG, "georeference_sigma_m"
+        )
+        heights_file = None if surface is None else open_source(surface, "surface")
+        site.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG, "slope_sigma_deg")
+        if heights_file is not None:
+            heights, lies = read_surface(heights_file, site._grid)
             site._attach(_Surface(heights, warp_between(site._grid, lies)))
         return site
 
@@ -236,6 +185,8 @@ class OrthoMap:
         *,
         surface_m: ArrayLike | None = None,
         valid: Mask | None = None,
+        georeference_sigma_m: float | None = None,
+        slope_sigma_deg: float | None = None,
     ) -> OrthoMap:
         """A map without a file, for simulators and tests.
 
@@ -245,8 +196,11 @@ class OrthoMap:
             crs: anything that pyproj takes.
             surface_m: (H, W) heights, NaN where unknown.
             valid: (H, W) bool, all where None.
+            georeference_sigma_m: how well the map lies, where that is known.
+            slope_sigma_deg: how well the surface leans, where that is known.
 
         Raises:
+            OptionError: an accuracy is not a number above 0.
             ShapeError: an array does not have the shape of the map.
             DtypeError: ``gray`` is not uint8.
             MapError: the grid is not metric and north-up.
@@ -274,6 +228,10 @@ class OrthoMap:
             return gray[part], mask[part]
 
         site = cls("arrays", grid, read, grid.crs)
+        site.georeference_sigma_m = stated_sigma(
+            georeference_sigma_m, None, GEOREFERENCE_TAG, "georeference_sigma_m"
+        )
+        site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG, "slope_sigma_deg")
         if heights is not None:
             site._attach(_Surface(heights, warp_between(grid, grid)))
         return site
@@ -326,6 +284,35 @@ class OrthoMap:
             return np.zeros(xy.shape[:-1])
         heights = self._surface.sample(xy)
         return np.where(np.isnan(heights), self.ground_m, heights)
+
+    def ground_at(self, xy_px: ArrayLike) -> float:
+        """Level of the bare ground at one pixel (2,), in the surface's datum: below its roofs and crowns.
+
+        The plane that the 20th percentile of the surface lies on, within :data:`GROUND_REACH_M`; a percentile alone
+        would lie below a slope. ``ground_m`` where nothing is known there; 0.0 without a surface.
+        """
+        if self._surface is None:
+            return self.ground_m
+        steps = np.linspace(-1.0, 1.0, _GROUND_PLACES) * (GROUND_REACH_M / self.gsd_m_per_px)
+        offsets_px = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        heights_m = self._surface.sample(np.asarray(xy_px, np.float64) + offsets_px)
+        known = np.isfinite(heights_m)
+        if np.count_nonzero(known) < 3:
+            return self.ground_m
+        return _lower_plane_m(offsets_px[known] / steps[-1], heights_m[known])
+
+    def steadiness_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
+        """Weight (...,) of what is seen at pixels (..., 2): 1 on level ground, less at walls, edges and crowns.
+
+        Where heights ``reach_px`` off differ from each other by a metre, what is seen may stand at either, and
+        weighs half.
+        """
+        xy = np.asarray(xy_px, np.float64)
+        if self._surface is None:
+            return np.ones(xy.shape[:-1])
+        about = [(0.0, 0.0), *((x, y) for x in (-reach_px, reach_px) for y in (-reach_px, reach_px))]
+        heights = [self.surface_at(xy + np.array(step)) for step in about]
+        return np.asarray(1.0 / (1.0 + (np.ptp(heights, axis=0) / _ROUGH_M) ** 2))
 
     def _exact_enu(self, xy_px: Array) -> Array:
         lonlat = self._to_geodetic(xy_px)
@@ -384,4 +371,22 @@ class OrthoMap:
             "nodata_share": self._pyramid.nodata_share,
             "surface_range_m": None if surface is None else list(surface.range_m),
             "ground_m": self.ground_m,
+            "georeference_sigma_m": self.georeference_sigma_m,
+            "slope_sigma_deg": self.slope_sigma_deg,
         }
+
+
+def _lower_plane_m(offsets: Array, heights_m: Array) -> float:
+    """The level at offset 0 of the plane with 20 % of the heights (N,) below it, at offsets (N, 2).
+
+    Quantile regression (Koenker and Bassett 1978) by reweighted least squares. Where the known places lie on one
+    line, the plane is the one that leans least.
+    """
+    terms = np.column_stack([np.ones(len(offsets)), offsets])
+    share, weights = GROUND_PERCENT / 100.0, np.ones(len(offsets))
+    for _ in range(_PLANE_ROUNDS):
+        weighted = terms.T * weights
+        plane = np.linalg.lstsq(weighted @ terms, weighted @ heights_m, rcond=1e-9)[0]
+        above = heights_m - terms @ plane
+        weights = np.where(above > 0.0, share, 1.0 - share) / np.maximum(np.abs(above), _PLANE_M)
+    return float(plane[0])

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import MapError
+from engine.errors import MapError, OptionError
 from engine.grids import Array, Grid, apply_affine, earth_crs, overlap, wgs84
 from engine.types import Window
 
@@ -51,6 +51,10 @@ COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
 OVERVIEW_PX = 4096
 """Stretch and collar are found on a copy of at most this many pixels a side."""
+GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
+"""Metadata item of a GeoTIFF: one standard deviation of where it lies, in metres per axis."""
+SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
+"""The same of a surface model: of how far the ground under a frame leans against it, in degrees."""
 _GDAL_CACHE_BYTES = 128 * 2**20  # GDAL's own cache is a twentieth of the machine's memory
 MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
@@ -65,6 +69,29 @@ class Source:
     path: Path
     dataset: Any
     grid: Grid
+
+
+def stated_sigma(given: float | None, source: Source | None, tag: str, argument: str) -> float | None:
+    """The accuracy that was given, else the one that a file says of itself, else None.
+
+    Raises:
+        OptionError: what was given is not a finite number above 0.
+        MapError: what the file says is not one.
+    """
+    text = None if source is None else source.dataset.tags().get(tag)
+    if given is not None:
+        if not 0.0 < given < math.inf:
+            raise OptionError(f"{argument}: expected a number above 0, got {given}")
+        return float(given)
+    if source is None or text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise MapError(f"{source.path}: expected a number above 0 as {tag}, got {text!r}")
+    return value
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
+from engine.formats.bags import BagFrames, is_bag
 from engine.formats.frames import FrameSource, VideoFile, exif_telemetry, open_frames
 from engine.formats.geotiff import write_geotiff
 from engine.formats.logs import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
@@ -19,6 +20,7 @@ from engine.formats.resampling import telemetry_at
 from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
 from engine.formats.truth import write_truth
 from engine.geo import wrap_heading_deg
+from engine.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.types import Frame, Prior, Truth
 
 _JPEG_QUALITY = 95
@@ -67,12 +69,16 @@ class Flight:
         return len(self.names)
 
     def __iter__(self) -> Iterator[FlightFrame]:
-        for i, name in enumerate(self.names):
-            image, row = self.source.read(name), self.rows[i] if self.rows else None
-            if row is None:
-                yield FlightFrame(name, Frame(image), None, None)
-            else:
-                yield FlightFrame(name, _frame(image, row), row.prior, row)
+        for index in range(len(self.names)):
+            yield self.read(index)
+
+    def read(self, index: int) -> FlightFrame:
+        """One frame of the flight; in a video cheap where indices come in ascending order."""
+        name, row = self.names[index], self.rows[index] if self.rows else None
+        image = self.source.read(name)
+        if row is None:
+            return FlightFrame(name, Frame(image), None, None)
+        return FlightFrame(name, _frame(image, row), row.prior, row)
 
 
 def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
@@ -93,22 +99,26 @@ def open_flight(
     telemetry: str | Path | None = None,
     camera: Camera | None = None,
     clock: LogClock = AS_LOGGED,
+    image_topic: str | None = None,
 ) -> Flight:
     """Open a flight and check up front that its parts belong together.
 
     Args:
-        frames: a folder of pictures, or a video.
-        telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT) whose quantities are brought to the frames'
-            moments; without it the photographs' EXIF, and where that has no times the pictures in natural
-            order with nothing known.
+        frames: a folder of pictures, a video, or a bag of ROS.
+        telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT, a bag) whose quantities are brought to the
+            frames' moments; without it the bag's own, or the photographs' EXIF, and where that has no times the
+            pictures in natural order with nothing known.
         camera: refuses the flight at once where the first picture has another size than the calibration.
         clock: when the frames were taken, where the telemetry is a log.
+        image_topic: of a bag's pictures; None for the only one.
 
     Raises:
         TelemetryError: a file cannot be read, or a row names a frame that is not there.
         CalibrationError: the first picture is of another size than the camera's.
     """
-    source = open_frames(frames)
+    source = BagFrames(Path(frames), image_topic) if is_bag(frames) else open_frames(frames)
+    if telemetry is None and isinstance(source, BagFrames):
+        telemetry = frames
     heights: dict[str, int] = {}
     if telemetry is not None and is_log(telemetry):
         log = open_log(telemetry)
@@ -136,6 +146,8 @@ def write_flight_folder(
     crs_epsg: int,
     surface_m: NDArray[Any] | None = None,
     start: Prior | None = None,
+    georeference_sigma_m: float | None = None,
+    slope_sigma_deg: float | None = None,
 ) -> None:
     """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
 
@@ -149,6 +161,8 @@ def write_flight_folder(
         crs_epsg: EPSG code of the CRS.
         surface_m: (H, W) heights on the map's grid, or None.
         start: a prior in latitude and longitude for the first row of the telemetry.
+        georeference_sigma_m: what map.tif says of its accuracy, or None: nothing.
+        slope_sigma_deg: what dsm.tif says of its own, or None: nothing.
 
     Raises:
         TelemetryError: a frame has no stamp, or a file cannot be written.
@@ -163,9 +177,12 @@ def write_flight_folder(
     write_telemetry(directory / "telemetry.csv", rows)
     write_truth(directory / "truth.csv", list(truth))
     (directory / "camera.yaml").write_text(_camera_info(camera), encoding="utf-8")
-    write_geotiff(directory / "map.tif", ortho_rgb, pixel_to_crs, crs_epsg)
+    tags = {} if georeference_sigma_m is None else {GEOREFERENCE_TAG: georeference_sigma_m}
+    write_geotiff(directory / "map.tif", ortho_rgb, pixel_to_crs, crs_epsg, tags=tags)
     if surface_m is not None:
-        write_geotiff(directory / "dsm.tif", np.asarray(surface_m, np.float32), pixel_to_crs, crs_epsg)
+        tags = {} if slope_sigma_deg is None else {SLOPE_TAG: slope_sigma_deg}
+        heights_m = np.asarray(surface_m, np.float32)
+        write_geotiff(directory / "dsm.tif", heights_m, pixel_to_crs, crs_epsg, tags=tags)
 
 
 def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow:

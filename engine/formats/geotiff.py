@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,13 @@ _DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 
 
 def write_geotiff(
-    path: str | Path, array: NDArray[Any], pixel_to_crs: ArrayLike, crs_epsg: int, nodata: float | None = None
+    path: str | Path,
+    array: NDArray[Any],
+    pixel_to_crs: ArrayLike,
+    crs_epsg: int,
+    nodata: float | None = None,
+    *,
+    tags: Mapping[str, object] | None = None,
 ) -> None:
     """Write a tiled, losslessly compressed GeoTIFF.
 
@@ -28,6 +35,7 @@ def write_geotiff(
         pixel_to_crs: affine map, (2, 3).
         crs_epsg: EPSG code of the CRS.
         nodata: the value that stands for nothing.
+        tags: metadata items, such as :data:`engine.rasters.GEOREFERENCE_TAG` and what it says.
 
     Raises:
         ShapeError: an argument has another shape.
@@ -46,11 +54,16 @@ def write_geotiff(
         raise OptionError(f"pixel_to_crs: expected a finite, invertible affine map, got {affine.tolist()}")
     corner = affine.copy()
     corner[:, 2] -= 0.5 * (affine[:, 0] + affine[:, 1])
-    _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs_epsg, nodata)
+    _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs_epsg, nodata, tags or {})
 
 
 def _write(
-    path: Path, bands: NDArray[Any], corner: NDArray[np.float64], crs_epsg: int, nodata: float | None
+    path: Path,
+    bands: NDArray[Any],
+    corner: NDArray[np.float64],
+    crs_epsg: int,
+    nodata: float | None,
+    tags: Mapping[str, object],
 ) -> None:
     import rasterio
     from rasterio.errors import RasterioError
@@ -76,5 +89,7 @@ def _write(
     try:
         with rasterio.open(path, "w", crs=rasterio.CRS.from_epsg(crs_epsg), **profile) as file:
             file.write(np.moveaxis(bands, 2, 0))
+            if tags:
+                file.update_tags(**{name: str(value) for name, value in tags.items()})
     except (RasterioError, OSError, ValueError) as error:
         raise MapError(f"{path}: cannot be written: {str(error).splitlines()[0]}") from None

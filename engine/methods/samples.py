@@ -20,7 +20,7 @@ CELL_PX = 504
 """Of a large level samples are taken cell by cell."""
 MAX_CELLS = 64
 MAX_SAMPLES = 2000
-_ROUGH_M = 1.0  # heights about a sample that differ by this much halve its weight: walls, edges of roofs, crowns
+_ROUGH_REACH_PX = 1.5  # of the level: this far off a sample
 
 
 class SampleMap:
@@ -88,14 +88,7 @@ class SampleMap:
         if region.valid is not None:
             weights = region.valid.cpu().numpy()[inner][rows, columns].astype(np.float64)
         height_m = self._site.surface_at(xy_px)
-        if self._site.has_surface:
-            reach_px = 1.5 * 2.0**level
-            about = [
-                self._site.surface_at(xy_px + np.array([dx, dy]))
-                for dx in (-reach_px, reach_px)
-                for dy in (-reach_px, reach_px)
-            ]
-            weights /= 1.0 + (np.ptp([height_m, *about], axis=0) / _ROUGH_M) ** 2
+        weights *= self._site.steadiness_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
         points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
         return Samples(points, picture[rows, columns].astype(np.float64), weights), shape
 
