@@ -174,8 +174,13 @@ def _scaled_to_peak(steady_deg: Array, swing: Array, peak_deg: float) -> Array:
     return steady_deg + low * swing
 
 
-def _course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[float]]:
-    """Acceleration (N, 2) in east and north, nose direction (N,) unwrapped in degrees, and times of kicks."""
+def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[float]]:
+    """Legs from stop to stop through waypoints (N, 2), every :data:`STEP_S`.
+
+    Returns:
+        Acceleration (N, 2) in east and north, nose direction (N,) unwrapped in degrees, and the times at which
+        speeding up, braking and stopping shake the vehicle.
+    """
     pause = round(style.pause_s / STEP_S)
     turn = 0.5 - 0.5 * np.cos(math.pi * np.clip(np.linspace(-0.25, 1.25, pause), 0.0, 1.0))
     pushes, noses, kicks = [], [], []
@@ -205,7 +210,7 @@ def fly(waypoints_m: Array, style: FlightStyle, rng: np.random.Generator) -> Mot
         style: speed, tilt and height.
         rng: source of vibration and wander.
     """
-    push, nose, kicks = _course(waypoints_m, style)
+    push, nose, kicks = course(waypoints_m, style)
     time = np.arange(len(push), dtype=np.float64) * STEP_S
     velocity = np.cumsum(push, axis=0) * STEP_S
     position = waypoints_m[0] + np.cumsum(velocity, axis=0) * STEP_S

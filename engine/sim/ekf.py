@@ -1,0 +1,232 @@
+"""The reference filter: an error-state EKF over IMU, barometer, compass, and positions of GPS or of the engine.
+
+Convention:
+    Fifteen states of the vehicle: errors of position, velocity, attitude (a small turn in east-north-up, applied
+    from the left), accelerometer bias and gyroscope bias. Two more, the barometer's drift and the compass's
+    error, which last so long that they would otherwise be taken for height and heading. After Solà,
+    "Quaternion kinematics for the error-state Kalman filter" (2017), section 7, with rotation matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import enu_from_body
+from engine.sim.quadrotor import GRAVITY, STEP_S, Felt, next_time_s
+from engine.sim.rotations import cross_matrix, rotation
+from engine.sim.sensors import GpsSample, SensorSuite
+from engine.types import Attitude, Fix
+
+Array = NDArray[np.float64]
+
+POSITION, VELOCITY, TURN, ACCEL, GYRO = (slice(k, k + 3) for k in range(0, 15, 3))
+BARO, COMPASS = 15, 16
+STATES = 17
+START_TILT_DEG = 0.5
+"""How well roll and pitch are known of a vehicle that was levelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What the filter believes of one moment.
+
+    Attributes:
+        time_s: of that moment.
+        position_m: (3,) east, north, up.
+        velocity_mps: (3,) the same.
+        enu_from_body: (3, 3) attitude.
+        accel_bias_mps2: (3,) in the body.
+        gyro_bias_rps: (3,) in the body.
+        baro_drift_m: what the barometer reads too high.
+        compass_bias_rad: what the compass reads too far clockwise.
+        covariance: (17, 17) of the errors, in the order of the attributes.
+    """
+
+    time_s: float
+    position_m: Array
+    velocity_mps: Array
+    enu_from_body: Array
+    accel_bias_mps2: Array
+    gyro_bias_rps: Array
+    baro_drift_m: float
+    compass_bias_rad: float
+    covariance: Array
+
+    @property
+    def sigma_m(self) -> float:
+        """Horizontal standard deviation, the larger axis of the ellipse."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
+
+
+def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> Belief:
+    """The belief of a vehicle at rest that was levelled: its heading is known as well as by its compass.
+
+    Args:
+        position_m: (3,) east, north, up.
+        sigma_m: of each of them.
+        attitude: of the body.
+        suite: what it carries.
+    """
+    imu = suite.imu
+    tilt = math.radians(START_TILT_DEG)
+    heading = math.radians(math.hypot(suite.compass.bias_deg, suite.compass.noise_deg))
+    sigmas = np.array(
+        [sigma_m] * 3 + [0.1] * 3 + [tilt, tilt, heading] + [imu.accel_start_mps2] * 3
+        + [imu.gyro_start_rps] * 3 + [0.02, math.radians(suite.compass.bias_deg)]
+    )  # fmt: skip
+    covariance = np.diag(sigmas**2)
+    # The heading is the compass's: as far as that reads too far clockwise, the nose lies anticlockwise of it.
+    up = TURN.start + 2
+    covariance[up, COMPASS] = covariance[COMPASS, up] = math.radians(suite.compass.bias_deg) ** 2
+    return Belief(
+        0.0,
+        np.asarray(position_m, float),
+        np.zeros(3),
+        enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg),
+        np.zeros(3),
+        np.zeros(3),
+        0.0,
+        0.0,
+        covariance,
+    )
+
+
+def predict(belief: Belief, sample: Felt, suite: SensorSuite) -> Belief:
+    """The belief one step later, by what the IMU measured meanwhile."""
+    rates, dt = sample.rates_rps - belief.gyro_bias_rps, STEP_S
+    half = belief.enu_from_body @ rotation(0.5 * dt * rates)
+    force = half @ (sample.force_mps2 - belief.accel_bias_mps2)
+    acceleration = force + GRAVITY
+    keep_accel = math.exp(-dt / suite.imu.accel_time_s)
+    keep_gyro = math.exp(-dt / suite.imu.gyro_time_s)
+    keep_baro = math.exp(-dt / suite.barometer.drift_time_s)
+    F = _motion(half, force, keep_accel, keep_gyro, keep_baro)
+    covariance = F @ belief.covariance @ F.T
+    covariance[_DIAGONAL] += _process_noise(suite)
+    return Belief(
+        next_time_s(belief.time_s),
+        belief.position_m + dt * belief.velocity_mps + 0.5 * dt**2 * acceleration,
+        belief.velocity_mps + dt * acceleration,
+        belief.enu_from_body @ rotation(dt * rates),
+        keep_accel * belief.accel_bias_mps2,
+        keep_gyro * belief.gyro_bias_rps,
+        keep_baro * belief.baro_drift_m,
+        belief.compass_bias_rad,
+        covariance,
+    )
+
+
+_DIAGONAL = np.diag_indices(STATES)
+
+
+def _motion(half: Array, force: Array, keep_accel: float, keep_gyro: float, keep_baro: float) -> Array:
+    """(17, 17) how the errors of one moment become those of the next."""
+    dt, F = STEP_S, np.eye(STATES)
+    F[POSITION, VELOCITY] = dt * np.eye(3)
+    F[VELOCITY, TURN] = -dt * cross_matrix(force)
+    F[VELOCITY, ACCEL] = -dt * half
+    F[POSITION, TURN], F[POSITION, ACCEL] = 0.5 * dt * F[VELOCITY, TURN], 0.5 * dt * F[VELOCITY, ACCEL]
+    F[TURN, GYRO] = -dt * half
+    F[VELOCITY, GYRO] = 0.5 * F[VELOCITY, TURN] @ F[TURN, GYRO]
+    F[ACCEL, ACCEL], F[GYRO, GYRO], F[BARO, BARO] = keep_accel * np.eye(3), keep_gyro * np.eye(3), keep_baro
+    return F
+
+
+def _process_noise(suite: SensorSuite) -> Array:
+    """(17,) variances that one step adds; the same in every direction, so that attitude does not enter."""
+    imu, baro = suite.imu, suite.barometer
+    drive = [0.0, imu.accel_noise, imu.gyro_noise, imu.accel_walk, imu.gyro_walk]
+    drift = baro.drift_m * math.sqrt(2.0 / baro.drift_time_s)
+    return STEP_S * np.concatenate([np.repeat(drive, 3), [drift, 0.0]]) ** 2
+
+
+def correct(belief: Belief, residual: Array, H: Array, R: Array) -> Belief:
+    """The belief after a measurement (Joseph's form, which keeps the covariance positive definite).
+
+    Args:
+        belief: before.
+        residual: (M,) measured less expected.
+        H: (M, 17) how the errors enter the measurement.
+        R: (M, M) covariance of its noise.
+    """
+    P = belief.covariance
+    gain = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+    kept = np.eye(STATES) - gain @ H
+    covariance = kept @ P @ kept.T + gain @ R @ gain.T
+    error = gain @ residual
+    # Taking the turn into the attitude moves the others' frame by half of it (Solà, eq. 287): too little to keep.
+    return Belief(
+        belief.time_s,
+        belief.position_m + error[POSITION],
+        belief.velocity_mps + error[VELOCITY],
+        rotation(error[TURN]) @ belief.enu_from_body,
+        belief.accel_bias_mps2 + error[ACCEL],
+        belief.gyro_bias_rps + error[GYRO],
+        belief.baro_drift_m + float(error[BARO]),
+        belief.compass_bias_rad + float(error[COMPASS]),
+        0.5 * (covariance + covariance.T),
+    )
+
+
+def fuse_height(belief: Belief, height_m: float, suite: SensorSuite) -> Belief:
+    """Takes in the barometer."""
+    H = np.zeros((1, STATES))
+    H[0, 2] = H[0, BARO] = 1.0
+    residual = np.array([height_m - belief.position_m[2] - belief.baro_drift_m])
+    return correct(belief, residual, H, np.array([[suite.barometer.noise_m**2]]))
+
+
+def fuse_heading(belief: Belief, heading_deg: float, suite: SensorSuite) -> Belief:
+    """Takes in the compass; a body that points straight up or down has no heading."""
+    east, north, up = belief.enu_from_body[:, 0].tolist()
+    flat2 = east**2 + north**2
+    if flat2 < 1e-3:
+        return belief
+    H = np.zeros((1, STATES))
+    # d atan2(east, north) under a turn from the left, which moves the nose by turn x nose.
+    H[0, TURN] = (up * east / flat2, up * north / flat2, -1.0)
+    H[0, COMPASS] = 1.0
+    off = math.radians(heading_deg) - math.atan2(east, north) - belief.compass_bias_rad
+    residual = np.array([(off + math.pi) % (2.0 * math.pi) - math.pi])
+    return correct(belief, residual, H, np.array([[math.radians(suite.compass.noise_deg) ** 2]]))
+
+
+def fuse_range(belief: Belief, range_m: float, suite: SensorSuite, surface_m: float = 0.0) -> Belief:
+    """Takes in the rangefinder over level ground at ``surface_m``; its beam's tilt is taken as believed."""
+    descent = max(-float(belief.enu_from_body[2, 2]), 0.1)
+    H = np.zeros((1, STATES))
+    H[0, 2] = 1.0
+    residual = np.array([range_m * descent + surface_m - belief.position_m[2]])
+    return correct(belief, residual, H, np.array([[(suite.rangefinder.noise_m * descent) ** 2]]))
+
+
+def fuse_gps(belief: Belief, sample: GpsSample, suite: SensorSuite) -> Belief:
+    """Takes in position and velocity of the receiver, at the moment that they are of."""
+    gps = suite.gps
+    variances = np.array([gps.noise_m] * 2 + [gps.height_noise_m] + [gps.velocity_noise_mps] * 3) ** 2
+    residual = np.concatenate([sample.position_m - belief.position_m, sample.velocity_mps - belief.velocity_mps])
+    return correct(belief, residual, np.eye(6, STATES), np.diag(variances))
+
+
+def fuse_fix(belief: Belief, fix: Fix) -> Belief:
+    """Takes in a fix of the engine with its covariance, at its capture; its height too where it has one.
+
+    Args:
+        belief: of the moment of capture, about the same origin and in the same datum of heights.
+        fix: what the engine said of it.
+    """
+    place = [fix.east_m, fix.north_m] + ([] if fix.up_m is None else [fix.up_m])
+    count = len(place)
+    spread = fix.covariance_m2[:count, :count]
+    return correct(belief, np.array(place) - belief.position_m[:count], np.eye(count, STATES), spread)
+
+
+def fix_chi_square(belief: Belief, fix: Fix) -> float:
+    """Squared horizontal distance of a fix from the belief, in units of both covariances: 2 degrees of freedom."""
+    apart = np.array([fix.east_m, fix.north_m]) - belief.position_m[:2]
+    spread = belief.covariance[:2, :2] + fix.covariance_m2[:2, :2]
+    return float(apart @ np.linalg.solve(spread, apart))

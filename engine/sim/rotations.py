@@ -1,0 +1,41 @@
+"""Rotations as vectors: the turn about an axis by its length in radians, there and back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def cross_matrix(v: Array) -> Array:
+    """(3, 3) that multiplies as the cross product with v does."""
+    x, y, z = v.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation(vector_rad: Array) -> Array:
+    """(3, 3) turn about a vector (3,) by its length in radians (Rodrigues)."""
+    x, y, z = vector_rad.tolist()
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    a = math.sin(angle) / angle if angle > 1e-6 else 1.0 - angle2 / 6.0
+    b = (1.0 - math.cos(angle)) / angle2 if angle > 1e-4 else 0.5 - angle2 / 24.0
+    c = 1.0 - b * angle2
+    return np.array(
+        [
+            [c + b * x * x, b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, c + b * y * y, b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, c + b * z * z],
+        ]
+    )
+
+
+def rotation_vector(matrix: Array) -> Array:
+    """(3,) whose :func:`rotation` this is, for turns of less than half a circle."""
+    twice_sine = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    sine = 0.5 * float(np.linalg.norm(twice_sine))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(matrix)) - 1.0))
+    return np.asarray(twice_sine * (0.5 if sine < 1e-9 else 0.5 * angle / sine), dtype=np.float64)
