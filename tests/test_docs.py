@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import engine
 from engine.cli.app import app
 from engine.cli.demo import write_flight
 from engine.formats.track import COLUMNS
@@ -68,6 +69,13 @@ def test_every_page_is_reached_from_the_readme():
     assert {page.resolve() for page in PAGES} - {ROOT / "README.md"} <= linked
 
 
+def test_the_site_shows_every_page_and_every_public_name():
+    nav = re.findall(r": (\S+\.md)$", read("mkdocs.yml"), re.MULTILINE)
+    assert sorted(nav) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+    told = re.findall(r"^::: engine\.(\w+)$", read("docs/api.md"), re.MULTILINE)
+    assert sorted(told) == sorted(engine.__all__)
+
+
 def test_pages_fit_the_line():
     for page in PAGES:
         prose = CODE.sub("", page.read_text(encoding="utf-8"))
@@ -125,7 +133,9 @@ def test_columns_of_the_track_are_listed():
 def test_every_command_has_its_section():
     told = set(re.findall(r"^## (.+)$", read("docs/command-line.md"), re.MULTILINE))
     commands = {(info.callback.__name__ if info.callback else "") for info in app.registered_commands}
-    assert told == commands | {"map info", "map audit"}
+    for group in app.registered_groups:
+        commands |= {f"{group.name} {info.name}" for info in group.typer_instance.registered_commands}
+    assert told == commands
 
 
 def test_the_changelog_names_the_version():

@@ -173,6 +173,37 @@ def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_pa
     assert written.stat().st_size > 100
 
 
+def test_the_truth_comes_at_the_moments_of_the_fixes_about_the_same_origin(tmp_path, capfd):
+    write_track(tmp_path / "track.csv", ROWS)
+    names = ("map", "surface", "truth", "method", "profile", "ground_m", "ground_amsl_m")
+    settings = dict.fromkeys(names) | {"origin": {"lat_deg": 32.5, "lon_deg": 35.25}}
+    (tmp_path / "summary.json").write_text(json.dumps({"settings": settings}))
+    # 100 m north of the origin at T0, another 4 m in each second; it ends before the last two fixes.
+    degrees_a_metre = 1.0 / 110_888.0  # of latitude at 32.5 degrees
+    rows = [f"{T0 + k * 10**9},{32.5 + (100 + 4 * k) * degrees_a_metre:.9f},35.25" for k in (0, 1)]
+    rows.append(f"{T0 + 1_600_000_000},{32.5 + 106.4 * degrees_a_metre:.9f},35.25")
+    (tmp_path / "t.csv").write_text("timestamp_ns,lat_deg,lon_deg\n" + "\n".join(rows) + "\n")
+    arguments = ["export", str(tmp_path), "--format", "tum", "--truth", str(tmp_path / "t.csv"), "--json"]
+    assert run(arguments) == 0
+    assert json.loads(capfd.readouterr().out)["fixes"] == 4
+    lines = (tmp_path / "truth.tum").read_text().splitlines()[1:]
+    values = [[float(value) for value in line.split()[1:4]] for line in lines]
+    assert [line.split()[0][-11:] for line in lines] == [
+        "0.000000000",
+        "0.250000000",
+        "0.750000000",
+        "1.500000000",
+    ]
+    expected = [[0.0, 100.0 + 4.0 * t, 0.0] for t in (0.0, 0.25, 0.75, 1.5)]
+    assert [value for row in values for value in row] == pytest.approx(
+        [value for row in expected for value in row], abs=0.02
+    )
+    assert run(arguments) == 2
+    (tmp_path / "t.csv").write_text("timestamp_ns,lat_deg,lon_deg\n1,32.5,35.25\n2,32.5,35.25\n")
+    assert run([*arguments, "--force"]) == 1
+    assert "expected the truth at the moment of a fix, got none" in capfd.readouterr().err
+
+
 def test_the_command_refuses_in_one_line(tmp_path, capfd):
     def refused(*arguments):
         code, error = run(["export", str(tmp_path), *arguments]), capfd.readouterr().err

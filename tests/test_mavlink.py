@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -20,20 +22,24 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.links import parse_connection
 from engine.adapters.mavlink import LEAST_HZ, Bridge
-from engine.adapters.mavlink_in import WANTED, Clock, Origin, Series, Telemetry, Vehicle
+from engine.adapters.mavlink_in import WANTED, Clock, Telemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
     FixVelocity,
     Outgoing,
     Sending,
     Velocity,
+    command_message,
+    heartbeat_message,
     make_message,
-    north_east_m,
     pose_covariance,
+    set_origin_message,
+    timesync_message,
     why_withheld,
 )
 from engine.adapters.packets import Decoder, Encoder, read_key, signing_time
 from engine.adapters.parameters import parameter_file
+from engine.adapters.vehicle import Origin, Series, Vehicle, north_east_m
 from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
@@ -80,6 +86,27 @@ def test_bytes_are_the_golden_ones(firmware, kind):
     made = encoded(make_message(sending(), Outgoing(firmware=firmware, message=kind)))
     golden = bytes.fromhex((GOLDEN / f"{firmware}-{kind}.hex").read_text(encoding="ascii"))
     assert made.hex() == golden.hex()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("heartbeat", heartbeat_message()),
+        ("timesync-question", timesync_message(12_345_678_901)),
+        ("timesync-answer", timesync_message(12_345_678_901, 5_000_000_007)),
+        ("set_gps_global_origin", set_origin_message(1, ORIGIN, 12_345_678_901)),
+        ("ask-origin", command_message(1, mavlink.MAV_CMD_REQUEST_MESSAGE, 49)),
+        ("ask-attitude", command_message(1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1e6 / 50)),
+    ],
+)
+def test_bytes_of_all_that_is_sent_beside_fixes_are_the_golden_ones(name, message):
+    assert encoded(message).hex() == (GOLDEN / f"{name}.hex").read_text(encoding="ascii").strip()
+
+
+def test_signed_bytes_are_the_golden_ones(monkeypatch):
+    monkeypatch.setattr("engine.adapters.packets.signing_time", lambda: 10 * 365 * 86400 * 100_000)
+    made = Encoder(1, KEY).encode(make_message(sending(), Outgoing()))
+    assert made.hex() == (GOLDEN / "ardupilot-signed.hex").read_text(encoding="ascii").strip()
 
 
 def test_golden_bytes_are_made_without_the_engine(tmp_path):
@@ -261,6 +288,21 @@ def test_height_is_by_the_rangefinder_then_the_clearance_then_above_home():
     assert heard(home, clear, beam, tilted).height_agl_m == pytest.approx(50.0)
 
 
+def test_a_rangefinder_without_a_stamp_counts_from_its_arrival():
+    beam = mavlink.MAVLink_rangefinder_message(80.0, 1.0)
+    level = mavlink.MAVLink_attitude_message(5000, 0, 0, 0, 0, 0, 0)
+    assert heard(level, beam).height_agl_m == pytest.approx(80.0)
+    assert heard(level, mavlink.MAVLink_rangefinder_message(0.0, 0.0)).height_agl_m is None
+
+
+def test_the_date_is_the_autopilots_and_none_where_it_has_none():
+    telemetry, unix_us = Telemetry(), 1_700_000_000_000_000
+    telemetry.update(mavlink.MAVLink_system_time_message(0, 5000), 10_000_000_000)  # no date before a GPS fix
+    assert telemetry.unix_offset_ns() is None
+    telemetry.update(mavlink.MAVLink_system_time_message(unix_us, 6000), 11_000_000_000)
+    assert telemetry.unix_offset_ns() == unix_us * 1000 - 11_000_000_000
+
+
 def test_series_go_the_shorter_way_round_and_grow_stale():
     series = Series((True,))
     series.add(0, 350.0)
@@ -307,6 +349,28 @@ def test_an_autopilot_that_starts_again_is_followed():
     assert telemetry.origin is None
 
 
+def test_a_restart_shows_in_timesync_before_it_shows_in_the_stamps():
+    """Its first answer after the restart is quicker than all before it, and must not pass for a better one."""
+    telemetry, boot_ns = Telemetry(), 60_000_000_000
+
+    def ask(now_ns, since_boot_ns, trip_ns):
+        telemetry.sync_asked(now_ns)
+        answer = mavlink.MAVLink_timesync_message(since_boot_ns, now_ns)
+        telemetry.update(answer, now_ns + trip_ns)
+
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
+    for k in range(10):
+        ask(k * 500_000_000, boot_ns + k * 500_000_000 + 10_000_000, 20_000_000)
+    assert telemetry.origin is not None
+    ask(5_000_000_000, boot_ns + 5_300_000_000, 600_000_000)  # a slow answer is no restart
+    assert telemetry.origin is not None
+    ask(6_000_000_000, 1_000_000, 2_000_000)
+    assert telemetry.origin is None
+    ask(6_500_000_000, 501_000_000, 2_000_000)
+    telemetry.update(mavlink.MAVLink_attitude_message(550, 0.2, 0, 0, 0, 0, 0), 6_552_000_000)
+    assert telemetry.vehicle(6_549_000_000).roll_deg == pytest.approx(math.degrees(0.2))
+
+
 # ------------------------------------------------------------------------------------------------ security
 
 
@@ -333,6 +397,13 @@ def test_packets_may_be_cut_anywhere_in_a_stream_but_not_in_datagrams():
     half = len(beat(autopilot())) // 2
     assert not datagrams.feed(beat(autopilot())[:half])
     assert len(datagrams.feed(beat(autopilot()))) == 1  # the half before it is forgotten
+
+
+def test_a_datagram_of_noise_is_given_up_soon():
+    noise, datagrams = b"\xfd\x10\x00" * 20_000, decoder(is_stream=False)
+    assert not datagrams.feed(noise)
+    assert datagrams.dropped < 100  # not the 20,000 packets that may begin in it
+    assert len(datagrams.feed(noise[:30] + beat(autopilot()))) == 1
 
 
 def test_strangers_are_not_heard():
@@ -383,6 +454,22 @@ def test_hours_of_traffic_leave_nothing_behind():
     from bench.fuzz_mavlink import growth_bytes
 
     assert growth_bytes(hours=0.05) < 20_000
+
+
+def test_minutes_of_the_hour_in_which_everything_goes_wrong():
+    from bench.bridge_hour import hour
+
+    flown = hour(minutes=1.5, flood_pieces=2000)
+    assert flown["due"] > 200
+    nothing = ("missing", "twice", "foreign", "unwanted")
+    assert {name: flown[name] for name in nothing} == dict.fromkeys(nothing, 0)
+    assert flown["steps"] == flown["resets"]
+    assert flown["reconnections"] == 2
+    assert flown["least_hz"] >= LEAST_HZ
+    assert flown["stamp_off_ms"] < 12.5  # half of what the link may take
+    assert flown["place_off_m"] < 0.01
+    assert flown["heading_off_deg"] < 1.0
+    assert flown["unplaced"] == 0
 
 
 def test_random_and_mutated_packets_harm_nothing():
@@ -671,6 +758,38 @@ def test_with_a_key_an_unsigned_autopilot_is_not_answered(bridge_to):
         fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
 
 
+def test_with_a_key_what_is_not_signed_cannot_steer_even_from_the_vehicles_own_address(bridge_to):
+    made = bridge_to(key=KEY)
+    with Standin(made.port, origin=(336400000, 729900000, 510000), key=KEY) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        liar = autopilot()
+        lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(liar) + beat(liar)
+        lies += mavlink.MAVLink_attitude_message(1, 1.0, 1.0, 1.0, 0, 0, 0).pack(liar)
+        before = made.bridge.status.dropped
+        for _ in range(50):
+            pilot.socket.send(lies)
+        fly(made.bridge, lambda: made.bridge.status.dropped >= before + 100)
+        fly(made.bridge, lambda: len(made.navigator.frames) > 5)
+        assert made.navigator.frames[-1].roll_deg == pytest.approx(0.0)
+    assert made.bridge.telemetry.origin.lat_deg == pytest.approx(33.64)
+
+
+@pytest.mark.skipif(not Path("/proc/net/udp").exists(), reason="asks Linux which sockets are open")
+def test_the_open_sockets_are_those_of_loopback(bridge_to):
+    bridge_to()
+    own = {os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if fd_is_there(fd)}
+    addresses = []
+    for table in ("udp", "udp6", "tcp", "tcp6"):
+        rows = [line.split() for line in Path(f"/proc/net/{table}").read_text(encoding="ascii").splitlines()[1:]]
+        addresses += [(table, row[1].split(":")[0]) for row in rows if f"socket:[{row[9]}]" in own]
+    assert addresses
+    assert set(addresses) <= {("udp", "0100007F"), ("tcp", "0100007F")}  # 127.0.0.1, as the kernel writes it
+
+
+def fd_is_there(fd):
+    return os.path.lexists(f"/proc/self/fd/{fd}")
+
+
 def test_a_flood_and_a_stranger_do_not_steer_it(bridge_to):
     made = bridge_to()
     rng = random.Random(4)
@@ -707,3 +826,52 @@ def test_tcp_reconnects_after_the_link_drops(monkeypatch):
                     assert bridge.connected
                     assert other.recv(1) == b"\xfd"
                     assert bridge.status.reconnections == expected
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pair of serial ports")
+def test_a_serial_port_takes_halves_and_its_loss_is_survived(monkeypatch):
+    import tty
+
+    pytest.importorskip("serial")
+    monkeypatch.setattr("engine.adapters.mavlink._REOPEN_S", 0.05)
+    vehicle, port = os.openpty()
+    tty.setraw(vehicle)
+    tty.setraw(port)
+    packet = beat(autopilot())
+    with Bridge(parse_connection(f"serial:{os.ttyname(port)}:115200"), lambda _: Matched(), Outgoing()) as bridge:
+        os.write(vehicle, packet[:7])
+        time.sleep(0.05)
+        assert not bridge.connected
+        os.write(vehicle, packet[7:])
+        wait_until(lambda: bridge.connected)
+        assert os.read(vehicle, 1) == b"\xfd"
+        os.close(vehicle)
+        wait_until(lambda: not bridge.connected)
+    os.close(port)
+
+
+def wait_until(holds, timeout_s=10.0):
+    end = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+# ---------------------------------------------------------------------------------------------- the page
+
+
+def test_the_table_of_traps_names_tests_and_code_that_are_there():
+    page = (Path(__file__).parents[1] / "docs" / "mavlink.md").read_text(encoding="utf-8")
+    rows = [
+        line for line in page.split("## The traps", 1)[1].split("\n## ", 1)[0].splitlines() if "`test_" in line
+    ]
+    assert len(rows) > 12
+    here = set(re.findall(r"^def (test_\w+)", Path(__file__).read_text(encoding="utf-8"), re.MULTILINE))
+    code = "".join(
+        path.read_text(encoding="utf-8") for path in (Path(__file__).parents[1] / "engine").rglob("*.py")
+    )
+    for row in rows:
+        _, _, where, tests, _ = row.split("|")
+        assert set(re.findall(r"`(test_\w+)`", tests)) <= here, row
+        for name in re.findall(r"`([\w.]+)`", where):
+            assert re.search(rf"\b{name.split('.')[-1]}\b", code), name

@@ -173,7 +173,9 @@ class _Serial:
         try:
             import serial
         except ImportError:
-            raise BackendError("serial: expected pyserial to be installed: pip install pyserial") from None
+            raise BackendError(
+                "serial: expected pyserial to be installed: pip install 'scenematch[mavlink]'"
+            ) from None
         self._port: Any = serial.Serial(device, baud, timeout=0, write_timeout=1.0)
 
     def receive(self, timeout_s: float) -> list[tuple[bytes, Sender]]:

@@ -18,9 +18,20 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.links import Connection, Link, Sender
-from engine.adapters.mavlink_in import FIRMWARES, STREAMS_HZ, WANTED, Origin, Telemetry
-from engine.adapters.mavlink_out import FixVelocity, Outgoing, Sending, make_message, why_withheld
-from engine.adapters.packets import AUTOPILOT, Decoder, Encoder
+from engine.adapters.mavlink_in import FIRMWARES, STREAMS_HZ, WANTED, Telemetry
+from engine.adapters.mavlink_out import (
+    FixVelocity,
+    Outgoing,
+    Sending,
+    command_message,
+    heartbeat_message,
+    make_message,
+    set_origin_message,
+    timesync_message,
+    why_withheld,
+)
+from engine.adapters.packets import Decoder, Encoder
+from engine.adapters.vehicle import Origin
 from engine.live import Answer, Live, LiveOptions
 from engine.navigator import Navigator
 from engine.types import Fix, NoFix, Prior
@@ -111,7 +122,8 @@ class Bridge:
         self._least_age_ms: float | None = None
         self._peer: Sender = None
         self._met_ns = 0  # when the vehicle was heard first, or again
-        self._due_ns = {"beat": 0, "sync": 0, "ask": 0}
+        self._originless_ns = 0  # since when the autopilot states no origin
+        self._done_ns = {"beat": 0, "sync": 0, "ask": 0}
         self._closed = threading.Event()
         self._link: Link | None = connection.open()
         self._decoder = self._new_decoder(self._link)
@@ -247,34 +259,28 @@ class Bridge:
             if sender != self._peer:
                 continue  # only a heartbeat makes somebody the vehicle
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                self._send(mavlink.MAVLink_timesync_message(time.monotonic_ns(), message.ts1))
+                self._send(timesync_message(time.monotonic_ns(), message.ts1))
             self.telemetry.update(message, now_ns)
 
     def _meet(self, now_ns: int) -> None:
         """The vehicle is heard for the first time, or again."""
         self._counts["reconnections"] += self._met_ns != 0
-        self._met_ns = now_ns
-        self._due_ns["ask"] = self._due_ns["sync"] = 0
+        self._met_ns = self._originless_ns = now_ns
+        self._done_ns["ask"] = self._done_ns["sync"] = 0
         self.telemetry.forget()
 
     def _keep_alive(self) -> None:
         """What is sent by the clock: heartbeats always, questions while the vehicle is heard."""
         now_ns = time.monotonic_ns()
         if self._is_due("beat", now_ns, 1.0):
-            self._send(
-                mavlink.MAVLink_heartbeat_message(
-                    mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-                    mavlink.MAV_AUTOPILOT_INVALID,
-                    *(0, 0),
-                    mavlink.MAV_STATE_ACTIVE,
-                    3,
-                )
-            )
+            self._send(heartbeat_message())
         if not self.connected:
             return
         if self._is_due("sync", now_ns, 0.5):
             self.telemetry.sync_asked(now_ns)
-            self._send(mavlink.MAVLink_timesync_message(0, now_ns))
+            self._send(timesync_message(now_ns))
+        if self.telemetry.origin is not None:
+            self._originless_ns = now_ns
         if self._is_due("ask", now_ns, 10.0 if self.telemetry.origin else 1.0):
             self._ask(now_ns)
 
@@ -283,26 +289,16 @@ class Bridge:
         for number, rate_hz in STREAMS_HZ.items():
             self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
         self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        missing = self.telemetry.origin is None and now_ns - self._met_ns > _ORIGIN_PATIENCE_NS
-        if missing and self._origin is not None:
-            self._send(
-                mavlink.MAVLink_set_gps_global_origin_message(
-                    self._system_id,
-                    round(self._origin.lat_deg * 1e7),
-                    round(self._origin.lon_deg * 1e7),
-                    round(self._origin.alt_amsl_m * 1e3),
-                    now_ns // 1000,
-                )
-            )
+        if self._origin is not None and now_ns - self._originless_ns > _ORIGIN_PATIENCE_NS:
+            self._send(set_origin_message(self._system_id, self._origin, now_ns))
 
     def _command(self, command: int, *values: float) -> None:
-        padded = (*values, *(0.0,) * (7 - len(values)))
-        self._send(mavlink.MAVLink_command_long_message(self._system_id, AUTOPILOT, command, 0, *padded))
+        self._send(command_message(self._system_id, command, *values))
 
     def _is_due(self, what: str, now_ns: int, every_s: float) -> bool:
-        due = now_ns >= self._due_ns[what]
+        due = now_ns - self._done_ns[what] >= round(every_s * 1e9)
         if due:
-            self._due_ns[what] = now_ns + round(every_s * 1e9)
+            self._done_ns[what] = now_ns
         return due
 
     def _send(self, message: Any) -> bool:

@@ -8,14 +8,11 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.types import Frame
+from engine.adapters.vehicle import ANGLES, Origin, Series, Vehicle, only
 
 FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 STREAMS_HZ = {
@@ -38,95 +35,12 @@ WANTED = frozenset(
 )
 """Numbers of the messages that are understood."""
 
-_STALE_NS = 500_000_000  # further from its neighbour than this a capture is not described by it
-_KEPT = 128  # samples of each series
 _CLOCK_SAMPLES = 64
 _CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot has started again
 _STALE_IN_A_ROW = 20  # stamps that far back, after which the same is taken to be so
 _UNKNOWN_BELOW_M = -1000.0  # of ALTITUDE, by MAVLink's definition
 _UNIX_USEC = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100; others mean that it has no date
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
-_ANGLES = (True, True, True)
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Where the autopilot's NED begins."""
-
-    lat_deg: float
-    lon_deg: float
-    alt_amsl_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Vehicle:
-    """What the vehicle knew at one moment; None where it did not say.
-
-    Attributes:
-        height_agl_m: by the rangefinder, else the distance to the ground that the autopilot states, else the
-            height above home.
-        alt_amsl_m: height above mean sea level.
-        down_m: below the autopilot's origin.
-        up_velocity_mps: positive in a climb.
-    """
-
-    roll_deg: float | None = None
-    pitch_deg: float | None = None
-    heading_deg: float | None = None
-    east_velocity_mps: float | None = None
-    north_velocity_mps: float | None = None
-    up_velocity_mps: float | None = None
-    height_agl_m: float | None = None
-    alt_amsl_m: float | None = None
-    down_m: float | None = None
-
-    def frame(self, image: NDArray[np.uint8], captured_ns: int) -> Frame:
-        """The frame of a picture that was taken at this moment."""
-        return Frame(
-            image,
-            captured_ns,
-            self.height_agl_m,
-            self.heading_deg,
-            self.roll_deg,
-            self.pitch_deg,
-            self.east_velocity_mps,
-            self.north_velocity_mps,
-        )
-
-
-class Series:
-    """Values over time, the newest few.
-
-    Args:
-        angles: which of the values are degrees and go the shorter way round; empty for none.
-    """
-
-    def __init__(self, angles: tuple[bool, ...] = ()) -> None:
-        self._angles = angles
-        self._samples: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_KEPT)
-
-    def add(self, time_ns: int, *values: float) -> None:
-        """One more sample; dropped where it is not finite or not newer than the last."""
-        newer = not self._samples or time_ns > self._samples[-1][0]
-        if newer and all(map(math.isfinite, values)):
-            self._samples.append((time_ns, values))
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._samples.clear()
-
-    def at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The values at a moment, interpolated; the nearest where one side is missing, None where it is stale."""
-        before = next((s for s in reversed(self._samples) if s[0] <= time_ns), None)
-        after = next((s for s in self._samples if s[0] >= time_ns), None)
-        near = [s for s in (before, after) if s is not None and abs(s[0] - time_ns) <= _STALE_NS]
-        if len(near) < 2 or near[0][0] == near[1][0]:
-            return near[0][1] if near else None
-        (t0, first), (t1, last) = near
-        share = (time_ns - t0) / (t1 - t0)
-        steps = [b - a for a, b in zip(first, last, strict=True)]
-        steps = [math.remainder(d, 360.0) if i < len(self._angles) else d for i, d in enumerate(steps)]
-        return tuple(a + share * d for a, d in zip(first, steps, strict=True))
 
 
 class Clock:
@@ -151,11 +65,20 @@ class Clock:
         """A TIMESYNC request with this stamp was sent."""
         self._asked.append(now_ns)
 
-    def answered(self, stamp_ns: int, theirs_ns: int, now_ns: int) -> None:
-        """Take an answer; one that nobody asked for is ignored."""
-        if stamp_ns in self._asked:
-            self._asked.remove(stamp_ns)
-            self._by_sync.append((now_ns - stamp_ns, theirs_ns - (stamp_ns + now_ns) // 2))
+    def answered(self, stamp_ns: int, theirs_ns: int, now_ns: int) -> bool:
+        """Take an answer; one that nobody asked for is ignored.
+
+        Returns:
+            False where it is another clock than in the answers before: the autopilot has started again.
+        """
+        if stamp_ns not in self._asked:
+            return True
+        self._asked.remove(stamp_ns)
+        trip_ns, offset_ns = now_ns - stamp_ns, theirs_ns - (stamp_ns + now_ns) // 2
+        if self._by_sync and abs(offset_ns - min(self._by_sync)[1]) > _CLOCK_JUMP_NS + trip_ns // 2:
+            return False
+        self._by_sync.append((trip_ns, offset_ns))
+        return True
 
     def ours_ns(self, theirs_ns: int, arrival_ns: int) -> int | None:
         """When it was on our clock, never after it arrived; None where that lies a second or more back."""
@@ -172,7 +95,7 @@ class Telemetry:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._clock = Clock()
-        self._attitude, self._velocity = Series(_ANGLES), Series()
+        self._attitude, self._velocity = Series(ANGLES), Series()
         self._range, self._clearance, self._relative = Series(), Series(), Series()
         self._alt_amsl, self._down = Series(), Series()
         self._unix_offset_ns: int | None = None
@@ -214,15 +137,15 @@ class Telemetry:
                 north_velocity_mps=north,
                 up_velocity_mps=up,
                 height_agl_m=self._height_agl_m(time_ns, roll or 0.0, pitch or 0.0),
-                alt_amsl_m=_only(self._alt_amsl.at(time_ns)),
-                down_m=_only(self._down.at(time_ns)),
+                alt_amsl_m=only(self._alt_amsl.at(time_ns)),
+                down_m=only(self._down.at(time_ns)),
             )
 
     def _height_agl_m(self, time_ns: int, roll_deg: float, pitch_deg: float) -> float | None:
-        slant_m = _only(self._range.at(time_ns))
+        slant_m = only(self._range.at(time_ns))
         if slant_m is not None:  # the beam is fixed to the body
             slant_m *= math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg))
-        heights = (slant_m, _only(self._clearance.at(time_ns)), _only(self._relative.at(time_ns)))
+        heights = (slant_m, only(self._clearance.at(time_ns)), only(self._relative.at(time_ns)))
         return next((height for height in heights if height is not None and height > 0.0), None)
 
     def _update(self, message: Any, arrival_ns: int) -> None:
@@ -231,8 +154,8 @@ class Telemetry:
             if message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
                 self.firmware, self.heard_ns = message.autopilot, arrival_ns
         elif kind == "TIMESYNC":
-            if message.tc1 != 0:
-                self._clock.answered(message.ts1, message.tc1, arrival_ns)
+            if message.tc1 != 0 and not self._clock.answered(message.ts1, message.tc1, arrival_ns):
+                self._start_again()
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._set_origin(message)
         elif kind == "RANGEFINDER":  # has no stamp
@@ -295,7 +218,3 @@ class Telemetry:
         lat_deg, lon_deg = message.latitude * 1e-7, message.longitude * 1e-7
         if (message.latitude, message.longitude) != (0, 0) and abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0:
             self.origin = Origin(lat_deg, lon_deg, message.altitude * 1e-3)
-
-
-def _only(values: tuple[float, ...] | None) -> float | None:
-    return None if values is None else values[0]

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.mavlink_in import FIRMWARES, Origin, Vehicle
+from engine.adapters.mavlink_in import FIRMWARES
+from engine.adapters.packets import AUTOPILOT
 from engine.adapters.parameters import MAX_DELAY_MS
+from engine.adapters.vehicle import ANGLE_VARIANCE, Origin, Vehicle, north_east_m
 from engine.errors import OptionError
 from engine.geo import enu_from_body
 from engine.types import Fix, check_positive
@@ -28,9 +30,6 @@ MESSAGES = {
 SENSOR_ID = 1
 """Of GLOBAL_POSITION_SENSOR; PX4 takes the sensor that its EKF2_AGP0_ID names, and 0 names none."""
 
-_ANGLE_VARIANCE = math.radians(10.0) ** 2  # the attitude is the vehicle's own, and nothing to learn from
-_ARDUPILOT_M_PER_1E7_DEG = 0.011131884502145034
-_PX4_EARTH_M = 6371000.0
 _GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
 _VELOCITY_S = (0.4, 1.5)  # how far apart two fixes are that give a velocity
 _ACCELERATION_MPS2 = 3.0  # such a velocity is that of half the time before
@@ -170,26 +169,28 @@ def make_message(sending: Sending, options: Outgoing) -> Any:
     return _gps_input(sending) if options.kind == "gps_input" else _global_position_sensor(sending)
 
 
-def north_east_m(lat_deg: float, lon_deg: float, origin: Origin, firmware: str) -> tuple[float, float]:
-    """North and east of the origin in the firmware's own projection, so that it finds the latitude again.
+def heartbeat_message() -> Any:
+    """That the bridge is there: a companion computer, no autopilot."""
+    kind, nobody = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+    return mavlink.MAVLink_heartbeat_message(kind, nobody, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
 
-    ArduPilot scales degrees as on a sphere of 6,378.1 km, PX4 projects azimuthally from one of 6,371 km. WGS84
-    is neither: a kilometre away its tangent plane is up to metres off what they make of it.
-    """
-    if firmware == "ardupilot":
-        middle = math.radians(0.5 * (lat_deg + origin.lat_deg))
-        north_1e7 = (lat_deg - origin.lat_deg) * 1e7
-        east_1e7 = math.remainder(lon_deg - origin.lon_deg, 360.0) * 1e7
-        east_m = east_1e7 * _ARDUPILOT_M_PER_1E7_DEG * max(math.cos(middle), 0.01)
-        return north_1e7 * _ARDUPILOT_M_PER_1E7_DEG, east_m
-    lat, lat0 = math.radians(lat_deg), math.radians(origin.lat_deg)
-    turn = math.radians(lon_deg - origin.lon_deg)
-    north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(turn)
-    east = math.cos(lat) * math.sin(turn)
-    along = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(turn)
-    sine = math.hypot(north, east)
-    factor = math.atan2(sine, along) / sine if sine > 0.0 else 1.0
-    return factor * north * _PX4_EARTH_M, factor * east * _PX4_EARTH_M
+
+def timesync_message(now_ns: int, asked_ns: int | None = None) -> Any:
+    """A question for the time now, or the answer to one with the stamp ``asked_ns``."""
+    return mavlink.MAVLink_timesync_message(*((0, now_ns) if asked_ns is None else (now_ns, asked_ns)))
+
+
+def set_origin_message(system_id: int, origin: Origin, now_ns: int) -> Any:
+    """The origin for an autopilot that has none."""
+    lat_1e7, lon_1e7 = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
+    alt_mm = round(origin.alt_amsl_m * 1e3)
+    return mavlink.MAVLink_set_gps_global_origin_message(system_id, lat_1e7, lon_1e7, alt_mm, now_ns // 1000)
+
+
+def command_message(system_id: int, command: int, *values: float) -> Any:
+    """A command to the autopilot, its other values 0."""
+    padded = (*values, *(0.0,) * (7 - len(values)))
+    return mavlink.MAVLink_command_long_message(system_id, AUTOPILOT, command, 0, *padded)
 
 
 def pose_covariance(fix: Fix) -> list[float]:
@@ -202,7 +203,7 @@ def pose_covariance(fix: Fix) -> list[float]:
     pose = np.zeros((6, 6))
     pose[0, 0], pose[0, 1], pose[1, 1] = c[1, 1], c[0, 1], c[0, 0]
     pose[2, 2] = fix.sigma_m**2
-    pose[3, 3] = pose[4, 4] = pose[5, 5] = _ANGLE_VARIANCE
+    pose[3, 3] = pose[4, 4] = pose[5, 5] = ANGLE_VARIANCE
     return [float(v) for v in pose[np.triu_indices(6)]]
 
 

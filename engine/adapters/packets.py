@@ -18,6 +18,7 @@ BRIDGE = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
 _MOST_BYTES = 65536  # of a stream that never makes a packet
+_MOST_FAILED = 64  # beginnings in a datagram that are none, after which the rest is noise: a flood must stay cheap
 _SIGNING_EPOCH_S = 1420070400  # 1 January 2015, from which signatures count
 _STREAM_AGE = 60 * 100_000  # how far behind our clock a new signed stream may begin, in 10 us
 
@@ -91,7 +92,7 @@ class Decoder:
         """The messages that these bytes complete."""
         self._buffer += data
         messages: list[Any] = []
-        at = 0
+        at = failed = 0
         while (at := self._start(at)) < len(self._buffer):
             size = self._size(at)
             if size is None or at + size > len(self._buffer):
@@ -103,6 +104,9 @@ class Decoder:
             message = self._decode(packet)
             if message is None:
                 self.dropped += 1
+                failed += 1
+                if failed > _MOST_FAILED and not self._is_stream:
+                    break
                 at += 1  # no packet begins here, or none of which anybody knows where it ends
                 continue
             at += size

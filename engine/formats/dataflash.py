@@ -72,7 +72,11 @@ def read_dataflash(path: Path) -> Log:
     if not data.startswith(_HEAD + bytes([_FMT])):
         got = data[:3].hex(" ")
         raise TelemetryError(f"{path}: expected a DataFlash log, which begins with A3 95 80, got {got}")
-    found = {name: columns for name, columns in _messages(data).items() if columns}
+    with np.errstate(all="ignore"):  # damage may make any numbers, signalling NaNs among them
+        return _log(path, {name: columns for name, columns in _messages(data).items() if columns})
+
+
+def _log(path: Path, found: Mapping[str, Columns]) -> Log:
     stamps = {name: _stamps_ns(columns) for name, columns in found.items()}
     position = "POS" if "POS" in found else "GPS"
     series: dict[str, Series | None] = {
@@ -147,8 +151,7 @@ def _columns(known: _Format, rows: list[bytes]) -> Columns:
     columns = {field: np.full(len(table), np.nan) for field in ("TimeUS", *_FIELDS[known.name])}
     for field, kind in zip(known.columns, known.kinds, strict=True):
         if field in columns and table[field].dtype.kind in "iuf":
-            with np.errstate(invalid="ignore"):  # damage may make a signalling NaN
-                columns[field] = table[field].astype(np.float64) / _KINDS[kind][1]
+            columns[field] = table[field].astype(np.float64) / _KINDS[kind][1]
     keep = np.isfinite(columns["TimeUS"]) & (np.abs(columns["TimeUS"]) < _LONGEST_US)
     for field in ("I", "C", "Instance"):  # logs from before there were instances have none
         if field in columns:

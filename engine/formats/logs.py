@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import OptionError, TelemetryError
+from engine.formats.bags import BagFrames, is_bag, read_bag
 from engine.formats.dataflash import read_dataflash
 from engine.formats.frames import FrameSource, VideoFile, exif_telemetry
 from engine.formats.resampling import EPOCH_NS, Log, truth_of
@@ -26,8 +27,8 @@ class LogClock:
     """When the frames of a flight with a log were taken.
 
     Attributes:
-        stamps: a CSV with ``timestamp_ns`` and ``frame``; without it the video's own times, the log's camera
-            messages or the photographs' EXIF.
+        stamps: a CSV with ``timestamp_ns`` and ``frame``; without it the video's or bag's own times, the log's
+            camera messages or the photographs' EXIF.
         offset_s: added to every frame's stamp.
 
     Raises:
@@ -47,18 +48,20 @@ AS_LOGGED = LogClock()
 
 
 def is_log(path: str | Path) -> bool:
-    """Whether a file is a flight log, by its ending."""
-    return Path(path).suffix.lower() in LOG_SUFFIXES
+    """Whether a path is a flight log or a bag, by its ending."""
+    return Path(path).suffix.lower() in LOG_SUFFIXES or is_bag(path)
 
 
 def open_log(path: str | Path) -> Log:
-    """Read a flight log: ArduPilot's DataFlash (.BIN), PX4's ULog (.ulg) or DJI's subtitles (.SRT).
+    """Read a flight log: ArduPilot's DataFlash (.BIN), PX4's ULog (.ulg), DJI's subtitles (.SRT), or a bag of ROS.
 
     Raises:
         TelemetryError: the file cannot be read, is none of them, or knows nothing of use.
     """
     path = Path(path)
     try:
+        if is_bag(path):
+            return read_bag(path)
         if path.stat().st_size == 0:
             raise TelemetryError(f"{path}: expected a flight log, got an empty file")
         return _READERS[path.suffix.lower()](path)
@@ -88,7 +91,7 @@ def _own_stamps(source: FrameSource, log: Log, clock: LogClock) -> tuple[list[in
     if clock.stamps is not None:
         rows = read_telemetry(clock.stamps, source, source.described)
         return [row.timestamp_ns for row in rows], [row.frame for row in rows]
-    if isinstance(source, VideoFile):
+    if isinstance(source, (VideoFile, BagFrames)):
         stamps_ns = source.stamps_ns()
         return stamps_ns, source.names[: len(stamps_ns)]
     if log.captures_ns.size:
@@ -108,7 +111,7 @@ def _own_stamps(source: FrameSource, log: Log, clock: LogClock) -> tuple[list[in
 
 
 def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
-    """Truth from truth.csv, or a log's own positions.
+    """Truth from truth.csv, or a log's own positions; of a bag those under ``/truth``, where it has them.
 
     Args:
         path: truth.csv or a log.
@@ -119,4 +122,5 @@ def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
     """
     if not is_log(path):
         return read_truth(path)
-    return truth_of(open_log(path), utc=stamp_ns is not None and stamp_ns >= EPOCH_NS)
+    log = read_bag(Path(path), truth=True) if is_bag(path) else open_log(path)
+    return truth_of(log, utc=stamp_ns is not None and stamp_ns >= EPOCH_NS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from engine.errors import TelemetryError
 
 _PLACES = (16, 17, 18, 19, 21, 22, 31, 82)  # MAVLink commands that go to the latitude and longitude they carry
 _RETURN = 20
+_DEGREES_BELOW = 1e9
 _LARGEST_BYTES = 64 << 20
 
 
@@ -79,7 +79,8 @@ def _numbers(point: Any) -> list[Any]:
 def _place(lat_lon: list[Any], shown: Any) -> tuple[float, float]:
     """Latitude and longitude that can be on the Earth."""
     for value in lat_lon:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        # Compared before it is converted: JSON has whole numbers that no float holds, and Python's reads NaN.
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _DEGREES_BELOW:
             raise TelemetryError(f"expected a latitude and a longitude in degrees, got {str(shown)[:60]}")
     lat, lon = float(lat_lon[0]), float(lat_lon[1])
     if abs(lat) > 90.0 or abs(lon) > 360.0:

@@ -2,7 +2,8 @@
 
 Convention:
     The clock is microseconds since the autopilot started; a message that says when it was sampled
-    (``timestamp_sample``) is stamped so. Of topics with several instances the first is read.
+    (``timestamp_sample``) is stamped so. Of topics with several instances the first is read. An estimator's own
+    topic stands for the vehicle's where a log has none, and ``sensor_gps`` for ``vehicle_gps_position``.
 """
 
 from __future__ import annotations
@@ -31,7 +32,14 @@ _TOPICS = (
     "camera_capture",
     "camera_trigger",
 )
+_ELSE = {  # of the same fields; a log of few topics, or of one estimator among several, may have these alone
+    "vehicle_attitude": "estimator_attitude",
+    "vehicle_local_position": "estimator_local_position",
+    "vehicle_global_position": "estimator_global_position",
+    "vehicle_gps_position": "sensor_gps",
+}
 _DOWN, _FIX_3D = 25, 3
+_MOST_ENDS = 16  # how often a parser that makes its way comes to the end of a file
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -48,11 +56,27 @@ def read_ulog(path: Path) -> Log:
         raise TelemetryError(f"{path}: expected a ULog, which begins with 'ULog' 01 12 35, got {head.hex(' ')}")
     topics = _topics(path)
     try:
-        series = _attitude(topics) | _velocity(topics) | _position(topics)
-        captures = next((_stamps_ns(topics[n]) for n in ("camera_capture", "camera_trigger") if n in topics), ())
-        return make_log(path, series, _heights(topics), captures, _utc_ns(topics))
+        with np.errstate(all="ignore"):  # damage may make any numbers, signalling NaNs among them
+            series = _attitude(topics) | _velocity(topics) | _position(topics)
+            cameras = (topics[name] for name in ("camera_capture", "camera_trigger") if name in topics)
+            captures = next(map(_stamps_ns, cameras), ())
+            return make_log(path, series, _heights(topics), captures, _utc_ns(topics))
     except KeyError as error:
         raise TelemetryError(f"{path}: expected a topic of PX4 with the field {error}, got one without") from None
+
+
+class _Watched(io.BufferedReader):
+    """A file for pyulog, which leads some that are damaged in circles: behind the end, and back before it."""
+
+    _ends = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read; comes to an end where the end was come to again and again."""
+        data = super().read(size)
+        self._ends += size is not None and len(data) < size
+        if self._ends > _MOST_ENDS:
+            raise EOFError("its definitions are damaged")
+        return data
 
 
 def _topics(path: Path) -> dict[str, Columns]:
@@ -63,13 +87,14 @@ def _topics(path: Path) -> dict[str, Columns]:
         raise TelemetryError(f"{path}: a ULog needs pyulog: pip install 'scenematch[logs]'") from None
     # The parser prints what it skips, and fails in its own ways on a file that is damaged.
     quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
-    with path.open("rb") as file, quiet[0], quiet[1]:
+    with _Watched(io.FileIO(path)) as file, quiet[0], quiet[1]:
         try:
-            log: Any = ULog(file, list(_TOPICS))
+            log: Any = ULog(file, [*_TOPICS, *_ELSE.values()])
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise TelemetryError(f"{path}: expected a ULog that can be read: {reason}") from None
-    return {topic.name: topic.data for topic in reversed(log.data_list) if _counts(topic.data, "timestamp")}
+    found = {topic.name: topic.data for topic in reversed(log.data_list) if _counts(topic.data, "timestamp")}
+    return {name: found[other] for name, other in _ELSE.items() if other in found} | found
 
 
 def _counts(topic: Columns, field: str) -> bool:

@@ -71,8 +71,32 @@ PACKETS = {
         source=mavlink.GLOBAL_POSITION_SRC_VISION, flags=0, lat=336410000, lon=729920000, alt_ellipsoid=NAN,
         alt=NAN, eph=0.5, epv=NAN,
     ),
+    "heartbeat": mavlink.MAVLink_heartbeat_message(
+        type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER, autopilot=mavlink.MAV_AUTOPILOT_INVALID, base_mode=0,
+        custom_mode=0, system_status=mavlink.MAV_STATE_ACTIVE, mavlink_version=3,
+    ),
+    "timesync-question": mavlink.MAVLink_timesync_message(tc1=0, ts1=12_345_678_901),
+    "timesync-answer": mavlink.MAVLink_timesync_message(tc1=12_345_678_901, ts1=5_000_000_007),
+    "set_gps_global_origin": mavlink.MAVLink_set_gps_global_origin_message(
+        target_system=1, latitude=336400000, longitude=729900000, altitude=510000, time_usec=12345678,
+    ),
+    "ask-origin": mavlink.MAVLink_command_long_message(
+        target_system=1, target_component=1, command=mavlink.MAV_CMD_REQUEST_MESSAGE, confirmation=0,
+        param1=49.0, param2=0.0, param3=0.0, param4=0.0, param5=0.0, param6=0.0, param7=0.0,
+    ),
+    "ask-attitude": mavlink.MAVLink_command_long_message(
+        target_system=1, target_component=1, command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, confirmation=0,
+        param1=30.0, param2=20000.0, param3=0.0, param4=0.0, param5=0.0, param6=0.0, param7=0.0,
+    ),
 }  # fmt: skip
 
 for name, message in PACKETS.items():
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
     (OUT / f"{name}.hex").write_text(message.pack(sender).hex() + "\n", encoding="ascii")
+
+# The same fix, signed 10 years after signatures began to count.
+signer = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
+signer.signing.secret_key, signer.signing.sign_outgoing = bytes(range(32)), True
+signer.signing.timestamp = 10 * 365 * 86400 * 100_000
+signed = PACKETS["ardupilot-vision_position_estimate"].pack(signer)
+(OUT / "ardupilot-signed.hex").write_text(signed.hex() + "\n", encoding="ascii")
