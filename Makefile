@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test check package bench integrity bench-flights bench-latency clean
+.PHONY: demo test check package docs bench integrity simulated bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -40,6 +40,9 @@ package: $(VENV)/dev.stamp
 	build/clean/bin/pip --disable-pip-version-check install --quiet dist/*.whl
 	cd build && clean/bin/scenematch doctor && clean/bin/scenematch demo --frames 4 --out flown
 
+docs: $(VENV)/dev.stamp
+	$(BIN)/python -m mkdocs build --quiet
+
 bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks
 	$(BIN)/python -m pytest bench --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
@@ -47,6 +50,10 @@ bench: $(VENV)/bench.stamp
 
 integrity: $(VENV)/dev.stamp
 	$(BIN)/python -m bench.integrity
+	$(BIN)/python -m bench.nees
+
+simulated: $(VENV)/dev.stamp
+	$(BIN)/python -m bench.simulated
 
 bench-flights: $(VENV)/dev.stamp
 	$(BIN)/python -m bench.flights

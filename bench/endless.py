@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -92,8 +91,7 @@ def draw(count: int | None = None, dive_m: float = DIVE_M, rate_hz: float = RATE
     truth, told = (replace(m, position_m=m.position_m + dive) for m in (plan.truth, plan.telemetry))
     plan = replace(plan, truth=truth, telemetry=told)
     town = plan.town
-    gray = np.asarray(cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
-    site = OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m)
+    site = town.site()
     places = [site.frame.enu_from_geodetic(row.lat_deg, row.lon_deg)[:2] for row in plan.truth_rows()]
     return Course(site, plan.camera, list(plan.iter_frames()), np.array(places), round(1e9 / rate_hz))
 

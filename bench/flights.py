@@ -72,9 +72,7 @@ def recorded(name: str, step: int, **accuracy: float | None) -> Recorded:
 def simulated() -> Recorded:
     """Every second frame of the built-in flight."""
     plan = plan_flight(SIMULATED_SEED, rate_hz=SIMULATED_HZ)
-    town = plan.town
-    gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
-    site = OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m)
+    site = plan.town.site()
     frames: list[tuple[Frame, Prior | None]] = [(frame, None) for frame in plan.iter_frames()]
     return Recorded("built-in", 2, site, plan.camera, frames, plan.truth_rows(), Ground(site.ground_m))
 

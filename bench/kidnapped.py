@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,9 +54,7 @@ class Flight:
 @cache
 def town_site(seed: int) -> OrthoMap:
     """The map of a simulated town with its surface model; it is of noon in every light."""
-    town = build_town(seed)
-    gray = np.asarray(cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
-    return OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m)
+    return build_town(seed).site()
 
 
 def simulated(seed: int, starts: int, light: str = "noon") -> Flight:

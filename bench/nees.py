@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from engine.methods.laid import NccOptions
 from engine.methods.sift import SiftOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import plan_flight
+from engine.sim.town import EXACT
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,6 @@ CHI_SQUARE_95 = 5.991  # two degrees of freedom
 STRETCHES = 8  # whose means tell how well the mean of all is known
 STUDENT_95 = 2.365  # of seven degrees of freedom
 SIGMA_M, OFF_M = 8.0, 4.0
-EXACT = 1e-3  # metres and degrees that an exact map says it is off
 BEGIN, END = "<!-- written by bench.nees -->", "<!-- end of what bench.nees writes -->"
 METHODS = ("NCC, peak", "NCC, refined", "SIFT", "auto", "NCC, no attitude")
 
@@ -115,16 +114,7 @@ class Sample:
 def town(seed: int, light: str = "noon") -> Flight:
     """A flight over a simulated town, whose map is of noon and says that it is exact."""
     plan = plan_flight(seed, rate_hz=0.45, light=light)
-    drawn = plan.town
-    gray = np.asarray(cv2.cvtColor(drawn.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
-    site = OrthoMap.from_arrays(
-        gray,
-        drawn.pixel_to_crs,
-        f"EPSG:{drawn.crs_epsg}",
-        surface_m=drawn.surface_m,
-        georeference_sigma_m=EXACT,
-        slope_sigma_deg=EXACT,
-    )
+    site = plan.town.site()
     frames, truth = list(plan.iter_frames()), plan.truth_rows()
     places = [site.frame.enu_from_geodetic(t.lat_deg, t.lon_deg) for t in truth]
     ups = [np.nan if t.height_agl_m is None else t.height_agl_m + site.ground_m for t in truth]

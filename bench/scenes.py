@@ -65,9 +65,7 @@ class Flight:
 def flight(count: int = 40) -> Flight:
     """Every fourth frame of the built-in flight, with a prior a few metres off."""
     plan = plan_flight(1, rate_hz=0.28)
-    town = plan.town
-    gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
-    site = OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m)
+    site = plan.town.site()
     frames, truth = list(plan.iter_frames())[:count], plan.truth_rows()[:count]
     rng = np.random.default_rng(0)
     priors = []

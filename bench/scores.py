@@ -77,9 +77,7 @@ class Trial:
 def simulated(light: str) -> Iterator[Flight]:
     for seed in SEEDS:
         plan = plan_flight(seed, rate_hz=0.28, light=light)
-        gray = cv2.cvtColor(plan.town.ortho, cv2.COLOR_RGB2GRAY)
-        crs = f"EPSG:{plan.town.crs_epsg}"
-        site = OrthoMap.from_arrays(gray, plan.town.pixel_to_crs, crs, surface_m=plan.town.surface_m)
+        site = plan.town.site()
         places = [(row.lat_deg, row.lon_deg) for row in plan.truth_rows()]
         yield Flight(f"{seed}", site, plan.camera, list(zip(plan.iter_frames(), places, strict=True)))
 

@@ -27,7 +27,7 @@ from engine.formats.track import track_row
 from engine.geo import LocalFrame
 from engine.navigator import BELIEVE_ALL
 from engine.report.metrics import Ground, summarise
-from engine.sim import CONDITIONS, Optics, Plan, Town, build_town, picture_at, plan_flight
+from engine.sim import CONDITIONS, Optics, Plan, build_town, picture_at, plan_flight
 from engine.sim.render import transformer
 from engine.types import Attitude
 
@@ -63,12 +63,6 @@ class Run:
     summary: dict[str, Any]
 
 
-def site_of(town: Town) -> OrthoMap:
-    """The map of a town as the engine has it."""
-    gray = np.asarray(cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
-    return OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m)
-
-
 def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str, Any]]:
     """Each way to match over a map, warmed up."""
     for method, profile in ways:
@@ -100,7 +94,7 @@ def flights(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
         for day in DAYS:
             plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, condition=day)
             if not ready:
-                site = site_of(plan.town)
+                site = plan.town.site()
                 ready = list(matchers(site, plan.camera, WAYS))
             yield from fly(plan, day, ready, site)
 
@@ -110,7 +104,7 @@ def harder(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
     for name, options in HARDER.items():
         for seed in seeds:
             plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, **options)
-            site = site_of(plan.town)
+            site = plan.town.site()
             yield from fly(plan, name, list(matchers(site, plan.camera, WAYS[:2])), site)
 
 

@@ -140,9 +140,7 @@ def ground(name: int | str, *, map_only: bool = False) -> Ground:
 def _town(seed: int, map_only: bool) -> Ground:
     lights = {light: plan_flight(seed, rate_hz=0.56, light=light) for light in ("noon", "evening")}
     plan = lights["noon"]
-    drawn = plan.town
-    gray = np.asarray(cv2.cvtColor(drawn.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
-    site = OrthoMap.from_arrays(gray, drawn.pixel_to_crs, f"EPSG:{drawn.crs_epsg}", surface_m=drawn.surface_m)
+    site = plan.town.site()
     noon, evening = (
         [frame for _, frame in zip(range(0 if map_only else FRAMES), one.iter_frames(), strict=False)]
         for one in lights.values()

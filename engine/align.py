@@ -137,7 +137,7 @@ def _masked(picture: Image, weight: Image | None) -> Image:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How a level plane under the camera is seen, in map pixels about the nadir.
+    """How a plane under the camera is seen, in map pixels about the nadir.
 
     Attributes:
         image_from_map: (3, 3) homography; map pixels relative to the nadir to frame pixels.
@@ -152,8 +152,10 @@ class View:
     area_px: float
 
 
-def view_of(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array) -> View | None:
-    """The camera's view of level ground ``height_m`` below it.
+def view_of(
+    camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array, slope_m_per_px: Array | None = None
+) -> View | None:
+    """The camera's view of ground ``height_m`` below it, level or leaning.
 
     Equation 2 (scale) and equation 3 (rotation) are the special case of a level camera: the homography holds
     s = h / (f gsd) and psi - psi_m, and with them the tilt. The map's own rotation against true north and its
@@ -162,22 +164,28 @@ def view_of(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: A
     Args:
         camera: pinhole (the frame is undistorted).
         attitude: of the body.
-        height_m: above the plane that is looked at.
+        height_m: above the plane that is looked at, along the vertical.
         enu_jacobian: (2, 2) metres east and north per map pixel x and y.
+        slope_m_per_px: (2,) rise of the plane per map pixel x and y; None is level.
 
     Returns:
-        View | None: None where a corner of the frame looks too near the horizon, see :data:`MAX_RAY_DEG`.
+        View | None: None where a corner of the frame looks too near the horizon, see :data:`MAX_RAY_DEG`, or along
+        the plane.
     """
     enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
     rays = camera.frame_rays @ enu_from_camera.T
     down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
     if down.min() < np.cos(np.radians(MAX_RAY_DEG)):
         return None
-    ground_m = rays[:, :2] * (height_m / -rays[:, 2:])
+    slope = np.zeros(2) if slope_m_per_px is None else slope_m_per_px
+    sink = rays[:, :2] @ np.linalg.solve(enu_jacobian.T, slope) - rays[:, 2]  # of a ray towards the plane
+    if sink.min() <= 0.0:
+        return None
+    ground_m = rays[:, :2] * (height_m / sink)[:, None]
     ground_px = np.linalg.solve(enu_jacobian, ground_m.T).T
     extent = np.ptp(ground_px[:4], axis=0)
     plane = np.zeros((3, 3))  # map pixels about the nadir to east, north, up of the ground below the camera
-    plane[:2, :2], plane[2, 2] = enu_jacobian, -height_m
+    plane[:2, :2], plane[2, :2], plane[2, 2] = enu_jacobian, slope, -height_m
     return View(
         camera.matrix @ enu_from_camera.T @ plane,
         ground_px[4],

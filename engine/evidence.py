@@ -1,4 +1,4 @@
-"""What a correlation peak has to say for itself, and how probable it is then that it is the right place.
+"""What a peak or a pose has to say for itself, and how probable it is then that it is the right place.
 
 A peak is high over a wrong place too, where streets or furrows run alike. What tells the two apart is how far it
 stands out from chance, how near its best rival comes, and whether the place is where it was expected. One logistic
@@ -14,9 +14,24 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.types import Peak
+from engine.types import Fix, Peak
 
+_FEWEST_ALARMS = 60.0  # powers of ten; beyond them nothing is surer
 _FARTHEST = 12.0  # chi-square against the prior: beyond it the prior may be the one that is wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """How a place lies to where it was expected.
+
+    Attributes:
+        off_prior: chi-square of two degrees of freedom of the place against the prior, by the errors of both.
+        spread_m: one standard deviation of these errors, the mean of both axes: the wider, the more places would
+            have done as well.
+    """
+
+    off_prior: float
+    spread_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,12 +41,27 @@ class Evidence:
     Attributes:
         sigmas: Fisher's z of the score, in standard deviations of chance.
         ratio: the best rival's score as a share of the peak's, in [0, 1].
-        off_prior: chi-square of two degrees of freedom of the place against the prior.
+        expected: how its place lies to the prior.
     """
 
     sigmas: float
     ratio: float
-    off_prior: float
+    expected: Expected
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEvidence:
+    """What was measured of a pose by matched features.
+
+    Attributes:
+        log10_nfa: log10 of how many poses chance would support as well.
+        off_prior: chi-square of two degrees of freedom of the place against the prior; None where there is none.
+        off_height: chi-square of one of the height against the telemetry's; None where that tells or proves none.
+    """
+
+    log10_nfa: float
+    off_prior: float | None
+    off_height: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,35 +72,78 @@ class Logistic:
     log_sigmas: float
     ratio: float
     off_prior: float
+    log_spread: float
 
 
-FITTED = Logistic(9.338, 1.103, -11.318, -0.532)
-"""Of 11,968 matches over six towns, half of them without an answer."""
+FITTED = Logistic(constant=14.293, log_sigmas=0.709, ratio=-13.15, off_prior=-0.582, log_spread=-1.315)
+"""Of 4,200 matches over six towns, half of them without an answer."""
 
 
-def evidence_of(peak: Peak, sigma: float, off_prior: float) -> Evidence:
+@dataclass(frozen=True, slots=True)
+class PoseLogistic:
+    """Weights of :func:`terms` of a pose."""
+
+    constant: float
+    false_alarms: float
+    off_prior: float
+    no_prior: float
+    off_height: float
+    no_height: float
+
+
+FITTED_POSE = PoseLogistic(
+    constant=3.934, false_alarms=0.769, off_prior=-0.144, no_prior=-1.819, off_height=-0.264, no_height=0.511
+)
+"""Of 4,200 matches, with what telemetry tells left out in turns and the frame reduced as budgets ask."""
+
+
+def evidence_of(peak: Peak, sigma: float, expected: Expected) -> Evidence:
     """The evidence of a peak.
 
     Args:
         peak: the peak.
         sigma: one standard deviation of a score of chance, from :func:`engine.integrity.score_sigma`.
-        off_prior: chi-square of its place against the prior.
+        expected: how its place lies to the prior.
     """
     z = math.atanh(min(max(peak.score, 0.0), 0.999))
     ratio = max(peak.second_score, 0.0) / max(peak.score, 1e-3)
-    return Evidence(sigmas=z / sigma, ratio=min(ratio, 1.0), off_prior=off_prior)
+    return Evidence(sigmas=z / sigma, ratio=min(ratio, 1.0), expected=expected)
 
 
-def terms(evidence: Evidence) -> NDArray[np.float64]:
-    """(4,) what the weights are multiplied by.
+def expected_of(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> Expected:
+    """How a fix lies to a prior (2,) east and north with one standard deviation per axis."""
+    apart = np.array([fix.east_m, fix.north_m]) - prior_m
+    allowed = fix.covariance_m2[:2, :2] + sigma_m**2 * np.eye(2)
+    chi_square = float(apart @ np.linalg.solve(allowed, apart))
+    return Expected(chi_square, float(np.linalg.det(allowed)) ** 0.25)
 
-    Sigmas enter by their logarithm: 20 instead of 10 say as much as 10 instead of 5.
+
+def terms(evidence: Evidence | PoseEvidence) -> NDArray[np.float64]:
+    """(5,) of a peak or (6,) of a pose: what the weights are multiplied by.
+
+    Sigmas and false alarms enter by their logarithms: 20 sigmas instead of 10 say as much as 10 instead of 5.
     """
-    sigmas, off_prior = max(evidence.sigmas, 0.5), min(evidence.off_prior, _FARTHEST)
-    return np.array([1.0, math.log(sigmas), evidence.ratio, off_prior])
+    if isinstance(evidence, Evidence):
+        off_prior, spread_m = evidence.expected.off_prior, evidence.expected.spread_m
+        sigmas = math.log(max(evidence.sigmas, 0.5))
+        return np.array([1.0, sigmas, evidence.ratio, min(off_prior, _FARTHEST), math.log(max(spread_m, 1.0))])
+    known = [_known(evidence.off_prior), _known(evidence.off_height)]
+    alarms = min(max(-evidence.log10_nfa, 0.0), _FEWEST_ALARMS)
+    return np.array([1.0, math.sqrt(alarms), *known[0], *known[1]])
 
 
-def probability(evidence: Evidence, model: Logistic = FITTED) -> float:
-    """Probability in (0, 1) that the peak is the right place, where every second frame has an answer."""
+def _known(chi_square: float | None) -> tuple[float, float]:
+    """What a chi-square says, and what it says that there is none."""
+    return (0.0, 1.0) if chi_square is None else (min(chi_square, _FARTHEST), 0.0)
+
+
+def probability(evidence: Evidence | PoseEvidence, model: Logistic | PoseLogistic | None = None) -> float:
+    """Probability in (0, 1) that the place is right, where every second frame has an answer.
+
+    Args:
+        evidence: of a peak or of a pose.
+        model: other weights than those fitted.
+    """
+    model = model or (FITTED if isinstance(evidence, Evidence) else FITTED_POSE)
     logit = float(np.dot(astuple(model), terms(evidence)))
     return 1.0 / (1.0 + math.exp(-logit))

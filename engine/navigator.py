@@ -278,7 +278,8 @@ class Navigator:
         fix = None if self._anchor is None or self._lost else self._anchor.fix
         if frame.height_agl_m is not None or fix is None or fix.up_m is None:
             return frame
-        height = fix.up_m - self._matcher.site.ground_m
+        site = self._matcher.site
+        height = fix.up_m - site.ground_at(site.pixel_from_enu(en_m(fix)))
         return replace(frame, height_agl_m=height) if height > 0 else frame
 
     # ---------------------------------------------------------------------------------------------- beliefs

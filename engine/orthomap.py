@@ -39,7 +39,7 @@ GROUND_PERCENT = 20.0
 """Percentile of the surface over the map that is taken as the level of the ground."""
 GSD_RANGE_M = (1e-3, 1e3)
 GROUND_REACH_M = 30.0
-"""So far about a place its ground is looked for: wider than what stands there, narrower than a hill."""
+"""So far about a place its ground is looked for: wider than a house, narrower than a hill."""
 _GROUND_PLACES = 15  # a side of the lattice on which it is
 _PLANE_ROUNDS = 8
 _PLANE_M = 0.3  # heights closer to the plane than this lie on it
@@ -286,20 +286,35 @@ class OrthoMap:
         return np.where(np.isnan(heights), self.ground_m, heights)
 
     def ground_at(self, xy_px: ArrayLike) -> float:
-        """Level of the bare ground at one pixel (2,), in the surface's datum: below its roofs and crowns.
+        """Level of the bare ground at one pixel (2,), in the surface's datum; see :meth:`ground_plane`."""
+        return self.ground_plane(xy_px, GROUND_REACH_M)[0]
 
-        The plane that the 20th percentile of the surface lies on, within :data:`GROUND_REACH_M`; a percentile alone
-        would lie below a slope. ``ground_m`` where nothing is known there; 0.0 without a surface.
+    def ground_plane(self, xy_px: ArrayLike, reach_m: float) -> tuple[float, Array]:
+        """The bare ground about one pixel (2,): the plane above a fifth of the surface there, below the rest.
+
+        So it lies below roofs and crowns, and unlike a mere percentile not below the middle of a slope.
+
+        Args:
+            xy_px: place.
+            reach_m: half the side of the square that is looked at.
+
+        Returns:
+            The level at the place in the surface's datum, and the slope (2,) in metres up per pixel x and y:
+            ``ground_m`` and level where nothing is known there, 0.0 and level without a surface.
         """
         if self._surface is None:
-            return self.ground_m
-        steps = np.linspace(-1.0, 1.0, _GROUND_PLACES) * (GROUND_REACH_M / self.gsd_m_per_px)
-        offsets_px = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        heights_m = self._surface.sample(np.asarray(xy_px, np.float64) + offsets_px)
+            return self.ground_m, np.zeros(2)
+        steps = np.linspace(-1.0, 1.0, _GROUND_PLACES)
+        offsets, reach_px = (
+            np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2),
+            reach_m / self.gsd_m_per_px,
+        )
+        heights_m = self._surface.sample(np.asarray(xy_px, np.float64) + offsets * reach_px)
         known = np.isfinite(heights_m)
-        if np.count_nonzero(known) < 3:
-            return self.ground_m
-        return _lower_plane_m(offsets_px[known] / steps[-1], heights_m[known])
+        if np.count_nonzero(known) < offsets.shape[0] // 2:
+            return self.ground_m, np.zeros(2)
+        plane = _lower_plane(offsets[known], heights_m[known])
+        return float(plane[0]), plane[1:] / reach_px
 
     def steadiness_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
         """Weight (...,) of what is seen at pixels (..., 2): 1 on level ground, less at walls, edges and crowns.
@@ -376,17 +391,16 @@ class OrthoMap:
         }
 
 
-def _lower_plane_m(offsets: Array, heights_m: Array) -> float:
-    """The level at offset 0 of the plane with 20 % of the heights (N,) below it, at offsets (N, 2).
+def _lower_plane(offsets: Array, heights_m: Array) -> Array:
+    """The plane (3,), level and rise per offset, with a fifth of the heights (N,) below it at offsets (N, 2).
 
-    Quantile regression (Koenker and Bassett 1978) by reweighted least squares. Where the known places lie on one
-    line, the plane is the one that leans least.
+    Quantile regression (Koenker and Bassett, Econometrica 1978) by reweighted least squares.
     """
     terms = np.column_stack([np.ones(len(offsets)), offsets])
     share, weights = GROUND_PERCENT / 100.0, np.ones(len(offsets))
     for _ in range(_PLANE_ROUNDS):
         weighted = terms.T * weights
-        plane = np.linalg.lstsq(weighted @ terms, weighted @ heights_m, rcond=1e-9)[0]
+        plane = np.linalg.solve(weighted @ terms, weighted @ heights_m)
         above = heights_m - terms @ plane
         weights = np.where(above > 0.0, share, 1.0 - share) / np.maximum(np.abs(above), _PLANE_M)
-    return float(plane[0])
+    return plane

@@ -219,8 +219,8 @@ class Fix:
         map_xy_px: the camera's nadir in map pixels (x, y).
         stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "refined" in all of the
             pose, "verified" by both methods.
-        confidence: probability in (0, 1) that the place is right, where the method has one that is calibrated
-            (see ``docs/integrity.md``); None where it has none.
+        confidence: probability in (0, 1) that the place is right, as ``docs/integrity.md`` says; None where NCC
+            searched the map, the heading or the height, for which none was fitted.
     """
 
     timestamp_ns: int | None

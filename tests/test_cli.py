@@ -30,6 +30,7 @@ COLUMNS = (
 )
 FRAMES = 6
 FIGURES = {"path.png", "position.png", "height.png", "error.png"}
+WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"} | FIGURES
 SCRIPT = Path(sys.executable).with_name("scenematch")
 
 
@@ -116,7 +117,7 @@ def test_track_writes_one_row_a_frame_and_every_file(done):
     assert [row["frame"] for row in rows] == [f"{i:06d}.jpg" for i in range(FRAMES)]
     assert all(row["status"] == "fix" and row["method"] == "ncc" for row in rows)
     assert all(row["deadline_met"] == "" and row["reason"] == "" for row in rows)
-    assert {file.name for file in done.iterdir()} == {"track.csv", "summary.json"} | FIGURES
+    assert {file.name for file in done.iterdir()} == WRITTEN
     for name in FIGURES:
         with Image.open(done / name) as picture:
             assert picture.format == "PNG"
@@ -251,6 +252,18 @@ def test_locate_finds_a_picture_without_a_prior(flight, capsys):
     printed = capsys.readouterr()
     assert "no_height" in printed.out
     assert printed.err == ""
+
+
+def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
+    """The built-in map says that it is exact; --map-sigma-m counts more, and adds up with the rest."""
+    image = flight / "frames" / "000000.jpg"
+    base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}", "--json"]
+    variances = []
+    for option in ([], ["--map-sigma-m=3"]):
+        assert run([*base, *option, "--threads=1"]) == 0
+        variances.append(np.diag(json.loads(capsys.readouterr().out)["covariance_m2"]))
+    np.testing.assert_allclose(variances[1] - variances[0], 9.0, rtol=1e-4)
+    assert "georeference_sigma_m: expected a number above 0" in error_line(capsys, [*base, "--map-sigma-m=0"], 2)
 
 
 def test_locate_near_and_its_refusals(flight, capsys):
@@ -395,7 +408,7 @@ def test_force_replaces_results_and_touches_nothing_else(flight, tmp_path):
     (out / "notes.txt").write_text("mine", encoding="utf-8")
     assert (out / "height.png").exists()
     assert run(track(flight, out, "--force")) == 0
-    assert {file.name for file in out.iterdir()} == {"track.csv", "summary.json", "notes.txt"} | FIGURES
+    assert {file.name for file in out.iterdir()} == {"notes.txt"} | WRITTEN
     assert {row["method"] for row in cells(out / "track.csv")} == {"ncc"}
 
 

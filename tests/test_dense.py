@@ -195,6 +195,29 @@ def test_errors_are_as_large_as_the_covariance_says(sim_flight, sim_site, error_
     assert max(squared) < 16.3  # three degrees of freedom, once in a thousand
 
 
+def test_on_a_map_that_says_it_is_exact_the_errors_fill_the_covariance(sim_flight):
+    """Mean NEES of two dimensions: 2 where it is honest. On a map that says nothing it is far below."""
+    town = sim_flight.town
+    gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
+
+    def nees(**said):
+        site = OrthoMap.from_arrays(
+            gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m, **said
+        )
+        matcher, squared = SceneMatcher(site, sim_flight.camera, "ncc", "cpu"), []
+        for frame, truth in zip(sim_flight.frames, sim_flight.truth, strict=True):
+            place = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
+            fix = matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0))
+            assert isinstance(fix, Fix)
+            off = np.array([fix.east_m, fix.north_m]) - place
+            squared.append(off @ np.linalg.solve(fix.covariance_m2[:2, :2], off))
+        return np.mean(squared)
+
+    exact = nees(georeference_sigma_m=1e-3, slope_sigma_deg=1e-3)
+    assert 0.7 < exact < 3.3
+    assert nees() < 0.5 * exact
+
+
 def test_a_picture_of_another_place_keeps_its_fix_or_none(ground, flat_site, camera):
     """Refinement never makes a fix of what is no fix: the other half of the picture is noise."""
     frame = ground.frame(camera, NADIR, heading_deg=25.0)

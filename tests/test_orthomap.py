@@ -17,7 +17,9 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.warp import calculate_default_transform, reproject
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine.formats.geotiff import write_geotiff
 from engine.orthomap import OrthoMap
+from engine.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.types import Window
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -353,7 +355,7 @@ def test_map_too_large_for_memory_reads_the_same_from_the_file(tmp_path, monkeyp
     data[:, :, :20] = 0
     path = write(tmp_path / "map.tif", data, photometric="rgb")
     kept = OrthoMap.open(path)
-    monkeypatch.setattr("engine.orthomap.MEMORY_LIMIT_PX", 3000)
+    monkeypatch.setattr("engine.pyramid.MEMORY_LIMIT_PX", 3000)
     monkeypatch.setattr("engine.rasters.OVERVIEW_PX", 64)
     streamed = OrthoMap.open(path)
     assert streamed.levels == kept.levels
@@ -662,3 +664,52 @@ def test_geographic_orthophoto_with_a_black_collar(tmp_path):
     assert site.gsd_m_per_px == pytest.approx(0.08, abs=1e-3)
     assert 0.2 < site.info()["nodata_share"] < 0.3
     assert site.has_surface
+
+
+# ----------------------------------------------------------------------------------- how well it says that it lies
+
+
+@pytest.mark.parametrize("epsg", [32633, 4326])
+def test_a_map_says_how_well_it_lies_and_its_surface_how_it_leans(tmp_path, epsg):
+    """Also where it is resampled; what the caller says counts more."""
+    step = 0.5 if epsg == 32633 else 5e-6
+    corner = (5e5, 5.3e6) if epsg == 32633 else (15.0, 47.8)
+    affine = [[step, 0.0, corner[0]], [0.0, -step, corner[1]]]
+    write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, epsg, tags={GEOREFERENCE_TAG: 0.12})
+    write_geotiff(tmp_path / "dsm.tif", np.ones((40, 50), np.float32), affine, epsg, tags={SLOPE_TAG: 0.04})
+
+    def opened(**said):
+        site = OrthoMap.open(
+            tmp_path / "map.tif", surface=tmp_path / "dsm.tif", cache_dir=tmp_path / "cache", **said
+        )
+        return site.georeference_sigma_m, site.slope_sigma_deg
+
+    assert opened() == opened() == (0.12, 0.04)
+    assert opened(georeference_sigma_m=2.0, slope_sigma_deg=0.5) == (2.0, 0.5)
+    assert OrthoMap.open(tmp_path / "map.tif", cache_dir=tmp_path / "cache").slope_sigma_deg is None
+
+
+def test_a_map_that_says_nothing_of_its_accuracy_says_none(tmp_path):
+    write_geotiff(tmp_path / "map.tif", noise(40, 50), CENTRED, 32633)
+    site = OrthoMap.open(tmp_path / "map.tif")
+    assert (site.georeference_sigma_m, site.slope_sigma_deg) == (None, None)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "half a metre"])
+def test_an_accuracy_that_is_no_number_above_0_is_refused(tmp_path, text):
+    write_geotiff(tmp_path / "map.tif", noise(40, 50), CENTRED, 32633, tags={GEOREFERENCE_TAG: text})
+    with pytest.raises(MapError, match=rf"expected a number above 0 as {GEOREFERENCE_TAG}, got '{text}'"):
+        OrthoMap.open(tmp_path / "map.tif")
+    if text != "half a metre":
+        with pytest.raises(OptionError, match="georeference_sigma_m: expected a number above 0"):
+            OrthoMap.from_arrays(noise(20, 20), CENTRED, UTM, georeference_sigma_m=float(text))
+
+
+def test_what_stands_at_a_wall_is_not_to_be_relied_on():
+    """A house of 10 m over level ground: full weight away from its walls, 1 / (1 + 10^2) within reach of them."""
+    heights = np.zeros((60, 60), np.float32)
+    heights[20:40, 20:40] = 10.0
+    site = OrthoMap.from_arrays(noise(60, 60), CENTRED, UTM, surface_m=heights)
+    at = np.array([[5.0, 5.0], [30.0, 30.0], [20.0, 30.0], [18.0, 30.0], [17.0, 30.0]])
+    np.testing.assert_allclose(site.steadiness_at(at, 2.0), [1.0, 1.0, 1 / 101, 1 / 101, 1.0], rtol=1e-9)
+    assert OrthoMap.from_arrays(noise(60, 60), CENTRED, UTM).steadiness_at(at, 2.0).tolist() == [1.0] * 5

@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from engine import device as devices
 from engine.adapters.links import parse_connection
 from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import Picture, capture, replay
+from engine.adapters.vehicle import Origin
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_choice, parse_position
@@ -43,6 +44,7 @@ class Inputs:
     source: str | None
     rate_hz: float
     exposure_to_grab_ms: float
+    map_sigma_m: float | None = None  # how well the map lies, where it does not say
 
     def __post_init__(self) -> None:
         if (self.frames is None) == (self.source is None):
@@ -97,7 +99,8 @@ def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool)
     devices.resolve(matching.device)
     start = parse_position("--start", matching.start)
     key = None if wire.key is None else read_key(wire.key)
-    site, camera = OrthoMap.open(inputs.map, surface=inputs.surface), Camera.load(inputs.camera)
+    site = OrthoMap.open(inputs.map, surface=inputs.surface, georeference_sigma_m=inputs.map_sigma_m)
+    camera = Camera.load(inputs.camera)
     check_place("--start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, matching.method, matching.device)
     matcher.warmup()
@@ -149,10 +152,8 @@ def _outgoing(firmware: str, message: str, max_sigma_m: float) -> Outgoing:
         raise OptionError("--" + str(error).replace("_", "-", str(error).split(":")[0].count("_"))) from None
 
 
-def _origin(site: OrthoMap, wire: Wire) -> Any:
+def _origin(site: OrthoMap, wire: Wire) -> Origin | None:
     """The map's, at the height of its ground where none is told."""
-    from engine.adapters.mavlink_in import Origin
-
     if not wire.set_origin:
         return None
     alt_m = site.ground_m if wire.origin_alt_m is None else wire.origin_alt_m

@@ -33,6 +33,7 @@ class Inputs:
     surface: Path | None
     camera: Path | None
     topics: Topics
+    map_sigma_m: float | None = None  # how well the map lies, where it does not say
 
     def __post_init__(self) -> None:
         if not self.topics.image:
@@ -51,7 +52,7 @@ def run_bridge_ros(
         options = RosOptions(firmware=firmware, origin=begin)
     except OptionError as error:
         raise OptionError(f"--{error}") from None
-    site = OrthoMap.open(inputs.map, surface=inputs.surface)
+    site = OrthoMap.open(inputs.map, surface=inputs.surface, georeference_sigma_m=inputs.map_sigma_m)
     check_place("--start", start, site, OptionError)
     camera = None if inputs.camera is None else Camera.load(inputs.camera)
     node = _node(version)

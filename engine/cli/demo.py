@@ -12,6 +12,7 @@ from engine.cli.compare import CHART, COLUMNS, TABLE, USUAL, cells, parse_runs, 
 from engine.cli.track import Inputs
 from engine.formats.flight import write_flight_folder
 from engine.sim import Plan, plan_flight
+from engine.sim.town import EXACT
 from engine.types import Prior
 
 PAPER_TABLE = {"ncc": (2.4, 40.0), "sift": (2.1, 121.0)}
@@ -55,6 +56,8 @@ def write_flight(directory: Path, plan: Plan) -> Inputs:
         crs_epsg=plan.town.crs_epsg,
         surface_m=plan.town.surface_m,
         start=start,
+        georeference_sigma_m=EXACT,
+        slope_sigma_deg=EXACT,
     )
     return Inputs(
         map=directory / "map.tif",

@@ -58,6 +58,7 @@ def run_locate(
     map_path: Path,
     camera_path: Path,
     surface: Path | None,
+    map_sigma_m: float | None,
     known: Known,
     *,
     method: str,
@@ -68,7 +69,8 @@ def run_locate(
     check_choice("--method", method, METHODS)
     devices.resolve(device)
     prior = parse_position("--near", known.near)
-    site, camera = OrthoMap.open(map_path, surface=surface), Camera.load(camera_path)
+    site = OrthoMap.open(map_path, surface=surface, georeference_sigma_m=map_sigma_m)
+    camera = Camera.load(camera_path)
     check_place("--near", prior, site, OptionError)
     pixels = read_image(image)
     camera.check_size(pixels.shape)

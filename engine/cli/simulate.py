@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from engine.camera import Camera
@@ -34,7 +33,7 @@ from engine.sim.light import Image
 from engine.sim.loop import START_NS, ClosedLoop
 from engine.sim.pilot import plan_rounds
 from engine.sim.quadrotor import State
-from engine.sim.town import generator
+from engine.sim.town import EXACT, generator
 from engine.types import Prior, Truth
 
 FOLDER = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")
@@ -132,9 +131,7 @@ def run_closed_loop(out: Path, scene: Scene, loop: Loop, *, force: bool) -> dict
     check_folder(out, force)
     console.say("drawing the world")
     town, camera = scene.build(), Camera.from_fov(300, 300, 60.0)
-    site = OrthoMap.from_arrays(
-        cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY), town.pixel_to_crs, town.crs_epsg, surface_m=town.surface_m
-    )
+    site = town.site()
     matcher = SceneMatcher(site, camera, loop.method, loop.device)
     matcher.warmup()
     flight = close_loop(town, camera, matcher, scene.seed, loop)
@@ -216,6 +213,8 @@ def _write_folder(out: Path, flight: ClosedLoop, town: Town, camera: Camera, sit
         crs_epsg=town.crs_epsg,
         surface_m=town.surface_m,
         start=Prior(lat_deg=float(lat), lon_deg=float(lon), sigma_m=START_SIGMA_M),
+        georeference_sigma_m=EXACT,
+        slope_sigma_deg=EXACT,
     )
 
 

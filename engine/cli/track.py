@@ -1,4 +1,4 @@
-"""``track`` and ``evaluate``: a flight in, track.csv, summary.json and figures out."""
+"""``track`` and ``evaluate``: a flight in, track.csv, summary.json, figures and the report page out."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from engine.cli import console
 from engine.cli.arguments import check_choice, check_folder, parse_budget, parse_position, prepare_folder
 from engine.cli.checks import check_needs, check_pictures, check_place
 from engine.errors import EngineError, OptionError, TelemetryError
+from engine.formats.bags import is_bag, read_bag_camera
 from engine.formats.flight import Flight, FlightFrame, open_flight
 from engine.formats.logs import LogClock, is_log, open_truth
-from engine.formats.settings import changed, read_settings
+from engine.formats.notes import note_of, read_notes, write_notes
+from engine.formats.settings import changed, nested, options_from_mapping, read_settings
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
 from engine.matcher import METHODS, PROFILES, MatcherOptions, SceneMatcher
@@ -26,12 +28,15 @@ from engine.methods.sift import SiftOptions
 from engine.navigator import BELIEVE_ALL, Navigator, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
+from engine.report.explain import choose_frames, explain_frames
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
+from engine.report.page import Flown, write_page
 from engine.types import Fix, NoFix, Prior, Truth
 
 FIGURES = ("path.png", "position.png", "height.png", "error.png")
-OWNED = ("track.csv", "summary.json", *FIGURES)
+NOTES, PAGE = "notes.csv", "report.html"
+OWNED = ("track.csv", "summary.json", NOTES, PAGE, *FIGURES)
 """The files of an output folder."""
 
 
@@ -46,10 +51,16 @@ class Inputs:
     telemetry: Path | None
     truth: Path | None
     clock: LogClock | None = None  # when the frames were taken, where the telemetry is a log
+    image_topic: str | None = None  # of the pictures, where the frames are a bag
+    map_sigma_m: float | None = None  # how well the map lies, where it does not say
 
     def __post_init__(self) -> None:
         if self.clock is not None and (self.telemetry is None or not is_log(self.telemetry)):
             raise OptionError(f"--frame-stamps, --log-offset-s: expected a log as telemetry, got {self.telemetry}")
+
+    def load_camera(self) -> Camera:
+        """The calibration, of a file or of a bag."""
+        return read_bag_camera(self.camera, self.image_topic) if is_bag(self.camera) else Camera.load(self.camera)
 
     def find_truth(self) -> Path | None:
         """The truth that was named, else ``truth.csv`` beside the telemetry where there is one."""
@@ -57,6 +68,17 @@ class Inputs:
             return self.truth
         beside = self.telemetry.with_name("truth.csv")
         return beside if beside.is_file() else None
+
+
+def camera_or_bag(camera: Path | None, frames: Path) -> Path:
+    """The file that was named, else the bag that the frames come from.
+
+    Raises:
+        OptionError: neither.
+    """
+    if camera is None and not is_bag(frames):
+        raise OptionError("--camera: expected a calibration, which only a bag may have within itself")
+    return camera or frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,6 +141,15 @@ class _Opened:
     truth: list[Truth] | None
 
 
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """With what single frames are matched again for the report; None where it cannot be had, and why."""
+
+    flight: Flight | None = None
+    matcher: SceneMatcher | None = None
+    why_not: str = "the frames were not kept."
+
+
 def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = False) -> dict[str, Any]:
     """Follow a flight and write the output folder; returns the summary.
 
@@ -128,8 +159,7 @@ def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = Fa
     start, budget = parse_position("--start", settings.start), parse_budget("--budget-ms", settings.budget_ms)
     opened = _open(inputs, settings, start)
     site, flight = opened.site, opened.flight
-    options = MatcherOptions(profile=settings.profile, ncc=settings.ncc, sift=settings.sift)
-    matcher = SceneMatcher(site, opened.camera, settings.method, settings.device, options)
+    matcher = _matcher(site, opened.camera, settings)
     matcher.warmup()
     prepare_folder(out, force, OWNED)
     navigator = Navigator(
@@ -141,14 +171,22 @@ def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = Fa
     record = _record(inputs, settings, opened, str(matcher.device), ground)
     record["attitude"] = None if attitude is None else asdict(attitude)
     # From the rows as they stand in the file, so that evaluate gives the same figures.
-    return conclude(out, read_track(out / "track.csv"), opened.truth, site, ground, record)
+    rows = read_track(out / "track.csv")
+    return conclude(out, rows, opened.truth, site, ground, record, Replay(flight, matcher))
+
+
+def _matcher(site: OrthoMap, camera: Camera, settings: Settings) -> SceneMatcher:
+    options = MatcherOptions(profile=settings.profile, ncc=settings.ncc, sift=settings.sift)
+    return SceneMatcher(site, camera, settings.method, settings.device, options)
 
 
 def _open(inputs: Inputs, settings: Settings, start: Prior | None) -> _Opened:
     """Read what a run needs, and refuse what does not belong together."""
-    site = OrthoMap.open(inputs.map, surface=inputs.surface)
-    camera = Camera.load(inputs.camera)
-    flight = open_flight(inputs.frames, inputs.telemetry, clock=inputs.clock or LogClock())
+    site = OrthoMap.open(inputs.map, surface=inputs.surface, georeference_sigma_m=inputs.map_sigma_m)
+    camera = inputs.load_camera()
+    flight = open_flight(
+        inputs.frames, inputs.telemetry, clock=inputs.clock or LogClock(), image_topic=inputs.image_topic
+    )
     truth_path = inputs.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
     truth = open_truth(truth_path, stamp_ns) if truth_path is not None else None
@@ -210,6 +248,7 @@ def follow(
         AttitudeCheck | None: what the fixes say of the telemetry's attitude.
     """
     attitudes: list[AttitudeRow | None] = []
+    notes = []
     with TrackWriter(path) as writer:
         for item in console.progress(flight, len(flight), what):
             prior = item.prior if use_priors else None
@@ -220,6 +259,8 @@ def follow(
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
             attitudes.append(attitude_row(item.frame, result))
+            notes.append(note_of(item.name, result, navigator.state.value))
+    write_notes(path.with_name(NOTES), notes)
     return check_attitude([row for row in attitudes if row is not None])
 
 
@@ -238,8 +279,9 @@ def conclude(
     site: OrthoMap,
     ground: Ground,
     record: dict[str, Any],
+    replay: Replay | None = None,
 ) -> dict[str, Any]:
-    """Write summary.json and the figures, in place of older ones."""
+    """Write summary.json, the figures and the report page, in place of older ones."""
     summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         console.say(f"no fix is scored: {record['truth']} says nothing of the times of this flight")
@@ -248,7 +290,24 @@ def conclude(
         (out / name).unlink(missing_ok=True)
     title = f"{record['method']} ({record['profile']} profile)"
     draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
+    notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
+    _write_page(out / PAGE, Flown(rows, truth, site, ground, summary, notes), replay or Replay())
     return summary
+
+
+def _write_page(path: Path, flown: Flown, replay: Replay) -> None:
+    """The report, with some frames matched again where that can be done."""
+    if replay.flight is None or replay.matcher is None:
+        return write_page(path, flown, why_not=f"No frames are shown: {replay.why_not}")
+    if flown.notes is None or [note.frame for note in flown.notes] != [row.frame for row in flown.rows]:
+        return write_page(path, flown, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
+    errors = flown.scene().errors
+    chosen = choose_frames(flown.rows, errors)
+    try:
+        shown = explain_frames(replay.flight, replay.matcher, flown.rows, flown.notes, chosen, errors)
+    except EngineError as error:
+        return write_page(path, flown, why_not=f"No frames are shown: {error}")
+    return write_page(path, flown, shown)
 
 
 def run_evaluate(directory: Path, truth_path: Path | None) -> dict[str, Any]:
@@ -258,7 +317,7 @@ def run_evaluate(directory: Path, truth_path: Path | None) -> dict[str, Any]:
         TelemetryError: the folder holds no finished track, or no truth is known.
     """
     rows = read_track(directory / "track.csv")
-    record = _read_record(directory / "summary.json")
+    record = read_record(directory / "summary.json")
     if truth_path is None:
         if record["truth"] is None:
             raise TelemetryError(f"{directory}: the track was made without truth; name one with --truth")
@@ -266,16 +325,39 @@ def run_evaluate(directory: Path, truth_path: Path | None) -> dict[str, Any]:
     truth = open_truth(truth_path, rows[0].timestamp_ns if rows else None)
     site = OrthoMap.open(record["map"], surface=record["surface"])
     ground = Ground(record["ground_m"], record["ground_amsl_m"])
-    return conclude(directory, rows, truth, site, ground, record | {"truth": str(truth_path.resolve())})
+    replay = _reopened(record, rows, site)
+    return conclude(directory, rows, truth, site, ground, record | {"truth": str(truth_path.resolve())}, replay)
 
 
-def _read_record(path: Path) -> dict[str, Any]:
+def _reopened(record: dict[str, Any], rows: list[TrackRow], site: OrthoMap) -> Replay:
+    """The flight and the matcher of a run that is over, as far as its record and its files still give them."""
+    try:
+        settings = options_from_mapping(
+            Settings, nested({name: record[name] for name in ("method", "profile")} | record.get("changed", {}))
+        )
+        telemetry = None if record["telemetry"] is None else Path(record["telemetry"])
+        inputs = Inputs(
+            Path(record["map"]), None, Path(record["camera"]), Path(record["frames"]), telemetry, truth=None
+        )
+        flight = open_flight(inputs.frames, inputs.telemetry)
+        stamps = [row.timestamp_ns for row in flight.rows]
+        told = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
+        if (stamps, flight.names) != (told, [row.frame for row in rows]):
+            return Replay(why_not="the frames or their telemetry are not those of the run any more.")
+        return Replay(flight, _matcher(site, inputs.load_camera(), settings))
+    except KeyError as error:
+        return Replay(why_not=f"the record of the run lacks {error}.")
+    except (EngineError, OSError) as error:
+        return Replay(why_not=f"{error}.")
+
+
+def read_record(path: Path) -> dict[str, Any]:
     """The settings in a summary.json.
 
     Raises:
         TelemetryError: the file is missing, or is not one that track wrote.
     """
-    needed = ("map", "surface", "truth", "method", "profile", "ground_m", "ground_amsl_m")
+    needed = ("map", "surface", "truth", "method", "profile", "origin", "ground_m", "ground_amsl_m")
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["settings"]
         return {name: record[name] for name in needed} | record

@@ -76,6 +76,18 @@ def changed(options: Any, within: str = "") -> dict[str, Any]:
     return out
 
 
+def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables within tables, as a settings file has them, from what :func:`changed` gives."""
+    out: dict[str, Any] = {}
+    for name, value in changes.items():
+        *path, last = name.split(".")
+        table = out
+        for part in path:
+            table = table.setdefault(part, {})
+        table[last] = NONE if value is None else value
+    return out
+
+
 def options_from_mapping(cls: type[Options], values: Mapping[str, Any], within: str = "") -> Options:
     """Options from names and values, tables within tables.
 

@@ -84,7 +84,7 @@ def search(
     found: list[tuple[Peak, Aligned]] = []
     middle = max(first.level, level - 1)
     for frame, nadir in _coarse(query, prepared, frames, window, level, options):
-        aligned = laid.align(query, frame, middle, options)
+        aligned = laid.align(query, frame, middle, options, nadir)
         peak = None if isinstance(aligned, NoFix) else _near(query, prepared, aligned, nadir, level, options)
         if peak is not None and isinstance(aligned, Aligned):
             found.append((peak, aligned))
@@ -106,10 +106,11 @@ def _finish(
     """The best few places at full resolution; the rival is the best of the others."""
     final: list[tuple[Peak, Aligned]] = []
     for peak, aligned in found[:_FINALISTS]:
-        fine = laid.align(query, aligned.frame, level, options)
+        nadir = laid.nadir_px(query, peak, aligned)
+        fine = laid.align(query, aligned.frame, level, options, nadir)
         if isinstance(fine, NoFix):
             continue
-        better = _near(query, prepared, fine, laid.nadir_px(query, peak, aligned), aligned.level + 1, options)
+        better = _near(query, prepared, fine, nadir, aligned.level + 1, options)
         if better is None:
             continue
         # Rivals get as good a heading and height as the winner, or the lead would be that of the refinement.
@@ -254,8 +255,9 @@ def _moved(
         heading_deg=(frame.heading_deg + math.degrees(turn_rad)) % 360.0,
         height_agl_m=frame.height_agl_m * (1.0 + share),
     )
-    other = laid.align(query, moved, aligned.level, options)
+    nadir = laid.nadir_px(query, peak, aligned)
+    other = laid.align(query, moved, aligned.level, options, nadir)
     if isinstance(other, NoFix):
         return None
-    found = _near(query, prepared, other, laid.nadir_px(query, peak, aligned), aligned.level, options)
+    found = _near(query, prepared, other, nadir, aligned.level, options)
     return None if found is None else (found, other)

@@ -117,7 +117,10 @@ def by_both(query: Query, tools: Tools) -> Result:
         return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
     first = refine(query, tools, first)
     fixes = [fix for fix in (first, second) if isinstance(fix, Fix)]
-    return replace(min(fixes, key=lambda fix: fix.sigma_m), stage="verified")
+    # Both look at one picture over one map with one prior: their odds are not multiplied, the surer one stands.
+    stated = [fix.confidence for fix in fixes if fix.confidence is not None]
+    best = min(fixes, key=lambda fix: fix.sigma_m)
+    return replace(best, stage="verified", confidence=max(stated, default=None))
 
 
 def every_rung(query: Query, tools: Tools, method: str) -> None:

@@ -20,6 +20,8 @@ from engine.types import Frame, NoFix, Peak, Reason, Window
 Array = NDArray[np.float64]
 
 METHOD = "ncc"
+_GROUND_SHARE = 0.3  # of the height: as far about the middle of a frame its ground is taken for a plane
+_SPREAD_SIGMAS = 2.0  # and as far as this, where its place is less certain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,13 +90,26 @@ class Aligned:
     template: torch.Tensor
 
 
-def align(query: Query, frame: Frame, level: int, options: NccOptions) -> Aligned | NoFix:
-    """Equations 2 and 3: the frame in the pixels of one map level."""
+def align(
+    query: Query, frame: Frame, level: int, options: NccOptions, nadir_px: Array | None = None
+) -> Aligned | NoFix:
+    """Equations 2 and 3: the frame in the pixels of one map level.
+
+    Args:
+        query: what is asked.
+        frame: with the height and heading to lay it by.
+        level: of the pyramid.
+        options: settings.
+        nadir_px: where (2,) its ground is looked up; None takes the prior's place, or level ground without one.
+    """
     attitude, height = frame.attitude, frame.height_agl_m
     assert attitude is not None  # a hypothesis has both
     assert height is not None
     jacobian = query.jacobian * 2.0**level
     view = view_of(query.camera, attitude, height, jacobian)
+    if view is not None:
+        slope = _slope(query, view, height, level, nadir_px)
+        view = view_of(query.camera, attitude, height, jacobian, slope) or view
     if view is None:
         tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
         return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", METHOD)
@@ -108,6 +123,16 @@ def align(query: Query, frame: Frame, level: int, options: NccOptions) -> Aligne
     enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
     template = torch.from_numpy(enhanced).to(query.device)
     return Aligned(frame, level, jacobian, view, patch, template)
+
+
+def _slope(query: Query, view: View, height_m: float, level: int, nadir_px: Array | None) -> Array:
+    """Rise (2,) of the ground under the frame per pixel of the level, the flatter the less its place is known."""
+    reach_m, place = _GROUND_SHARE * height_m, nadir_px
+    if place is None and query.prior is not None:
+        reach_m, place = max(reach_m, _SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
+    if place is None:
+        return np.zeros(2)
+    return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
 
 
 def window_about(query: Query, aligned: Aligned, options: NccOptions) -> Window | None:
@@ -145,6 +170,27 @@ def search(
             peak = find_peak(scores, exclusion_px=exclusion_px)
     x, y = peak.x + region.window.x0, peak.y + region.window.y0
     return Peak(x, y, peak.score, peak.second_score, peak.curvature, peak.hypothesis)
+
+
+def surface(
+    query: Query, prepared: PreparedMap, aligned: Aligned, window: Window, options: NccOptions
+) -> tuple[torch.Tensor, Array] | None:
+    """The whole surface that :func:`search` finds its peak on, for reports.
+
+    Returns:
+        Scores (H', W') of the template's top-left pixel, and that place (2,) of the first in pixels of the level;
+        None where the patch does not fit the window.
+    """
+    height, width = aligned.template.shape
+    region = prepared.cut(level_crop(query.site, window, aligned.level), aligned.level)
+    if region.window.width_px < width or region.window.height_px < height:
+        return None
+    template = aligned.template[None]
+    if region.valid is None:
+        scores = ncc(region.search.image[None], template[None])[0, 0]
+    else:
+        scores = masked_scores(region, template, options)[0]
+    return scores, np.array([region.window.x0, region.window.y0], np.float64)
 
 
 def nadir_px(query: Query, peak: Peak, aligned: Aligned) -> Array:

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from engine.evidence import Evidence, evidence_of, probability
-from engine.integrity import judge_evidence, judge_peak, ncc_covariance_m2, peak_covariance_px, score_sigma
+from engine.evidence import Evidence, Expected, evidence_of, expected_of, probability
+from engine.integrity import (
+    PeakRule,
+    judge_evidence,
+    judge_peak,
+    ncc_covariance_m2,
+    peak_covariance_px,
+    pull_px2,
+    score_sigma,
+)
 from engine.methods import bank
 from engine.methods.laid import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
 from engine.methods.query import Query, level_for
 from engine.prepared import PreparedMap
-from engine.types import Attitude, Fix, NoFix, Peak, Prior, Reason, Window
+from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +74,9 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     fix = _fix(query, aligned, peak, window, options)
     evidence = None
     if trusted and query.prior is not None:
-        evidence = evidence_of(peak, score_sigma(aligned.template.numel()), _off_prior(query, query.prior, fix))
+        expected = _expected(query, fix)
+        assert expected is not None
+        evidence = evidence_of(peak, score_sigma(aligned.template.numel()), expected)
     return Found(peak, aligned, fix, trusted, evidence)
 
 
@@ -82,27 +90,27 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser:
         coarser: levels above the one whose pixels are like the frame's, for an answer that is quicker and cruder.
     """
     found = find(query, prepared, options, coarser=coarser)
-    if isinstance(found, NoFix):
-        return found
+    return found if isinstance(found, NoFix) else judge(query, found, options.rule)
+
+
+def judge(query: Query, found: Found, rule: PeakRule) -> Fix | NoFix:
+    """The fix with its probability of being right where its peak is believed, else a refusal."""
     evidence, pixels = found.evidence, found.aligned.template.numel()
     # A place that contradicts the prior is vouched for by the match alone, as on a search of the whole map.
-    unexpected = (
-        query.prior is None or _off_prior(query, query.prior, found.fix) > options.rule.max_prior_chi_square
-    )
-    refusal = judge_peak(found.peak, pixels, options.rule, whole_map=unexpected, searched=not found.trusted)
+    expected = _expected(query, found.fix)
+    unexpected = expected is None or expected.off_prior > rule.max_prior_chi_square
+    refusal = judge_peak(found.peak, pixels, rule, whole_map=unexpected, searched=not found.trusted)
     if refusal is None and evidence is not None:
-        refusal = judge_evidence(evidence, options.rule)
+        refusal = judge_evidence(evidence, rule)
     if refusal is not None:
         return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
     return found.fix if evidence is None else replace(found.fix, confidence=probability(evidence))
 
 
-def _off_prior(query: Query, prior: Prior, fix: Fix) -> float:
-    """Chi-square, of two degrees of freedom, of a fix against the prior, by the errors of both."""
-    assert query.prior_px is not None
-    apart = np.array([fix.east_m, fix.north_m]) - query.site.enu_from_pixel(query.prior_px)
-    allowed = fix.covariance_m2[:2, :2] + prior.sigma_m**2 * np.eye(2)
-    return float(apart @ np.linalg.solve(allowed, apart))
+def _expected(query: Query, fix: Fix) -> Expected | None:
+    if query.prior is None or query.prior_px is None:
+        return None
+    return expected_of(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
 
 
 def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions) -> Fix:
@@ -111,7 +119,10 @@ def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: Nc
     nadir = nadir_px(query, peak, aligned)
     east, north = site.enu_from_pixel(nadir)
     lat, lon = site.geodetic_from_pixel(nadir)
-    peak_px2 = peak_covariance_px(peak, aligned.template.numel())
+    assert frame.height_agl_m is not None  # asked for before
+    rows, columns = aligned.template.shape
+    peak_px2 = peak_covariance_px(peak, rows * columns)
+    peak_px2 = peak_px2 + pull_px2(peak, (rows, columns), frame.height_agl_m, options.errors)
     covariance = ncc_covariance_m2(peak_px2, frame, query.camera, aligned.jacobian, options.errors)
     searched = frame is not query.frame
     attitude = Attitude(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,13 +12,14 @@ import torch
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.evidence import PoseEvidence, expected_of, probability
 from engine.features import match, sift
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.integrity import AssumedErrors
 from engine.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.learned import PairMatcher
 from engine.methods.query import Query
-from engine.methods.views import LOWEST_M, Belief, View, turn_deg, views_of
+from engine.methods.views import LOWEST_M, Belief, View, turn_deg, view_in, views_of
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
 from engine.types import Attitude, Fix, NoFix, Reason, Window
@@ -26,6 +28,9 @@ Array = NDArray[np.float64]
 
 METHOD = "sift"
 MAP_FEATURES = ("prepared", "per_frame")
+_USUAL_SCALE = 0.5  # for which the tolerance of the pose is meant; features of a coarser picture are blunter
+_FOUND_HEADING_DEG = 30.0  # belief in a heading that the matches gave themselves: none to speak of
+_ROUGH_REACH_PX = 1.5  # pixels of the map off a landmark where heights are asked for
 _BLUNT_PX = 1.6  # scale at which a keypoint's place is half as sure, in variance, as a small one's
 
 
@@ -53,8 +58,9 @@ class SiftOptions:
             matches is lifted and solved for the pose as features are.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
-        use_attitude: where the frame came with heading, roll and pitch, let them weigh in the pose by their
-            assumed errors; a few features alone can hardly tell a tilt from a displacement.
+        use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
+            features alone can hardly tell a tilt from a displacement.
+        min_confidence: probability of :func:`engine.evidence.probability` below which a pose is not believed.
         pose: settings of PnP and RANSAC.
         errors: what is assumed of the telemetry and the map.
     """
@@ -75,6 +81,7 @@ class SiftOptions:
     min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
     use_attitude: bool = True
+    min_confidence: float = 0.97
     pose: PoseOptions = field(default_factory=PoseOptions)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
@@ -126,26 +133,65 @@ class _Reduced:
         return np.asarray((xy_px + 0.5) / self.scale - 0.5, dtype=np.float64)
 
 
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A pose that is not judged yet.
+
+    Attributes:
+        fix: what it means, with the probability that it is right.
+        evidence: what speaks for it.
+    """
+
+    fix: Fix
+    evidence: PoseEvidence
+
+
 def locate(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Fix | NoFix:
     """One frame to a fix by features; needs neither height nor heading."""
+    found = find(query, landmarks, options)
+    return found if isinstance(found, NoFix) else judge(query, found, options)
+
+
+def find(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Found | NoFix:
+    """The pose of one frame with its evidence, or a refusal where there is none. As :func:`locate`."""
     flat = query.refuse_flat(METHOD, options.min_deviation)
     if flat is not None:
         return flat
     height_m, factor = query.frame.height_agl_m, options.height_factor
     unknown = (LOWEST_M, options.max_height_m)
     told = Belief(unknown if height_m is None else (height_m, height_m), turn_deg(query))
-    result = _look(query, landmarks, told, options)
-    if isinstance(result, Fix) or result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
-        return result
+    first = _look(query, landmarks, told, options)
+    if isinstance(first, Found):
+        if not doubtful(first, options):
+            return first
+    elif first.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
+        return first
     doubted = Belief(unknown if height_m is None else (height_m / factor, height_m * factor), None)
     deadline = query.watch.deadline
     if not options.second_look or doubted == told or deadline.remaining_ms < deadline.elapsed_ms:
-        return result
+        return first
     second = _look(query, landmarks, doubted, options)
-    return second if isinstance(second, Fix) else result
+    return second if isinstance(second, Found) and not doubtful(second, options) else first
 
 
-def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOptions) -> Fix | NoFix:
+def doubtful(found: Found, options: SiftOptions) -> bool:
+    """Whether a pose is not probable enough."""
+    return (found.fix.confidence or 0.0) < options.min_confidence
+
+
+def judge(query: Query, found: Found, options: SiftOptions) -> Fix | NoFix:
+    """The fix where its pose is believed, else a refusal."""
+    fix, evidence = found.fix, found.evidence
+    if not doubtful(found, options):
+        return fix
+    off = "unknown" if evidence.off_prior is None else f"{evidence.off_prior:.1f}"
+    figures = f"log10 of false alarms {evidence.log10_nfa:.1f}, chi-square {off} from the prior"
+    asked = f"{options.min_confidence:g} is asked for ({figures})"
+    detail = f"right with a probability of {fix.confidence:.3f}, {asked}"
+    return query.refuse(Reason.BAD_POSE, detail, METHOD, score=fix.score, window=fix.window)
+
+
+def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOptions) -> Found | NoFix:
     """Match, lift and solve, with what is believed of the telemetry."""
     watch = query.watch
     with watch.stage("window"):
@@ -163,20 +209,34 @@ def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOpt
         return query.refuse(Reason.TOO_FEW_MATCHES, detail, METHOD, window=window)
     if watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the pose", METHOD, window=window)
-    prior = _attitude_prior(query, options)
     for found in matched:
         with watch.stage("pose"):
-            stats = solve_pose(
-                found.points_m,
-                found.points_px,
-                query.camera.matrix,
-                options.pose,
-                prior=prior,
-                weights=found.weights,
-            )
+            stats = _pose(query, found, belief, options)
         if stats is not None:
-            return _fix(query, stats, found.view.window, options)
+            fix = _fix(query, stats, found.view.window, options)
+            return fix if isinstance(fix, NoFix) else _weighed(query, fix, stats, belief, options)
     return query.refuse(Reason.BAD_POSE, f"no pose explains enough of the {count} matches", METHOD, window=window)
+
+
+def matches_in(
+    query: Query, landmarks: LandmarkMap, window: Window, options: SiftOptions
+) -> tuple[Array, Array, PoseStats | None]:
+    """What is matched in a window at the frame's own height and heading, and the pose of it: for reports.
+
+    Returns:
+        Points (M, 2) in pixels of the undistorted frame, their places (M, 3) on the ground in metres, and the pose
+        with its inliers, or None where there are too few or they do not carry one.
+    """
+    height_m = query.frame.height_agl_m
+    assert height_m is not None  # without one there is no single view
+    belief = Belief((height_m, height_m), turn_deg(query))
+    views = [view_in(query, window, height_m, options.scale)]
+    if options.matcher is not None:
+        found = _by_matcher(query, views, options.matcher, options)[0]
+    else:
+        found = _by_features(query, views, landmarks, belief, options)[0]
+    enough = len(found.points_px) >= options.pose.min_inliers
+    return found.points_px, found.points_m, _pose(query, found, belief, options) if enough else None
 
 
 def _by_features(
@@ -206,7 +266,8 @@ def _by_features(
             points_px = reduced.full(features.xy_px[0].cpu().numpy()[pairs[:, 0]])
             scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
             weights = 1.0 / (1.0 + (scale_px / _BLUNT_PX) ** 2)
-            matched.append(_Matched(view, points_px, known.points_m[pairs[:, 1]], weights))
+            points_m = known.points_m[pairs[:, 1]]
+            matched.append(_Matched(view, points_px, points_m, weights * _steadiness(query.site, points_m)))
     return matched
 
 
@@ -220,7 +281,7 @@ def _by_matcher(query: Query, views: list[View], matcher: PairMatcher, options: 
             points, places = (found.cpu().numpy() for found in matcher(reduced.picture, crop))
             map_px = query.site.full_from_level(places + view.corner_px, view.level)
             ground_m = _lifted(query.site, map_px)
-            matched.append(_Matched(view, reduced.full(points), ground_m, np.ones(len(ground_m))))
+            matched.append(_Matched(view, reduced.full(points), ground_m, _steadiness(query.site, ground_m)))
     return matched
 
 
@@ -257,6 +318,11 @@ def _lifted(site: OrthoMap, map_px: Array) -> Array:
     return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
 
 
+def _steadiness(site: OrthoMap, points_m: Array) -> Array:
+    """Weights (N,) of landmarks: where the surface is rough, what they show may stand higher or lower."""
+    return site.steadiness_at(site.pixel_from_enu(points_m[:, :2]), _ROUGH_REACH_PX)
+
+
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
     """(3, 3) what the map adds: its georeference, and a slope of the ground that PnP takes for a tilt."""
     slope_deg = errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg
@@ -264,13 +330,50 @@ def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -
     return np.diag([horizontal, horizontal, errors.map_m**2])
 
 
-def _attitude_prior(query: Query, options: SiftOptions) -> AttitudePrior | None:
-    """The frame's own attitude with its assumed error about the camera's axes, or None where it is not known."""
-    frame, errors = query.frame, options.errors
-    if not options.use_attitude or frame.heading_deg is None or frame.roll_deg is None or frame.pitch_deg is None:
-        return None
-    enu_from_camera = enu_from_body(frame.roll_deg, frame.pitch_deg, frame.heading_deg) @ query.camera.mount
-    return AttitudePrior(enu_from_camera.T, (errors.tilt_deg, errors.tilt_deg, errors.heading_deg))
+def _pose(query: Query, found: _Matched, belief: Belief, options: SiftOptions) -> PoseStats | None:
+    """The pose that the matches agree on and the attitude allows.
+
+    Few matches can hardly tell a tilt from a displacement. What is known of the tilt weighs in also where the
+    heading is not: that is then taken from the matches themselves.
+    """
+    tolerance_px = options.pose.reprojection_px * max(1.0, _USUAL_SCALE / options.scale)
+    pose = replace(options.pose, reprojection_px=tolerance_px)
+    solve = partial(solve_pose, found.points_m, found.points_px, query.camera.matrix, pose, weights=found.weights)
+    if not options.use_attitude:
+        return solve()
+    heading_deg, sigma_deg = query.frame.heading_deg, options.errors.heading_deg
+    if heading_deg is None or belief.turn_deg is None:
+        free = solve()
+        if free is None:
+            return None
+        heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
+        sigma_deg = _FOUND_HEADING_DEG
+    return solve(prior=_attitude_prior(query, heading_deg, sigma_deg, options.errors))
+
+
+def _attitude_prior(query: Query, heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
+    """The frame's attitude with its assumed error about the camera's axes; what is not told is level."""
+    roll_deg, pitch_deg = query.frame.roll_deg, query.frame.pitch_deg
+    told = roll_deg is not None and pitch_deg is not None
+    tilt_deg = errors.tilt_deg if told else errors.unknown_tilt_deg
+    enu_from_camera = enu_from_body(roll_deg or 0.0, pitch_deg or 0.0, heading_deg) @ query.camera.mount
+    return AttitudePrior(enu_from_camera.T, (tilt_deg, tilt_deg, sigma_deg))
+
+
+def _weighed(query: Query, fix: Fix, stats: PoseStats, belief: Belief, options: SiftOptions) -> Found:
+    """A pose with what speaks for it; telemetry that is doubted is not asked."""
+    errors, height_m = options.errors, query.frame.height_agl_m
+    off_height = None
+    if height_m is not None and belief.height_m == height_m:
+        assert fix.up_m is not None
+        variance = errors.height_m**2 + (errors.height_share * height_m) ** 2 + float(fix.covariance_m2[2, 2])
+        ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
+        off_height = (fix.up_m - ground_m - height_m) ** 2 / variance
+    off_prior = None
+    if query.prior is not None and query.prior_px is not None:
+        off_prior = expected_of(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m).off_prior
+    evidence = PoseEvidence(stats.log10_nfa, off_prior, off_height)
+    return Found(replace(fix, confidence=probability(evidence)), evidence)
 
 
 def _fix(query: Query, stats: PoseStats, window: Window, options: SiftOptions) -> Fix | NoFix:
@@ -286,6 +389,8 @@ def _fix(query: Query, stats: PoseStats, window: Window, options: SiftOptions) -
         return query.refuse(Reason.BAD_POSE, detail, METHOD, score=share, window=window)
     lat, lon = site.geodetic_from_pixel(nadir)
     covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
+    if query.frame.roll_deg is None or query.frame.pitch_deg is None:
+        covariance *= max(1.0, _USUAL_SCALE / options.scale) ** 2  # blunt features err together, as a tilt would
     return Fix(
         timestamp_ns=query.frame.timestamp_ns,
         lat_deg=float(lat),

@@ -91,12 +91,23 @@ def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale:
         window = _window(query, served_m, belief.turn_deg is not None, method, margin)
         if isinstance(window, NoFix):
             return window
-        searched = level
-        while window.area_px >> 2 * searched > PREPARED_PX and searched < site.levels - 1:
-            searched += 1
-        crop = level_crop(site, window, searched, step_px=_CROP_STEP_PX)
-        views[searched] = View(window, searched, crop, 2**searched / (heights_m[0] * per_height))
+        view = _view(query, window, level, heights_m[0] * per_height)
+        views[view.level] = view
     return list(views.values())
+
+
+def view_in(query: Query, window: Window, height_m: float, scale: float) -> View:
+    """The view of a window that is known, at one height; see :func:`views_of`."""
+    per_px = height_m / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
+    return _view(query, window, level_for(1.0, per_px, query.site.levels), per_px)
+
+
+def _view(query: Query, window: Window, level: int, per_px: float) -> View:
+    """A window on a level, or where it is too large a coarser one; ``per_px`` map pixels are one of the frame."""
+    site = query.site
+    while window.area_px >> 2 * level > PREPARED_PX and level < site.levels - 1:
+        level += 1
+    return View(window, level, level_crop(site, window, level, step_px=_CROP_STEP_PX), 2**level / per_px)
 
 
 def _window(query: Query, height_m: float, known_turn: bool, method: str, margin: float) -> Window | NoFix:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.orthomap import OrthoMap
 from engine.sim.blocks import fill_blocks
 from engine.sim.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
 from engine.sim.conditions import CONDITIONS, Condition, condition_by_name, dress
@@ -26,6 +27,8 @@ from engine.sim.terrain import draw_river, hills, lay_on
 CRS_EPSG = 32633
 """UTM zone 33 north; the town lies 1.45 degrees east of its central meridian: convergence +1.08 degrees."""
 CENTRE_LAT_DEG, CENTRE_LON_DEG = 48.25, 16.45
+EXACT = 1e-3
+"""Metres and degrees by which a simulated map says that it is off: none, but a sigma is above 0."""
 GROUND_AMSL_M = 155.0
 """Height of the flat or lowest ground above mean sea level."""
 MARGIN_M = 40.0
@@ -66,6 +69,18 @@ class Town:
     world: World
     condition: Condition = CONDITIONS["noon"]
     datum_amsl_m: float = GROUND_AMSL_M
+
+    def site(self) -> OrthoMap:
+        """The town's map as the engine has it; it lies exactly, and says so."""
+        gray = np.asarray(cv2.cvtColor(self.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
+        return OrthoMap.from_arrays(
+            gray,
+            self.pixel_to_crs,
+            f"EPSG:{self.crs_epsg}",
+            surface_m=self.surface_m,
+            georeference_sigma_m=EXACT,
+            slope_sigma_deg=EXACT,
+        )
 
 
 def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array, float]]]:

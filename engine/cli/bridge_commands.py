@@ -1,0 +1,199 @@
+"""The commands of `bridge`: what each takes, and whom it calls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli.options import (
+    CameraOption,
+    DeviceOption,
+    FirmwareOption,
+    JsonOption,
+    MapOption,
+    MapSigmaOption,
+    MaxSigmaOption,
+    MessageOption,
+    MethodOption,
+    SurfaceOption,
+    ThreadsOption,
+    use_threads,
+)
+
+
+def mavlink(
+    connect: Annotated[
+        str,
+        typer.Option(
+            "--connect",
+            metavar="LINK",
+            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+        ),
+    ],
+    map_path: MapOption,
+    camera: CameraOption,
+    surface: SurfaceOption = None,
+    map_sigma: MapSigmaOption = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
+    ] = None,
+    telemetry: Annotated[
+        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
+    ] = None,
+    rate: Annotated[
+        float, typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps.")
+    ] = 10.0,
+    source: Annotated[
+        str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
+    ] = None,
+    grab: Annotated[
+        float,
+        typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
+    ] = 0.0,
+    firmware: FirmwareOption = "ardupilot",
+    message: MessageOption = "",
+    max_sigma: MaxSigmaOption = 10.0,
+    system_id: Annotated[
+        int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
+    ] = 1,
+    key: Annotated[
+        Path | None,
+        typer.Option("--key", metavar="FILE", help="Secret of MAVLink's signing; unsigned is ignored."),
+    ] = None,
+    listen_anywhere: Annotated[
+        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
+    ] = False,
+    set_origin: Annotated[
+        bool, typer.Option("--set-origin/--no-set-origin", help="Give an autopilot without an origin the map's.")
+    ] = True,
+    origin_alt: Annotated[
+        float | None,
+        typer.Option("--origin-alt-m", metavar="M", help="Its height above sea level; else the map's ground."),
+    ] = None,
+    use_velocity: Annotated[
+        bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is believed.")
+    ] = True,
+    method: MethodOption = "auto",
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
+    ] = None,
+    device: DeviceOption = "auto",
+    deadline: Annotated[
+        float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
+    ] = 121.0,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Fixes to an autopilot by MAVLink.
+
+    Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
+    played at their own pace, until they end.
+    """
+    from engine.cli.bridge import Inputs, Matching, Wire, run_bridge
+
+    use_threads(threads)
+    inputs = Inputs(map_path, surface, camera, frames, telemetry, source, rate, grab, map_sigma)
+    wire = Wire(
+        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
+        message=message, max_sigma_m=max_sigma, set_origin=set_origin, origin_alt_m=origin_alt,
+        use_velocity=use_velocity,
+    )  # fmt: skip
+    matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
+    run_bridge(inputs, wire, matching, as_json=as_json)
+
+
+def mavlink_params(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, made by this run.")],
+    firmware: FirmwareOption = "ardupilot",
+    message: MessageOption = "",
+    delay: Annotated[
+        int, typer.Option("--delay-ms", metavar="MS", help="From capture to arrival; the bridge prints it.")
+    ] = 100,
+    max_sigma: MaxSigmaOption = 10.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+) -> None:
+    """Parameters for an autopilot.
+
+    Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
+    """
+    from engine.cli.bridge import write_parameters
+
+    write_parameters(firmware, message, out, delay_ms=delay, max_sigma_m=max_sigma, force=force)
+
+
+def ros(
+    map_path: MapOption,
+    version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
+    surface: SurfaceOption = None,
+    map_sigma: MapSigmaOption = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
+    ] = None,
+    image: Annotated[
+        str, typer.Option("--image-topic", metavar="NAME", help="sensor_msgs/Image.")
+    ] = "/camera/image_raw",
+    camera_info: Annotated[
+        str, typer.Option("--camera-info-topic", metavar="NAME", help="sensor_msgs/CameraInfo.")
+    ] = "/camera/camera_info",
+    imu: Annotated[
+        str, typer.Option("--imu-topic", metavar="NAME", help="sensor_msgs/Imu with an orientation.")
+    ] = "/mavros/imu/data",
+    compass: Annotated[
+        str, typer.Option("--compass-topic", metavar="NAME", help="std_msgs/Float64, degrees; outranks the Imu.")
+    ] = "/mavros/global_position/compass_hdg",
+    height: Annotated[
+        str, typer.Option("--height-topic", metavar="NAME", help="std_msgs/Float64, metres above take-off.")
+    ] = "/mavros/global_position/rel_alt",
+    ranging: Annotated[
+        str, typer.Option("--range-topic", metavar="NAME", help="sensor_msgs/Range; outranks the height.")
+    ] = "/mavros/rangefinder/rangefinder",
+    velocity: Annotated[
+        str, typer.Option("--velocity-topic", metavar="NAME", help="geometry_msgs/TwistStamped, east and north.")
+    ] = "/mavros/local_position/velocity_local",
+    firmware: Annotated[
+        str,
+        typer.Option("--firmware", metavar="none|ardupilot|px4", help="For whom the poses are, behind MAVROS."),
+    ] = "none",
+    origin: Annotated[
+        str | None, typer.Option("--origin", metavar="LAT,LON", help="Of the poses; without it the map's.")
+    ] = None,
+    method: MethodOption = "auto",
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
+    ] = None,
+    device: DeviceOption = "auto",
+    deadline: Annotated[
+        float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
+    ] = 121.0,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
+    ] = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """A node of ROS 1 or ROS 2.
+
+    Hears pictures, attitude and height, and publishes poses, fixes, diagnostics and the window that was searched.
+    An empty name of a topic leaves it out.
+    """
+    from engine.adapters.ros import Topics
+    from engine.cli.bridge import Matching
+    from engine.cli.bridge_ros import Inputs, run_bridge_ros
+
+    use_threads(threads)
+    topics = Topics(
+        image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
+        velocity=velocity,
+    )  # fmt: skip
+    matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
+    inputs = Inputs(map_path, surface, camera, topics, map_sigma)
+    run_bridge_ros(version, inputs, matching, firmware, origin, as_json=as_json)

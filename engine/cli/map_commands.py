@@ -1,0 +1,66 @@
+"""The commands of `map`: what each takes, and whom it calls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console
+from engine.cli.options import (
+    ForceOption,
+    JsonOption,
+    SurfaceOption,
+    ThreadsOption,
+    use_threads,
+)
+
+
+def info(
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
+    surface: SurfaceOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Size, ground sample distance, CRS, bounds."""
+    from engine.orthomap import OrthoMap
+
+    console.facts(OrthoMap.open(map_path, surface=surface).info(), as_json, title=str(map_path))
+
+
+def audit(
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
+    surface: SurfaceOption = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", metavar="FILE", help="Calibration; without it 300 x 300 px with 60 degrees."),
+    ] = None,
+    height_agl: Annotated[
+        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground; 150 unless told.")
+    ] = None,
+    route: Annotated[
+        Path | None,
+        typer.Option("--route", metavar="FILE", help="GeoJSON LineString, or a QGroundControl .plan."),
+    ] = None,
+    other: Annotated[
+        Path | None,
+        typer.Option("--other", metavar="FILE", help="The same ground at another date; finds what is stale."),
+    ] = None,
+    sigma: Annotated[
+        float, typer.Option("--sigma-m", metavar="M", help="How well the position is known before a match.")
+    ] = 10.0,
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Where frames can be matched, and where not.
+
+    Writes matchability.tif (probability of a fix by NCC), audit.png and summary.json. With --route the
+    availability along it is predicted, and its poor stretches are listed.
+    """
+    from engine.cli.audit import Inputs, run_audit
+
+    use_threads(threads)
+    inputs = Inputs(map_path, surface, camera, route, other, height_agl)
+    run_audit(inputs, out, sigma_m=sigma, force=force, as_json=as_json)

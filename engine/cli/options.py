@@ -1,0 +1,59 @@
+"""Options that several commands share, and what is done with the threads that they name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+MapOption = Annotated[Path, typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.")]
+SurfaceOption = Annotated[
+    Path | None, typer.Option("--surface", metavar="FILE", help="Surface model, a GeoTIFF of heights.")
+]
+MapSigmaOption = Annotated[
+    float | None,
+    typer.Option("--map-sigma-m", metavar="M", help="How well the map lies, per axis; else as the map says."),
+]
+CameraOption = Annotated[
+    Path, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
+]
+MethodOption = Annotated[
+    str, typer.Option("--method", metavar="ncc|sift|auto", help="auto is ncc, and sift where ncc refuses.")
+]
+DeviceOption = Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live.")]
+BudgetOption = Annotated[
+    float | None,
+    typer.Option("--budget-ms", metavar="MS", help="Time that one frame may take; later answers are refused."),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace the results in a folder that exists.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Results as JSON on standard output.")]
+ThreadsOption = Annotated[
+    int, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.", show_default=True)
+]
+
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option("--settings", metavar="FILE", help="Settings from init; options given here count more."),
+]
+FirmwareOption = Annotated[
+    str, typer.Option("--firmware", metavar="ardupilot|px4", help="What the autopilot runs.")
+]
+MessageOption = Annotated[
+    str,
+    typer.Option(
+        "--message",
+        metavar="NAME",
+        help="What is sent; without it vision_position_estimate or global_position_sensor.",
+    ),
+]
+MaxSigmaOption = Annotated[
+    float, typer.Option("--max-sigma-m", metavar="M", help="A fix that is less certain is not sent.")
+]
+
+
+def use_threads(count: int) -> None:
+    """Threads of torch and OpenCV."""
+    from engine.device import set_threads
+
+    set_threads(count)

@@ -1,0 +1,205 @@
+"""Charts as SVG: axes with round ticks, and the few marks that the report draws on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Limits = tuple[float, float]
+
+WIDTH, HEIGHT = 720.0, 230.0
+_TOP, _RIGHT, _BOTTOM = 12.0, 14.0, 44.0
+_MOST_POINTS = 4000  # of a line; more would not show
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """The area of a chart: data in, SVG units out.
+
+    Attributes:
+        x_limits: of the data.
+        y_limits: of the data.
+        left: where the area begins.
+    """
+
+    x_limits: Limits
+    y_limits: Limits
+    left: float = 62.0
+
+    def places(self, x: Array, y: Array) -> Array:
+        """(N, 2) units of data; NaN where y is not known."""
+        return np.column_stack([self.x(x), self.y(y)])
+
+    def x(self, values: Array | float) -> Array:
+        """Units from the left."""
+        return self._scaled(values, self.x_limits, self.left, WIDTH - _RIGHT)
+
+    def y(self, values: Array | float) -> Array:
+        """Units from the top."""
+        return self._scaled(values, self.y_limits, HEIGHT - _BOTTOM, _TOP)
+
+    @staticmethod
+    def _scaled(values: Array | float, limits: Limits, begin: float, end: float) -> Array:
+        span = limits[1] - limits[0] or 1.0
+        return begin + (np.asarray(values, np.float64) - limits[0]) / span * (end - begin)
+
+    def dots(self, x: Array, y: Array, kind: str) -> str:
+        """A dot for each finite pair; what lies outside the limits is left out."""
+        inside = (y >= self.y_limits[0]) & (y <= self.y_limits[1])
+        return dots(self.places(x[inside], y[inside]), kind)
+
+    def line(self, x: Array, y: Array, kind: str) -> str:
+        """A line that is broken where y is NaN, and cut off at the limits."""
+        return line(self.places(x, np.clip(y, *self.y_limits)), kind)
+
+    def band(self, x: Array, low: Array, high: Array, kind: str) -> str:
+        """The area between two lines, broken where one of them is NaN."""
+        parts = []
+        for run in _runs(np.isfinite(low) & np.isfinite(high)):
+            part = run[:: max(1, len(run) // _MOST_POINTS)]
+            there, back = (self.places(x[part], np.clip(y[part], *self.y_limits)) for y in (high, low))
+            parts.append(f"M{_joined(there)}L{_joined(back[::-1])}Z")
+        return f'<path class="{kind}" d="{"".join(parts)}"/>' if parts else ""
+
+    def level(self, y: float, kind: str, text: str) -> str:
+        """A horizontal line with its name; nothing where it lies outside the limits."""
+        if not self.y_limits[0] <= y <= self.y_limits[1]:
+            return ""
+        at, above = float(self.y(y)), float(self.y(y)) > _TOP + 24
+        name = f'<text class="{kind}" x="{WIDTH - _RIGHT}" y="{at + (-5 if above else 17):.1f}" '
+        return f'{_segment(self.left, at, WIDTH - _RIGHT, at, kind)}{name}text-anchor="end">{escape(text)}</text>'
+
+    def upright(self, x: float, kind: str, text: str, row: int = 0) -> str:
+        """A vertical line with its name, in the first row of names or one below."""
+        if not self.x_limits[0] <= x <= self.x_limits[1]:
+            return ""
+        at = float(self.x(x))
+        right = at > 0.6 * WIDTH
+        name = f'<text class="{kind}" x="{at + (-6 if right else 6):.1f}" y="{_TOP + 14 + 20 * row}" '
+        anchor = "end" if right else "start"
+        segment = _segment(at, _TOP, at, HEIGHT - _BOTTOM, kind)
+        return f'{segment}{name}text-anchor="{anchor}">{escape(text)}</text>'
+
+    def overflow(self, x: Array, y: Array, kind: str) -> str:
+        """A triangle at the upper edge for each value above it."""
+        above = self.x(x[y > self.y_limits[1]])
+        marks = "".join(f"M{v - 4:.1f} {_TOP + 7}h8l-4 -7z" for v in np.unique(np.round(above, 1)))
+        return f'<path class="{kind}" d="{marks}"/>' if marks else ""
+
+    def bars(self, edges: Array, counts: Array, kind: str) -> str:
+        """A histogram."""
+        left, right, top = self.x(edges[:-1]), self.x(edges[1:]), self.y(counts.astype(np.float64))
+        foot = HEIGHT - _BOTTOM
+        marks = "".join(
+            f"M{a + 0.5:.1f} {foot}V{t:.1f}H{b - 0.5:.1f}V{foot}Z"
+            for a, b, t, n in zip(left, right, top, counts, strict=True)
+            if n
+        )
+        return f'<path class="{kind}" d="{marks}"/>'
+
+    def strip(self, x: Array, values: Sequence[str]) -> str:
+        """The background coloured by a word for each x, up to the next."""
+        parts, begin = [], 0
+        ends = np.append(x[1:], x[-1:])
+        for i in range(len(values)):
+            if i + 1 == len(values) or values[i + 1] != values[begin]:
+                left, right = float(self.x(float(x[begin]))), float(self.x(float(ends[i])))
+                size = f'width="{max(right - left, 0.8):.1f}" height="{HEIGHT - _BOTTOM - _TOP}"'
+                kind = escape(values[begin], quote=True)
+                parts.append(f'<rect class="{kind}" x="{left:.1f}" y="{_TOP}" {size}/>')
+                begin = i + 1
+        return "".join(parts)
+
+    def svg(self, label: str, x_label: str, marks: Sequence[str], *, rows: Sequence[str] = (), timed: bool) -> str:
+        """The chart.
+
+        Args:
+            label: what it shows, for those who do not see it.
+            x_label: under the axis.
+            marks: what is drawn, from below upwards.
+            rows: names of y = 0, 1, ... in place of numbers.
+            timed: whether x is the page's time, on which its cursor moves.
+        """
+        foot = HEIGHT - _BOTTOM
+        grid = "".join(self._x_tick(v, t, i) for i, (v, t) in enumerate(ticks(*self.x_limits, 6)))
+        y_ticks = list(enumerate(rows)) if rows else ticks(*self.y_limits, 4)
+        grid += "".join(self._y_tick(v, t) for v, t in y_ticks)
+        middle = (self.left + WIDTH - _RIGHT) / 2
+        name = f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text>'
+        axis = _segment(self.left, foot, WIDTH - _RIGHT, foot, "axis")
+        cursor, data = "", ""
+        if timed:
+            cursor = _segment(-9, _TOP, -9, foot, "cursor")
+            limits = f'data-from="{self.x_limits[0]:g}" data-to="{self.x_limits[1]:g}"'
+            data = f' {limits} data-left="{self.left:g}" data-right="{WIDTH - _RIGHT:g}"'
+        head = f'<svg class="chart" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img"'
+        head = f'{head} aria-label="{escape(label, quote=True)}"{data}>'
+        return f"{head}{grid}{''.join(marks)}{axis}{cursor}{name}</svg>"
+
+    def _x_tick(self, value: float, text: str, index: int) -> str:
+        at, foot = float(self.x(value)), HEIGHT - _BOTTOM
+        place = f'x="{at:.1f}" y="{foot + 19}" text-anchor="middle"'
+        return _segment(at, _TOP, at, foot, "grid") + f'<text class="tick{index % 2}" {place}>{text}</text>'
+
+    def _y_tick(self, value: float, text: str) -> str:
+        at = float(self.y(value))
+        place = f'x="{self.left - 7:g}" y="{at + 5:.1f}" text-anchor="end"'
+        return _segment(self.left, at, WIDTH - _RIGHT, at, "grid") + f"<text {place}>{escape(text)}</text>"
+
+
+def ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
+    """Round values within the limits, about ``count`` of them, and how they are written."""
+    rough = max(high - low, 1e-9) / count
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if power * m >= rough * 0.999)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    decimals = next(n for n in range(12) if abs(round(step, n) - step) < 1e-6 * step)
+    return [(n * step, f"{n * step + 0.0:,.{decimals}f}") for n in range(first, last + 1)]
+
+
+def dots(places: Array, kind: str) -> str:
+    """Round dots at (N, 2), each drawn once however many fall together; their size is the stroke's width."""
+    marks = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in _distinct(places))
+    return f'<path class="dots {kind}" d="{marks}"/>' if marks else ""
+
+
+def crosses(places: Array, kind: str, size: float) -> str:
+    """Diagonal crosses at (N, 2), with arms so long."""
+    arms = f"l{2 * size:.1f} {2 * size:.1f}m0 {-2 * size:.1f}l{-2 * size:.1f} {2 * size:.1f}"
+    marks = "".join(f"M{x - size:.1f} {y - size:.1f}{arms}" for x, y in _distinct(places))
+    return f'<path class="{kind}" d="{marks}"/>' if marks else ""
+
+
+def line(places: Array, kind: str) -> str:
+    """A line through (N, 2), broken where a place is NaN."""
+    runs = _runs(np.asarray(np.isfinite(places).all(axis=1), bool))
+    thin = max(1, sum(map(len, runs)) // _MOST_POINTS)
+    marks = "".join(f"M{_joined(places[run[::thin]])}" for run in runs)
+    return f'<path class="line {kind}" d="{marks}"/>' if marks else ""
+
+
+def _distinct(places: Array) -> Array:
+    """Those that are known and differ in what is written of them."""
+    return np.unique(np.round(places[np.isfinite(places).all(axis=1)], 1), axis=0)
+
+
+def _runs(known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Indices of what is known, cut where something between is not."""
+    indices = np.flatnonzero(known)
+    if not indices.size:
+        return []
+    return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
+
+
+def _joined(places: Array) -> str:
+    return "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
+
+
+def _segment(x0: float, y0: float, x1: float, y1: float, kind: str) -> str:
+    return f'<line class="{kind}" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>'

@@ -1,0 +1,323 @@
+"""report.html: one page that holds all of a track, its verdict first. It needs no network and no other file."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import metadata, resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from engine.formats.notes import Note
+from engine.formats.track import TrackRow
+from engine.orthomap import OrthoMap
+from engine.report.explain import Shown
+from engine.report.figures import Scene, scene_of
+from engine.report.metrics import WRONG_M, Ground
+from engine.report.page_charts import draw_charts
+from engine.report.page_map import TrackMap, draw_map, map_of
+from engine.report.verdict import MEANINGS, metres, verdict_of
+from engine.types import Reason, Truth, Window
+
+_FACTS = {
+    "map": "map", "surface": "surface model", "camera": "camera", "frames": "frames", "telemetry": "telemetry",
+    "truth": "truth", "method": "method", "profile": "profile", "device": "device", "start": "start",
+    "budget_ms": "budget (ms)",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """A finished track with what is known of it.
+
+    Attributes:
+        rows: the track.
+        truth: in the order of time, or None.
+        site: the map.
+        ground: level of the ground.
+        summary: as in summary.json, its settings included.
+        notes: one a row, or None where the run left none.
+    """
+
+    rows: Sequence[TrackRow]
+    truth: Sequence[Truth] | None
+    site: OrthoMap
+    ground: Ground
+    summary: Mapping[str, Any]
+    notes: Sequence[Note] | None
+
+    def scene(self) -> Scene:
+        """What is drawn of it."""
+        return scene_of(self.rows, self.truth, self.site.frame, self.ground, "")
+
+
+def write_page(path: Path, flown: Flown, shown: Sequence[Shown] = (), why_not: str = "") -> None:
+    """Write the page; equal inputs give equal bytes.
+
+    Args:
+        path: of the file, replaced where it exists.
+        flown: what it tells of.
+        shown: frames with their pictures.
+        why_not: where there are none, the reason.
+    """
+    scene, record = flown.scene(), flown.summary["settings"]
+    track_map = map_of(flown.site, scene)
+    verdict = verdict_of(flown.summary, _sigma_m(flown.rows), record.get("budget_ms"))
+    charts = draw_charts(flown.rows, flown.notes, scene, record.get("budget_ms"))
+    heading, subheading = _headings(flown, scene)
+    frames = [_frame(one, flown, scene, track_map) for one in shown]
+    data = {"box": track_map.box, "frames": frames}
+    parts = {
+        "title": escape(f"{heading}: scenematch report"),
+        "style": _part("page.css"),
+        "heading": escape(heading),
+        "subheading": escape(subheading),
+        "grade": verdict.grade,
+        "accuracy": escape(verdict.accuracy),
+        "latency": escape(verdict.latency),
+        "map": draw_map(track_map, scene),
+        "map_legend": _map_legend(scene, track_map, bool(shown)),
+        "tiles": "\n".join(
+            f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in _tiles(flown)
+        ),
+        "charts": "\n".join(f"<figure><figcaption>{escape(c)}</figcaption>{svg}</figure>" for c, svg in charts)
+        + _states_legend(flown),
+        "refusals": _refusals(flown, shown),
+        "frames": _slider(flown, scene, shown, why_not),
+        "made": _made(record),
+        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
+        "script": _part("page.js"),
+    }
+    path.write_text(Template(_part("page.html")).substitute(parts), encoding="utf-8", newline="\n")
+
+
+def _part(name: str) -> str:
+    return resources.files("engine.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _sigma_m(rows: Sequence[TrackRow]) -> float | None:
+    """Median of the stated sigmas, the larger of the two axes."""
+    sigmas = [
+        max(row.sigma_east_m, row.sigma_north_m)
+        for row in rows
+        if row.sigma_east_m is not None and row.sigma_north_m is not None
+    ]
+    return float(np.median(sigmas)) if sigmas else None
+
+
+def _headings(flown: Flown, scene: Scene) -> tuple[str, str]:
+    """The flight's name, and how it was followed."""
+    record = flown.summary["settings"]
+    frames = Path(record.get("frames") or record["map"])
+    name = frames.parent.name if frames.name == "frames" else frames.stem
+    method = str(record["method"])
+    text = f"{method.upper() if method != 'auto' else 'NCC and SIFT'}, {record['profile']} profile"
+    text += f", {len(flown.rows)} frames"
+    if scene.time_label.startswith("time") and len(scene.time) > 1:
+        text += f" over {scene.time[-1]:.0f} s"
+    return name or "flight", text
+
+
+def _tiles(flown: Flown) -> list[tuple[str, str]]:
+    """Key figures, each with its name; those that are not known are left out."""
+    summary = flown.summary
+    share = summary["availability"]
+    tiles = [(f"fixed, {summary['fixes']} of {summary['frames']}", "-" if share is None else f"{share:.1%}")]
+    if summary.get("median_m") is not None:
+        tiles += [
+            ("median error", metres(summary["median_m"])),
+            ("95 % of errors below", metres(summary["r95_m"])),
+            ("largest error", metres(summary["max_m"])),
+            (f"wrong, more than {WRONG_M:g} m off", str(summary["wrong_over_10m"])),
+            ("false, wrong beyond 3 sigma", str(summary["false_fixes"])),
+        ]
+        if summary["nees_mean"] is not None:
+            tiles.append(("NEES: 2 is honest, less cautious, more boastful", f"{summary['nees_mean']:.2f}"))
+    elif (sigma_m := _sigma_m(flown.rows)) is not None:
+        tiles.append(("median of the stated sigmas", metres(sigma_m)))
+    if summary.get("height_rms_m") is not None:
+        tiles.append(("RMS error of height", metres(summary["height_rms_m"])))
+    for name, key in (("latency, median", "p50"), ("latency, 95 % below", "p95")):
+        if summary["latency_ms"][key] is not None:
+            tiles.append((name, f"{summary['latency_ms'][key]:.1f} ms"))
+    return tiles
+
+
+def _map_legend(scene: Scene, track_map: TrackMap, slider: bool) -> str:
+    true = bool(np.isfinite(scene.errors.truth_en_m).any())
+    wrong = bool((scene.errors.distance_m > WRONG_M).any())
+    cross = "M6 2l10 10M16 2l-10 10"
+    entries = [
+        (
+            "truth" if true else "from fix to fix",
+            f'<path d="M0 7h22" stroke="var(--{"truth" if true else "fix"})"/>',
+        ),
+        ("fix", '<path class="dots" d="M11 7h0" stroke="var(--fix)"/>'),
+        ("its 3 sigma ellipse", '<circle cx="11" cy="7" r="6" stroke="var(--fix)" fill="#0072b220"/>'),
+        ("refused", f'<path d="{cross}" stroke="var(--refused)"/>') if scene.refused.any() else None,
+        (f"fix more than {WRONG_M:g} m off", f'<path d="{cross}" stroke="var(--wrong)"/>') if wrong else None,
+        (
+            "frame shown below and its window",
+            '<rect class="outline" x="2" y="1" width="18" height="12" stroke="var(--now)"/>',
+        )
+        if slider
+        else None,
+    ]
+    items = "".join(f"<li><svg aria-hidden='true'>{mark}</svg>{name}</li>" for name, mark in filter(None, entries))
+    width, height = (
+        n * track_map.site.gsd_m_per_px for n in (track_map.window.width_px, track_map.window.height_px)
+    )
+    return (
+        f'<ul class="legend">{items}</ul><p class="hint">{width:,.0f} by {height:,.0f} m of the map. Zoom by the '
+        "buttons or Ctrl and the wheel; drag to move.</p>"
+    )
+
+
+def _states_legend(flown: Flown) -> str:
+    """The colours of the navigator's states, as far as they occurred."""
+    seen = {note.state for note in flown.notes or ()} - {"tracking"}
+    names = {"coasting": "on dead reckoning", "searching": "searching for a first fix", "lost": "lost"}
+    items = "".join(
+        f'<li><svg aria-hidden="true"><rect class="{state}" width="22" height="14"/></svg>{name}</li>'
+        for state, name in names.items()
+        if state in seen
+    )
+    return f'\n<ul class="legend states">{items}</ul>' if items else ""
+
+
+def _refusals(flown: Flown, shown: Sequence[Shown]) -> str:
+    """A row for each reason, the most frequent first, with what one of its refusals said."""
+    if not flown.summary["reasons"]:
+        return "<p>No frame was refused.</p>" if flown.rows else "<p>There are no frames.</p>"
+    lines = []
+    for name, count in flown.summary["reasons"].items():
+        indices = [i for i, row in enumerate(flown.rows) if row.reason == name]
+        known = set(indices)
+        place = next((k for k, one in enumerate(shown) if one.index in known), None)
+        index = indices[0] if place is None else shown[place].index
+        detail = (flown.notes[index].detail if flown.notes else None) or "-"
+        button = "" if place is None else f'<button class="goto" type="button" data-goto="{place}">show</button>'
+        cells = (name.replace("_", " "), MEANINGS[Reason(name)], f"{flown.rows[index].frame}: {detail}")
+        text = "".join(f"<td>{escape(cell)}</td>" for cell in cells[:2])
+        text += f'<td class="break">{escape(cells[2])}</td><td>{button}</td>'
+        lines.append(f'<tr><td class="count">{count}</td>{text}</tr>')
+    head = "<th>frames</th><th>reason</th><th>meaning</th><th>for example</th><th></th>"
+    return f'<table class="reasons"><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table>'
+
+
+def _slider(flown: Flown, scene: Scene, shown: Sequence[Shown], why_not: str) -> str:
+    if not shown:
+        return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
+    text = f"All {len(shown)} frames."
+    if len(shown) < len(flown.rows):
+        wrong = [i for i, distance_m in enumerate(scene.errors.distance_m) if distance_m > WRONG_M]
+        refused = [i for i, row in enumerate(flown.rows) if not row.fixed]
+        said = [_told(wrong, shown, "wrong fixes"), _told(refused, shown, "refusals"), "the others evenly spaced"]
+        text = f"{len(shown)} of {len(flown.rows)} frames: {', '.join(part for part in said if part)}."
+    return (
+        f'<p class="sub">{text} Move by the slider, the arrow keys, or a click on the map or a chart. Each was '
+        "matched again for this page, in the window that the run used.</p>"
+        '<div class="slider"><button type="button" id="before" aria-label="Frame before">&#9664;</button>'
+        '<input type="range" id="slider" min="0" value="0" aria-label="Frame">'
+        '<button type="button" id="after" aria-label="Next frame">&#9654;</button><div class="strip" id="strip" '
+        'aria-hidden="true"></div></div>'
+        '<div class="facts" id="facts" aria-live="polite"></div><div class="pictures" id="pictures"></div>'
+        "<noscript><p>The slider needs JavaScript; the rest of the page does not.</p></noscript>"
+    )
+
+
+def _told(indices: Sequence[int], shown: Sequence[Shown], what: str) -> str:
+    """How many of these frames are shown; nothing where there are none."""
+    count = len({one.index for one in shown} & set(indices))
+    return (
+        ""
+        if not indices
+        else f"all {count} {what}"
+        if count == len(indices)
+        else f"{count} of {len(indices)} {what}"
+    )
+
+
+def _frame(shown: Shown, flown: Flown, scene: Scene, track_map: TrackMap) -> dict[str, Any]:
+    """What the page's script knows of one frame."""
+    i = shown.index
+    row, note = flown.rows[i], flown.notes[i] if flown.notes else None
+    wrong = bool(scene.errors.distance_m[i] > WRONG_M)
+    place = scene.refused_en_m[i] if scene.refused[i] else scene.errors.fix_en_m[i]
+    window = None
+    if (
+        note is not None
+        and note.window_x0_px is not None
+        and note.window_y0_px is not None
+        and row.window_width_px
+    ):
+        size = (row.window_width_px, row.window_height_px or 0)
+        window = track_map.rectangle(Window(note.window_x0_px, note.window_y0_px, *size))
+    reason = (row.reason or "").replace("_", " ")
+    return {
+        "name": row.frame,
+        "kind": "wrong" if wrong else "fix" if row.fixed else "refused",
+        "answer": ("Wrong fix" if wrong else "Fix") if row.fixed else f"Refused: {reason}",
+        "detail": None if note is None else note.detail,
+        "facts": _facts(i, row, note, scene),
+        "t": round(float(scene.time[i]), 3),
+        "xy": [round(float(v), 1) for v in track_map.places(place)] if np.isfinite(place).all() else None,
+        "window": window,
+        "pictures": [
+            {"s": p.src, "w": p.width_px, "h": p.height_px, "c": p.caption, "a": p.alt, "o": p.overlay}
+            for p in shown.pictures
+        ],
+    }
+
+
+def _facts(i: int, row: TrackRow, note: Note | None, scene: Scene) -> list[tuple[str, str]]:
+    sigma = (
+        None if row.sigma_east_m is None or row.sigma_north_m is None else (row.sigma_east_m, row.sigma_north_m)
+    )
+    error_m, known = float(scene.errors.distance_m[i]), bool(np.isfinite(scene.errors.distance_m[i]))
+    facts = [
+        (scene.time_label.partition(" ")[0], f"{scene.time[i]:.2f} s" if "(s)" in scene.time_label else f"{i}"),
+        ("error", metres(error_m) if known else None),
+        ("stated sigma", None if sigma is None else f"{sigma[0]:.2f} m east, {sigma[1]:.2f} m north"),
+        ("score", None if row.score is None else f"{row.score:.3f}"),
+        ("confidence", None if note is None or note.confidence is None else f"{note.confidence:.3f}"),
+        ("method", f"{row.method or '-'}" + (f", {note.stage}" if note is not None and note.stage else "")),
+        ("navigator", None if note is None else note.state),
+        ("latency", None if row.latency_ms is None else f"{row.latency_ms:.1f} ms"),
+    ]
+    return [(name, value) for name, value in facts if value is not None]
+
+
+def _made(record: Mapping[str, Any]) -> str:
+    """Inputs and settings, what was changed from the defaults, and versions."""
+
+    def table(pairs: Sequence[tuple[str, str]]) -> str:
+        body = "".join(f'<tr><td>{escape(k)}</td><td class="break">{escape(v)}</td></tr>' for k, v in pairs)
+        return f"<table><tbody>{body}</tbody></table>"
+
+    inputs = [(name, "-" if record.get(key) is None else str(record[key])) for key, name in _FACTS.items()]
+    if record.get("heights"):
+        inputs.append(
+            ("heights from", ", ".join(f"{source} ({count})" for source, count in record["heights"].items()))
+        )
+    changes = [(name, str(value)) for name, value in (record.get("changed") or {}).items()]
+    changed = table(changes) if changes else "<p>Nothing.</p>"
+    versions = [
+        ("scenematch", metadata.version("scenematch")),
+        ("torch", str(torch.__version__)),
+        ("OpenCV", cv2.__version__),
+        ("numpy", np.__version__),
+        ("Python", platform.python_version()),
+    ]
+    return (
+        f"<div><h3>Inputs and settings</h3>{table(inputs)}</div>"
+        f"<div><h3>Changed from the defaults</h3>{changed}<h3>Versions</h3>{table(versions)}</div>"
+    )
