@@ -90,6 +90,7 @@ class PeakRule:
             another town, turned until they fit, look like these.
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
         min_confidence: probability of :func:`engine.evidence.probability` below which a peak is not believed.
+        sure: the same above which it need not be held against the patch upside down.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
@@ -101,6 +102,7 @@ class PeakRule:
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
     min_confidence: float = 0.93
+    sure: float = 0.995
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import torch
+
 from engine.evidence import Evidence, Expected, evidence_of, expected_of, probability
 from engine.integrity import (
     PeakRule,
@@ -76,8 +78,25 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     if trusted and query.prior is not None:
         expected = _expected(query, fix)
         assert expected is not None
-        evidence = evidence_of(peak, score_sigma(aligned.template.numel()), expected)
+        sigma = score_sigma(aligned.template.numel())
+        evidence = evidence_of(peak, sigma, expected)
+        if probability(evidence) < options.rule.sure:
+            peak = _against_turned(query, prepared, aligned, window, peak, options)
+            evidence = evidence_of(peak, sigma, expected)
     return Found(peak, aligned, fix, trusted, evidence)
+
+
+def _against_turned(
+    query: Query, prepared: PreparedMap, aligned: Aligned, window: Window, peak: Peak, options: NccOptions
+) -> Peak:
+    """The peak with the best of the same patch upside down among its rivals.
+
+    Upside down the patch is of no place at all, so its best score is what this window gives to chance. Where the
+    compass is wrong by half a turn, it is the true place.
+    """
+    upside_down = replace(aligned, template=torch.flip(aligned.template, (0, 1)))
+    rival = search(query, prepared, upside_down, window, options)
+    return peak if rival is None else replace(peak, second_score=max(peak.second_score, rival.score))
 
 
 def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Fix | NoFix:
