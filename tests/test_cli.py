@@ -309,15 +309,19 @@ def test_doctor(capsys):
         ["bridge"],
         ["bridge", "mavlink"],
         ["bridge", "mavlink-params"],
+        ["bridge", "ros"],
+        ["simulate"],
+        ["compare"],
+        ["init"],
+        ["bag"],
         ["doctor"],
     ],
 )
-def test_help_fits_80_columns_and_offers_nothing_that_is_not_there(command, capsys, monkeypatch):
+def test_help_fits_80_columns_and_is_not_cut_off(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert run([*command, "--help"]) == 0
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 80
-    assert not re.search("simulate|bridge ros", printed)
     assert "..." not in printed.replace("[ARGS]...", "")
 
 
