@@ -13,7 +13,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from engine.errors import DtypeError, MapError, ShapeError
 from engine.geo import LocalFrame
@@ -30,47 +30,16 @@ from engine.rasters import (
     read_surface,
     stated_sigma,
 )
+from engine.surface import GROUND_PERCENT, Surface
 from engine.types import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-GROUND_PERCENT = 20.0
-"""Percentile of the surface over the map that is taken as the level of the ground."""
 GSD_RANGE_M = (1e-3, 1e3)
 GROUND_REACH_M = 30.0
 """So far about a place its ground is looked for: wider than a house, narrower than a hill."""
-_GROUND_PLACES = 15  # a side of the lattice on which it is
-_PLANE_ROUNDS = 8
-_PLANE_M = 0.3  # heights closer to the plane than this lie on it
 _ROUGH_M = 1.0  # heights about a place that differ by this much halve its weight
-
-
-class _Surface:
-    """Heights on a grid of their own, NaN where unknown, sampled at map pixels."""
-
-    def __init__(self, heights_m: NDArray[np.float32], from_map: Warp) -> None:
-        self._heights_m, self._from_map = heights_m, from_map
-
-    def sample(self, map_xy: Array) -> Array:
-        """Bilinear heights (...,) of map pixels (..., 2), NaN outside and next to nodata."""
-        height, width = self._heights_m.shape
-        last = np.array([width - 1.0, height - 1.0])
-        at = self._from_map(map_xy)
-        inside = np.asarray(((at >= -0.5) & (at <= last + 0.5)).all(axis=-1))
-        at = np.clip(np.where(inside[..., None], at, 0.0), 0.0, last)
-        low = at.astype(np.intp)
-        (x0, y0), (x1, y1) = np.moveaxis(low, -1, 0), np.moveaxis(np.minimum(low + 1, last.astype(np.intp)), -1, 0)
-        u, v = np.moveaxis(at - low, -1, 0)
-        grid = self._heights_m
-        top = grid[y0, x0] * (1.0 - u) + grid[y0, x1] * u
-        bottom = grid[y1, x0] * (1.0 - u) + grid[y1, x1] * u
-        return np.where(inside, top * (1.0 - v) + bottom * v, np.nan)
-
-    @property
-    def range_m(self) -> tuple[float, float]:
-        """Lowest and highest known height."""
-        return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
 
 
 class OrthoMap:
@@ -100,7 +69,7 @@ class OrthoMap:
         self.name, self.width_px, self.height_px = name, grid.width_px, grid.height_px
         self.crs, self.source_crs = grid.crs, source_crs
         self._grid, self._facts = grid, facts or {}
-        self._surface: _Surface | None = None
+        self._surface: Surface | None = None
         self.has_surface, self.ground_m = False, 0.0
         self._to_geodetic, self._from_geodetic = grid.pixels_of(earth_crs("EPSG:4326", "crs"))
         lon_deg, lat_deg = self._to_geodetic(grid.centre_px)
@@ -173,7 +142,7 @@ class OrthoMap:
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG, "slope_sigma_deg")
         if heights_file is not None:
             heights, lies = read_surface(heights_file, site._grid)
-            site._attach(_Surface(heights, warp_between(site._grid, lies)))
+            site._attach(Surface(heights, warp_between(site._grid, lies)))
         return site
 
     @classmethod
@@ -233,10 +202,10 @@ class OrthoMap:
         )
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG, "slope_sigma_deg")
         if heights is not None:
-            site._attach(_Surface(heights, warp_between(grid, grid)))
+            site._attach(Surface(heights, warp_between(grid, grid)))
         return site
 
-    def _attach(self, surface: _Surface) -> None:
+    def _attach(self, surface: Surface) -> None:
         xy = np.clip(np.rint(self._grid.lattice(257)), 0, [self.width_px - 1, self.height_px - 1])
         heights = surface.sample(xy)
         known = heights[np.asarray(np.isfinite(heights) & self._pyramid.valid_at(xy))]
@@ -302,19 +271,10 @@ class OrthoMap:
             The level at the place in the surface's datum, and the slope (2,) in metres up per pixel x and y:
             ``ground_m`` and level where nothing is known there, 0.0 and level without a surface.
         """
-        if self._surface is None:
-            return self.ground_m, np.zeros(2)
-        steps = np.linspace(-1.0, 1.0, _GROUND_PLACES)
-        offsets, reach_px = (
-            np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2),
-            reach_m / self.gsd_m_per_px,
-        )
-        heights_m = self._surface.sample(np.asarray(xy_px, np.float64) + offsets * reach_px)
-        known = np.isfinite(heights_m)
-        if np.count_nonzero(known) < offsets.shape[0] // 2:
-            return self.ground_m, np.zeros(2)
-        plane = _lower_plane(offsets[known], heights_m[known])
-        return float(plane[0]), plane[1:] / reach_px
+        found = None
+        if self._surface is not None:
+            found = self._surface.ground_plane(np.asarray(xy_px, np.float64), reach_m / self.gsd_m_per_px)
+        return found or (self.ground_m, np.zeros(2))
 
     def steadiness_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
         """Weight (...,) of what is seen at pixels (..., 2): 1 on level ground, less at walls, edges and crowns.
@@ -389,18 +349,3 @@ class OrthoMap:
             "georeference_sigma_m": self.georeference_sigma_m,
             "slope_sigma_deg": self.slope_sigma_deg,
         }
-
-
-def _lower_plane(offsets: Array, heights_m: Array) -> Array:
-    """The plane (3,), level and rise per offset, with a fifth of the heights (N,) below it at offsets (N, 2).
-
-    Quantile regression (Koenker and Bassett, Econometrica 1978) by reweighted least squares.
-    """
-    terms = np.column_stack([np.ones(len(offsets)), offsets])
-    share, weights = GROUND_PERCENT / 100.0, np.ones(len(offsets))
-    for _ in range(_PLANE_ROUNDS):
-        weighted = terms.T * weights
-        plane = np.linalg.solve(weighted @ terms, weighted @ heights_m)
-        above = heights_m - terms @ plane
-        weights = np.where(above > 0.0, share, 1.0 - share) / np.maximum(np.abs(above), _PLANE_M)
-    return plane

@@ -22,8 +22,9 @@ from engine.types import Attitude, Fix, NoFix, Reason, Window
 Array = NDArray[np.float64]
 
 _MAX_SHRINK = 0.75  # a frame finer than the map by more than this is averaged down first
-_COARSER = 1  # levels above the frame's own on which refinement begins
-_COARSER_UNTOLD = 2  # the same where nobody told roll and pitch
+# Levels above the frame's own on which refinement begins; where nobody told roll and pitch, or it did not find its
+# way from the former, the latter, where a few pixels reach farther.
+_COARSER, _COARSER_YET = 1, 2
 _TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # from which it begins there, about both axes
 _LEAST_UNTOLD = 0.45  # correlation asked for there: over simulated towns true poses reached 0.53, wrong ones 0.32
 _HEIGHT_SHARE = 2e-4  # of the height that walls, and the ground that they hide, pull it: 3 cm at 150 m
@@ -45,7 +46,8 @@ def improve(query: Query, fix: Fix, samples: SampleMap, options: NccOptions) -> 
     """
     belief = _belief(query, fix, options.errors)
     with query.watch.stage("dense"):
-        fit = _through_levels(query, belief, samples, options)
+        fit = _through_levels(query, belief, samples, options, _COARSER) if _told_tilt(query) else None
+        fit = fit or _through_levels(query, belief, samples, options, _COARSER_YET)
     if fit is not None:
         covariance = fit.covariance[:3, :3] + options.errors.map_m**2 * np.eye(3)
         covariance[2, 2] += (_HEIGHT_SHARE * (fit.pose.center_m[2] - query.site.ground_m)) ** 2
@@ -60,15 +62,16 @@ def _told_tilt(query: Query) -> bool:
     return query.frame.roll_deg is not None and query.frame.pitch_deg is not None
 
 
-def _through_levels(query: Query, belief: Belief, samples: SampleMap, options: NccOptions) -> DenseFit | None:
+def _through_levels(
+    query: Query, belief: Belief, samples: SampleMap, options: NccOptions, coarser: int
+) -> DenseFit | None:
     """Refine on levels coarser than the frame's first, where a few pixels reach farther, then on its own."""
     site, height_m = query.site, query.frame.height_agl_m
     assert height_m is not None  # a fix by correlation had one
     own = level_for(site.gsd_m_per_px, height_m / query.camera.focal_px, site.levels)
     told = _told_tilt(query)
-    first = own + (_COARSER if told else _COARSER_UNTOLD)
     pose, fit, before = belief.pose, None, 0.0
-    for level in range(min(first, site.levels - 1), own - 1, -1):
+    for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
         window = _footprint(query, belief.pose, height_m, level)
         if window is None:
             fit = None

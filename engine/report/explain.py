@@ -183,8 +183,9 @@ def _window(row: TrackRow, note: Note) -> Window | None:
 def _as_matched(frame: Frame, row: TrackRow, note: Note, site: OrthoMap) -> Frame:
     """The frame with the height and heading that the match gave it where the telemetry had none."""
     height_m, heading_deg = frame.height_agl_m, frame.heading_deg
-    if height_m is None and row.up_m is not None and row.up_m > site.ground_m:
-        height_m = row.up_m - site.ground_m
+    if height_m is None and row.up_m is not None and row.lat_deg is not None and row.lon_deg is not None:
+        above_m = row.up_m - site.ground_at(site.pixel_from_geodetic(row.lat_deg, row.lon_deg))
+        height_m = above_m if above_m > 0.0 else None
     return replace(
         frame, height_agl_m=height_m, heading_deg=note.heading_deg if heading_deg is None else heading_deg
     )
