@@ -480,7 +480,7 @@ def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
         odd.encoding = "32FC1"
         bridge.on_image(odd)
         bridge.on_image(an_image(maker, NOW_NS + 1))
-        node.wait_for("pose", 1)
+        node.wait_for("diagnostics", 2)  # the odd one's, and the fix's, which is told when it has been counted
         bridge.on_image(an_image(maker, NOW_NS))  # older than the last
         status = bridge.status
     first = node.of("diagnostics")[0].status[0]
