@@ -9,6 +9,7 @@ import typer
 
 from engine.cli.options import (
     CameraOption,
+    DeadlineOption,
     DeviceOption,
     FirmwareOption,
     JsonOption,
@@ -17,6 +18,8 @@ from engine.cli.options import (
     MaxSigmaOption,
     MessageOption,
     MethodOption,
+    SecondsOption,
+    StartOption,
     SurfaceOption,
     ThreadsOption,
     use_threads,
@@ -77,17 +80,10 @@ def mavlink(
         bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is believed.")
     ] = True,
     method: MethodOption = "auto",
-    start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
-    ] = None,
+    start: StartOption = None,
     device: DeviceOption = "auto",
-    deadline: Annotated[
-        float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
-    ] = 121.0,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
-    ] = None,
+    deadline: DeadlineOption = 121.0,
+    seconds: SecondsOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -166,17 +162,10 @@ def ros(
         str | None, typer.Option("--origin", metavar="LAT,LON", help="Of the poses; without it the map's.")
     ] = None,
     method: MethodOption = "auto",
-    start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
-    ] = None,
+    start: StartOption = None,
     device: DeviceOption = "auto",
-    deadline: Annotated[
-        float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
-    ] = 121.0,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
-    ] = None,
+    deadline: DeadlineOption = 121.0,
+    seconds: SecondsOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:

@@ -17,7 +17,9 @@ from engine.cli.options import (
     MapOption,
     MapSigmaOption,
     MethodOption,
+    OtherDeviceOption,
     SettingsOption,
+    StartOption,
     SurfaceOption,
     ThreadsOption,
     use_threads,
@@ -90,13 +92,8 @@ def track(
         str | None,
         typer.Option("--method", metavar="ncc|sift|auto", help="ncc, unless the settings say otherwise."),
     ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
-    ] = None,
+    start: StartOption = None,
+    device: OtherDeviceOption = None,
     budget_ms: BudgetOption = None,
     profile: Annotated[
         str | None,
@@ -144,13 +141,8 @@ def compare(
         list[str] | None,
         typer.Option("--run", metavar="METHOD[/PROFILE]|FILE", help="Once a run; without it the paper's Table I."),
     ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
-    ] = None,
+    start: StartOption = None,
+    device: OtherDeviceOption = None,
     budget_ms: BudgetOption = None,
     threads: ThreadsOption = 1,
     force: ForceOption = False,

@@ -50,6 +50,19 @@ MessageOption = Annotated[
 MaxSigmaOption = Annotated[
     float, typer.Option("--max-sigma-m", metavar="M", help="A fix that is less certain is not sent.")
 ]
+StartOption = Annotated[
+    str | None,
+    typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
+]
+DeadlineOption = Annotated[
+    float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
+]
+SecondsOption = Annotated[
+    float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
+]
+OtherDeviceOption = Annotated[
+    str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
+]
 
 
 def use_threads(count: int) -> None:
