@@ -109,7 +109,8 @@ def align(
     view = view_of(query.camera, attitude, height, jacobian)
     if view is not None:
         slope = _slope(query, view, height, level, nadir_px)
-        view = view_of(query.camera, attitude, height, jacobian, slope) or view
+        if slope.any():
+            view = view_of(query.camera, attitude, height, jacobian, slope) or view
     if view is None:
         tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
         return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", METHOD)

@@ -32,6 +32,7 @@ class Found:
         aligned: the hypothesis that it belongs to.
         fix: what the peak means, if it is believed.
         trusted: neither heading nor height was searched for.
+        expected: how its place lies to the prior; None where there is none.
         evidence: what speaks for it; None where more was searched than a window at one heading and height.
     """
 
@@ -39,6 +40,7 @@ class Found:
     aligned: Aligned
     fix: Fix
     trusted: bool
+    expected: Expected | None
     evidence: Evidence | None
 
 
@@ -74,16 +76,14 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     if query.watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
     fix = _fix(query, aligned, peak, window, options)
-    evidence = None
-    if trusted and query.prior is not None:
-        expected = _expected(query, fix)
-        assert expected is not None
+    expected, evidence = _expected(query, fix), None
+    if trusted and expected is not None:
         sigma = score_sigma(aligned.template.numel())
         evidence = evidence_of(peak, sigma, expected)
         if probability(evidence) < options.rule.sure:
             peak = _against_turned(query, prepared, aligned, window, peak, options)
             evidence = evidence_of(peak, sigma, expected)
-    return Found(peak, aligned, fix, trusted, evidence)
+    return Found(peak, aligned, fix, trusted, expected, evidence)
 
 
 def _against_turned(
@@ -116,8 +116,7 @@ def judge(query: Query, found: Found, rule: PeakRule) -> Fix | NoFix:
     """The fix with its probability of being right where its peak is believed, else a refusal."""
     evidence, pixels = found.evidence, found.aligned.template.numel()
     # A place that contradicts the prior is vouched for by the match alone, as on a search of the whole map.
-    expected = _expected(query, found.fix)
-    unexpected = expected is None or expected.off_prior > rule.max_prior_chi_square
+    unexpected = found.expected is None or found.expected.off_prior > rule.max_prior_chi_square
     refusal = judge_peak(found.peak, pixels, rule, whole_map=unexpected, searched=not found.trusted)
     if refusal is None and evidence is not None:
         refusal = judge_evidence(evidence, rule)
