@@ -18,6 +18,7 @@ from engine.cli.options import (
     MapSigmaOption,
     MethodOption,
     OtherDeviceOption,
+    OutOption,
     SettingsOption,
     StartOption,
     SurfaceOption,
@@ -56,7 +57,7 @@ def track(
     frames: Annotated[
         Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
+    out: OutOption,
     camera: Annotated[
         Path | None,
         typer.Option(
@@ -128,7 +129,7 @@ def compare(
     map_path: MapOption,
     camera: CameraOption,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR|VIDEO", help="Folder of pictures, or a video.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
+    out: OutOption,
     telemetry: Annotated[
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
     ] = None,

@@ -11,6 +11,7 @@ from engine.cli import console
 from engine.cli.options import (
     ForceOption,
     JsonOption,
+    OutOption,
     SurfaceOption,
     ThreadsOption,
     use_threads,
@@ -30,7 +31,7 @@ def info(
 
 def audit(
     map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")],
+    out: OutOption,
     surface: SurfaceOption = None,
     camera: Annotated[
         Path | None,
