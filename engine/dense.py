@@ -11,8 +11,12 @@ Convention:
 References:
     Evangelidis and Psarakis, Parametric image alignment using enhanced correlation coefficient maximization,
     PAMI 2008, https://doi.org/10.1109/TPAMI.2008.113 (gain and bias).
+    Benhimane and Malis, Real-time image-based tracking of planes using efficient second-order minimization,
+    IROS 2004, https://doi.org/10.1109/IROS.2004.1389474 (gradients of both pictures).
     Beaton and Tukey, The fitting of power series, Technometrics 1974,
     https://doi.org/10.1080/00401706.1974.10489171 (biweight).
+    Liang and Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986,
+    https://doi.org/10.1093/biomet/73.1.13 (scatter from cell to cell).
 """
 
 from __future__ import annotations
@@ -36,8 +40,10 @@ _BIWEIGHT = 4.685  # of the residuals' deviation: where Tukey's biweight gives a
 _MAD = 1.4826  # deviation of normal noise over its median absolute value
 _THINNED = 3  # every so many differences tell their median
 _EDGE_PX = 2.0  # along the picture's edge nothing is sampled
-# Neighbouring samples share what the map does not show: so many count as one.
-_SHARED = 2.0
+# What the samples pull is summed over so many cells of the picture, squared: how the sums scatter says how far
+# neighbours share what the map does not show.
+_CELLS = 8
+_EXCESS = 1.6  # variance besides, at which the errors over six simulated towns at noon fill the covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +53,19 @@ class Samples:
     Attributes:
         points_m: (N, 3) east, north and up.
         values: (N,) what the map shows there, enhanced as the picture is.
+        gradients: (N, 2) of the values, per metre to the east and to the north.
         weights: (N,) 0 to 1, how far place and value are to be relied on.
     """
 
     points_m: Array
     values: Array
+    gradients: Array
     weights: Array
 
     def __post_init__(self) -> None:
         count = len(self.points_m)
-        for name, shape in (("points_m", (count, 3)), ("values", (count,)), ("weights", (count,))):
+        shapes = {"points_m": (count, 3), "values": (count,), "gradients": (count, 2), "weights": (count,)}
+        for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ShapeError(f"{name}: expected {shape}, got {getattr(self, name).shape}")
 
@@ -120,15 +129,39 @@ class _Look:
 
     Attributes:
         differences: (N,) of picture and map.
-        derivatives: (8, N) of the differences.
+        places: (3, N) of the samples in the camera.
+        offsets_m: (2, N) of the samples from the slope's pivot.
+        rotation: (3, 3) of the pose.
+        shown: (3, N) derivatives of the differences by the places, as the picture's gradients show them.
+        expected: (3, N) the same, as the map's gradients let expect them.
         weights: (N,) robust ones, 0 where the picture does not show the sample.
+        cells: (N,) which cell of the picture shows it.
         correlation: of picture and map at the samples that the picture shows.
     """
 
     differences: Array
-    derivatives: Array
+    places: Array
+    offsets_m: Array
+    rotation: Array
+    shown: Array
+    expected: Array
     weights: Array
+    cells: NDArray[np.intp]
     correlation: float
+
+    @property
+    def variance(self) -> float:
+        """Of the differences."""
+        return max(float(self.weights @ self.differences**2 / self.weights.sum()), 1e-12)
+
+    def derivatives(self, by_places: Array) -> Array:
+        """(8, N) of the differences by the parameters, from those by the places (3, N)."""
+        out, x = np.empty((PARAMETERS, by_places.shape[1])), self.places
+        out[:3] = -self.rotation.T @ by_places
+        for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):  # x cross the derivatives
+            out[3 + i] = x[j] * by_places[k] - x[k] * by_places[j]
+        out[6:] = -out[2] * self.offsets_m
+        return out
 
 
 def picture_of(levels: Image, matrix: Array) -> Picture:
@@ -169,32 +202,64 @@ def refine(
         The pose, or None where too few samples are seen or they leave it undetermined.
     """
     offset_m = np.ascontiguousarray((samples.points_m - belief.pose.center_m).T)
-    pose, fit = start, None
-    for _ in range(_STEPS):
+    pose = start
+    for left in reversed(range(_STEPS)):
         look = _look(picture, samples, offset_m, pose, belief.pose)
         solved = None if look is None else _step(look, pose, belief)
         if look is None or solved is None:
             return None
-        step, covariance, sigmas_squared = solved
+        step, sigmas_squared = solved
         pose = _moved(pose, step)
-        fit = DenseFit(pose, covariance, look.correlation, sigmas_squared < last_step_sigmas**2)
-        if fit.settled:
-            break
-    return fit
+        settled = sigmas_squared < last_step_sigmas**2
+        if settled or not left:
+            covariance = _covariance(look, belief)
+            return None if covariance is None else DenseFit(pose, covariance, look.correlation, settled)
+    return None
 
 
-def _step(look: _Look, pose: Pose, belief: Belief) -> tuple[Array, Array, float] | None:
-    """The Gauss-Newton step (8,), the covariance (8, 8), and the step in standard deviations, squared."""
-    weighted = look.derivatives * look.weights
-    variance = float(look.weights @ look.differences**2 / look.weights.sum())
-    scale = 1.0 / (_SHARED * max(variance, 1e-12))
-    information = scale * (weighted @ look.derivatives.T) + belief.precision
-    gradient = -scale * (weighted @ look.differences) - belief.precision @ _away(pose, belief.pose)
-    found, covariance = cv2.invert(information, flags=cv2.DECOMP_CHOLESKY)
-    if not found:
+def _step(look: _Look, pose: Pose, belief: Belief) -> tuple[Array, float] | None:
+    """The Gauss-Newton step (8,), and in standard deviations, squared."""
+    # The mean of both gradients finds its way from farther than that of the picture alone.
+    derivatives = look.derivatives(0.5 * (look.shown + look.expected))
+    weighted = derivatives * (look.weights / (_EXCESS * look.variance))
+    inverse = _inverse(weighted @ derivatives.T + belief.precision)
+    if inverse is None:
         return None
-    step = covariance @ gradient
-    return step, np.asarray(covariance, np.float64), float(step @ gradient)
+    gradient = -weighted @ look.differences - belief.precision @ _away(pose, belief.pose)
+    step = inverse @ gradient
+    return step, float(step @ gradient)
+
+
+def _covariance(look: _Look, belief: Belief) -> Array | None:
+    """(8, 8) of the pose: the scatter of what the samples pull, over the squared pull of what both pictures show.
+
+    Parts of the picture that the map does not show have gradients too, which say nothing of the pose: of the
+    picture's information counts the share that its gradients have in common with the map's.
+    """
+    shown, expected = look.derivatives(look.shown), look.derivatives(look.expected)
+    weighted = shown * look.weights
+    information = weighted @ shown.T
+    alone = _inverse(information / look.variance + belief.precision)
+    if alone is None:
+        return None
+
+    def size(matrix: Array) -> float:
+        """In the measure of what the samples tell of each parameter besides the belief."""
+        return float(np.sum(alone * matrix))
+
+    in_common, of_map = size(weighted @ expected.T), size((expected * look.weights) @ expected.T)
+    pulls = 0.5 * (shown + expected) * (look.weights * look.differences)
+    by_cell = np.array([np.bincount(look.cells, pull, _CELLS**2) for pull in pulls], np.float64)
+    scatter = size(by_cell @ by_cell.T) / size(information)
+    if in_common <= 0.0 or scatter <= 0.0:
+        return None
+    share = min(1.0, in_common**2 / (size(information) * of_map))
+    return _inverse(information * (share / (_EXCESS * scatter)) + belief.precision)
+
+
+def _inverse(matrix: Array) -> Array | None:
+    found, inverse = cv2.invert(matrix, flags=cv2.DECOMP_CHOLESKY)
+    return np.asarray(inverse, np.float64) if found else None
 
 
 def _moved(pose: Pose, step: Array) -> Pose:
@@ -225,33 +290,36 @@ def _look(picture: Picture, samples: Samples, offset_m: Array, pose: Pose, pivot
         return None
     places = np.clip(at, -1e4, 1e4).astype(np.float32)[:, None]
     level, across, down = cv2.remap(picture.levels, *places, cv2.INTER_LINEAR)[0].T.astype(np.float64)
-    differences, weights, correlation = _compare(level, samples.values, weights)
-    pull = np.empty_like(x)  # d level / d x
-    pull[:2] = focal.T @ np.stack([across, down]) * near
-    pull[2] = -(pull[0] * tangents[0] + pull[1] * tangents[1])
-    derivatives = np.empty((PARAMETERS, len(level)))
-    derivatives[:3] = -pose.rotation.T @ pull
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):  # x cross pull
-        derivatives[3 + i] = x[j] * pull[k] - x[k] * pull[j]
-    derivatives[6:] = -derivatives[2] * offset_m[:2]
-    return _Look(differences, derivatives, weights, correlation)
+    differences, weights, correlation, gain = _compare(level, samples.values, weights)
+    shown = np.empty_like(x)
+    shown[:2] = focal.T @ np.stack([across, down]) * near
+    shown[2] = -(shown[0] * tangents[0] + shown[1] * tangents[1])
+    expected = np.empty_like(x)  # by the places on the map first; along the ray nothing changes
+    expected[:2] = gain * samples.gradients.T
+    expected[2] = -(expected[0] * away[0] + expected[1] * away[1]) / np.minimum(away[2], -1e-6)
+    expected = np.asarray(pose.rotation @ expected, np.float64)
+    cells = (np.clip(at / high, 0.0, 0.999) * _CELLS).astype(np.intp)
+    cells = cells[1] * _CELLS + cells[0]
+    return _Look(differences, x, offset_m[:2], pose.rotation, shown, expected, weights, cells, correlation)
 
 
-def _compare(level: Array, value: Array, weights: Array) -> tuple[Array, Array, float]:
-    """Differences between picture and map up to gain and bias, robust weights, and the correlation."""
-    differences, correlation = _up_to_gain(level, value, weights)
+def _compare(level: Array, value: Array, weights: Array) -> tuple[Array, Array, float, float]:
+    """Differences between picture and map up to gain and bias, robust weights, the correlation and the gain."""
+    differences, correlation, _ = _up_to_gain(level, value, weights)
     agreement = _biweight(differences, weights)
-    differences, _ = _up_to_gain(level, value, agreement)  # what does not belong there sets no gain
-    return differences, _biweight(differences, weights), correlation
+    differences, _, gain = _up_to_gain(level, value, agreement)  # what does not belong there sets no gain
+    return differences, _biweight(differences, weights), correlation, gain
 
 
-def _up_to_gain(level: Array, value: Array, weights: Array) -> tuple[Array, float]:
+def _up_to_gain(level: Array, value: Array, weights: Array) -> tuple[Array, float, float]:
+    """Differences, correlation, gain."""
     total = weights.sum()
     level = level - weights @ level / total
     value = value - weights @ value / total
     weighted = weights * value
     both, own, other = float(weighted @ level), float(weights @ (level * level)), float(weighted @ value)
-    return level - both / max(other, 1e-12) * value, both / max(math.sqrt(own * other), 1e-12)
+    gain = both / max(other, 1e-12)
+    return level - gain * value, both / max(math.sqrt(own * other), 1e-12), gain
 
 
 def _biweight(differences: Array, weights: Array) -> Array:

@@ -34,11 +34,16 @@ def make_scene(camera, roofs_m):
     points = np.column_stack([rng.uniform(-80, 80, (2500, 2)), rng.choice([0.0, *roofs_m], 2500)])
     body = enu_from_body(3.0, -2.0, 25.0) @ camera.mount
     pose = Pose(body.T, np.array([4.0, -3.0, HEIGHT_M]), np.zeros(2))
-    x = pose.rotation @ (points - pose.center_m).T
-    u, v = camera.matrix[:2, :2] @ (x[:2] / x[2]) + camera.matrix[:2, 2:]
+
+    def values(places):
+        x = pose.rotation @ (places - pose.center_m).T
+        return waves(*(camera.matrix[:2, :2] @ (x[:2] / x[2]) + camera.matrix[:2, 2:]))
+
+    steps = np.array([[0.01, 0.0, 0.0], [0.0, 0.01, 0.0]])
+    gradients = np.column_stack([(values(points + step) - values(points - step)) / 0.02 for step in steps])
     columns, rows = np.meshgrid(np.arange(SIZE_PX, dtype=float), np.arange(SIZE_PX, dtype=float))
     levels = waves(columns, rows).astype(np.float32)
-    return pose, Samples(points, waves(u, v), np.ones(len(points))), levels
+    return pose, Samples(points, values(points), gradients, np.ones(len(points))), levels
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +111,35 @@ def test_the_covariance_knows_that_tilt_and_slope_look_alike(camera):
     assert (sigmas[1] > 0.9 * HEIGHT_M * np.tan(np.radians(0.5))).all()
 
 
+def test_what_neighbours_share_widens_the_covariance(scene, camera):
+    """Grain and patches of the same variance: patches pull many samples at once."""
+    pose, samples, levels = scene
+    belief = believed(pose, precision=np.diag([0.0, 0.0, 1.0, *[np.radians(0.5) ** -2] * 3, 1e8, 1e8]))
+    sigmas = {}
+    for name, radius_px in (("grain", 0.1), ("patches", 12.0)):
+        noise = np.random.default_rng(1).normal(0, 1.0, levels.shape)
+        noise = cv2.GaussianBlur(noise, (0, 0), radius_px)
+        picture = picture_of((levels + 0.5 * noise / noise.std()).astype(np.float32), camera.matrix)
+        fit = refine(picture, samples, belief.pose, belief)
+        assert fit is not None
+        off = (fit.pose.center_m - pose.center_m)[:2]
+        assert off @ np.linalg.solve(fit.covariance[:2, :2], off) < 13.8  # once in a thousand
+        sigmas[name] = np.sqrt(np.diag(fit.covariance)[:2])
+    assert (sigmas["patches"] > 1.5 * sigmas["grain"]).all()
+
+
+def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, flat_site):
+    prepared = PreparedMap(flat_site, torch.device("cpu"), radius_px=12)
+    window = Window(100, 120, 200, 160)
+    found = SampleMap(flat_site, prepared).find(window, 0)
+    picture = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image.numpy()
+    for axis, step in enumerate(np.eye(2) * flat_site.gsd_m_per_px):
+        at = [flat_site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
+        ahead, behind = (cv2.remap(picture, *px.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for px in at)
+        change = (ahead - behind) / (2 * flat_site.gsd_m_per_px)
+        np.testing.assert_allclose(found.gradients[:, axis], change, atol=0.02 * np.abs(change).max())
+
+
 def test_no_pose_from_samples_that_are_not_seen(scene, camera):
     pose, samples, levels = scene
     picture = picture_of(levels, camera.matrix)
@@ -118,7 +152,7 @@ def test_no_pose_from_samples_that_are_not_seen(scene, camera):
 
 def test_samples_of_odd_shapes_are_refused():
     with pytest.raises(ShapeError, match=r"values: expected \(4,\), got \(3,\)"):
-        Samples(np.zeros((4, 3)), np.zeros(3), np.ones(4))
+        Samples(np.zeros((4, 3)), np.zeros(3), np.zeros((4, 2)), np.ones(4))
 
 
 # ------------------------------------------------------------------------------------------------ as part of NCC

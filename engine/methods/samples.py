@@ -51,7 +51,8 @@ class SampleMap:
                 )
             )
             index = np.arange(shape[0] * shape[1]).reshape(shape)[rows, columns].ravel()[::step]
-            parts.append((samples.points_m[index], samples.values[index], samples.weights[index]))
+            arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
+            parts.append([array[index] for array in arrays])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _cells_under(self, window: Window, level: int) -> list[Window]:
@@ -80,7 +81,7 @@ class SampleMap:
         region = self._prepared.cut(cell, level)
         inner = np.s_[cell.y0 - region.window.y0 :, cell.x0 - region.window.x0 :]
         picture = region.search.image.cpu().numpy()[inner]
-        across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1) for i in (1, 0))
+        across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
         rows, columns = _steepest(cv2.magnitude(across, down), shape)
         xy_px = self._site.full_from_level(np.stack([columns + cell.x0, rows + cell.y0], axis=-1), level)
@@ -90,7 +91,10 @@ class SampleMap:
         height_m = self._site.surface_at(xy_px)
         weights *= self._site.steadiness_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
         points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
-        return Samples(points, picture[rows, columns].astype(np.float64), weights), shape
+        per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
+        metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # alike all over a cell
+        gradients = per_px @ np.linalg.inv(metres_per_px)
+        return Samples(points, picture[rows, columns].astype(np.float64), gradients, weights), shape
 
 
 def _steepest(size: NDArray[np.float32], shape: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
