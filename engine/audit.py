@@ -57,7 +57,7 @@ def features(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Array:
     return np.stack([np.log2(np.clip(v, *limits)) for v, limits in zip(given, ranges, strict=True)], axis=-1)
 
 
-WEIGHTS = np.array([-16.2, 2.4, 1.6, 1.0])
+WEIGHTS = np.array([-16.41, 1.7, 1.89, 1.04])
 """Of the logistic rule: constant, texture, score, lead; fitted by ``python -m bench.audit --fit``."""
 
 

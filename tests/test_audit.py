@@ -152,7 +152,7 @@ def lat_lon(site, xy_px):
 def test_a_route_over_the_town_is_better_than_one_over_water(site, found):
     town = predict(found, *lat_lon(site, [[130, 225], [310, 225]]))
     water = predict(found, *lat_lon(site, [[600, 225], [780, 225]]))
-    assert town.availability > 0.7
+    assert town.availability > 0.5  # the least that is flagged good
     assert town.stretches == ()
     assert water.availability < 0.3
     assert [one.flag for one in water.stretches] == ["flat"]
