@@ -92,7 +92,7 @@ def test_a_place_in_a_town_is_found_from_nothing(town, error_m, method):
 
 def test_a_campus_is_matched_against_a_satellite_picture_of_another_day(campus, error_m):
     """Its truth is good to about a metre, its telemetry rounded to 5 m and 2 degrees."""
-    errors = campus.errors("ncc", error_m, range(0, len(campus.flight), 60))
+    errors = campus.errors("ncc", error_m, range(0, len(campus.flight), 10))
     known = errors[np.isfinite(errors)]
     assert len(known) >= 0.8 * len(errors)
     assert known.max() < 5.0
