@@ -31,6 +31,7 @@ METHODS = ("ncc", "sift", "auto")
 PROFILES = ("engine", "paper")
 _WARM_SHARES = (0.25, 0.12)  # of the map's shorter side that a made-up frame sees
 _WARM_ROUNDS = 3
+_WARM_SIDE_PX = 4096  # of a larger map it is a part of this side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,20 +122,22 @@ class SceneMatcher:
                     self.locate(frame, prior)
                     if self.options.profile == "engine":
                         ladder.every_rung(self._query(frame, prior, Deadline(Budget())), self._tools, self.method)
-            if self.options.profile == "engine":
+            if self.options.profile == "engine" and self.site.is_searchable:
                 self.locate(frame)  # the search of the whole map
 
     def _made_up(self, share: float) -> tuple[Frame, Prior]:
         """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""
         site, camera = self.site, self.camera
-        side_px = share * min(site.width_px, site.height_px)
+        side_px = share * min(site.width_px, site.height_px, _WARM_SIDE_PX)
         per_px = side_px / max(camera.width_px, camera.height_px)
         level = level_for(1.0, per_px, site.levels)
         size = (round(camera.width_px * per_px), round(camera.height_px * per_px))
-        corner = ((site.width_px - size[0]) // 2, (site.height_px - size[1]) // 2)
-        crop = level_crop(site, Window(*corner, max(1, size[0]), max(1, size[1])), level)
+        place = site.inner_px
+        last = (site.width_px - size[0], site.height_px - size[1])
+        x, y = (int(np.clip(v - (n - 1) / 2, 0, most)) for v, n, most in zip(place, size, last, strict=True))
+        crop = level_crop(site, Window(x, y, max(1, size[0]), max(1, size[1])), level)
         image = cv2.resize(site.gray(crop, level), (camera.width_px, camera.height_px))
-        middle = site.enu_from_pixel(np.array([site.width_px - 1, site.height_px - 1]) / 2.0)
+        middle = site.enu_from_pixel(place)
         height_m = per_px * camera.focal_px * site.gsd_m_per_px
         prior = Prior(east_m=float(middle[0]), north_m=float(middle[1]), sigma_m=5.0)
         return Frame(np.asarray(image, np.uint8), 0, height_m, 0.0, 0.0, 0.0), prior
@@ -164,6 +167,9 @@ class SceneMatcher:
         """
         deadline = Deadline(budget or Budget(), whole_map=prior is None)
         query = self._query(frame, prior, deadline)
+        if prior is None and not self.site.is_searchable:
+            detail = f"the map of {self.site.size_km} is not searched as a whole; a position to begin at is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
         result = self._dispatch(query)
         if isinstance(result, Fix) and not deadline.met:
             return query.refuse(

@@ -245,11 +245,9 @@ class Navigator:
             held = self._held_place(now)
             if held is not None:
                 return held.prior()
-            if (
-                place is None
-                or place.sigma_m > options.lost_sigma_m
-                or self._frames_lost % options.search_every == 0
-            ):
+            vague = place is None or place.sigma_m > options.lost_sigma_m
+            turn = vague or self._frames_lost % options.search_every == 0
+            if place is None or (turn and self._matcher.site.is_searchable):
                 return None
         growth = options.growth ** min(self._refusals, options.lost_after)
         last = self._way.last

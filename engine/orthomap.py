@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from engine.errors import DtypeError, MapError, ShapeError
 from engine.geo import LocalFrame
 from engine.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
-from engine.metric_copy import open_metric_copy
-from engine.pyramid import Pyramid, Read
+from engine.metric_copy import is_large, needs_copy, open_metric_copy
+from engine.pyramid import Arrays, Pyramid, Reader
 from engine.rasters import (
     GEOREFERENCE_TAG,
     SLOPE_TAG,
@@ -27,10 +27,9 @@ from engine.rasters import (
     GrayReader,
     Mask,
     open_source,
-    read_surface,
     stated_sigma,
 )
-from engine.surface import GROUND_PERCENT, Surface
+from engine.surface import GROUND_PERCENT, Surface, open_surface
 from engine.types import Window
 
 if TYPE_CHECKING:
@@ -39,6 +38,9 @@ if TYPE_CHECKING:
 GSD_RANGE_M = (1e-3, 1e3)
 GROUND_REACH_M = 30.0
 """So far about a place its ground is looked for: wider than a house, narrower than a hill."""
+SEARCH_LIMIT_PX = 1 << 29
+"""A map of up to this many pixels may be searched as a whole, where nothing is known of the place."""
+_LEAST_KNOWN = 100  # places at which the ground's level is taken
 _ROUGH_M = 1.0  # heights about a place that differ by this much halve its weight
 
 
@@ -64,7 +66,7 @@ class OrthoMap:
     slope_sigma_deg: float | None = None
 
     def __init__(
-        self, name: str, grid: Grid, read: Read, source_crs: CRS, facts: dict[str, Any] | None = None
+        self, name: str, grid: Grid, reader: Reader, source_crs: CRS, facts: dict[str, Any] | None = None
     ) -> None:
         self.name, self.width_px, self.height_px = name, grid.width_px, grid.height_px
         self.crs, self.source_crs = grid.crs, source_crs
@@ -84,7 +86,7 @@ class OrthoMap:
         lonlat = self._to_geodetic(grid.lattice())
         (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
         self.bounds_deg = (float(west), float(south), float(east), float(north))
-        self._pyramid = Pyramid(grid.width_px, grid.height_px, read)
+        self._pyramid = Pyramid(grid.width_px, grid.height_px, reader)
         self.levels = self._pyramid.levels
 
     @classmethod
@@ -119,30 +121,31 @@ class OrthoMap:
             OptionError: an accuracy is not a number above 0.
         """
         original = used = open_source(path, bounds_deg=bounds_deg, crs=crs)
-        reader = GrayReader(original)
-        share = reader.invalid_share
-        if not original.grid.is_metric:
+        copied = needs_copy(original)
+        reader = None if copied and is_large(original.grid) else GrayReader(original)
+        share = None if reader is None else reader.invalid_share
+        if copied:
             used = open_metric_copy(original, reader, cache_dir)
             reader = GrayReader(used, find_collar=False)
+        assert reader is not None  # of the file or of its copy
         facts = {
             "path": str(original.path),
             "driver": original.dataset.driver,
             "bands": original.dataset.count,
             "dtype": original.dataset.dtypes[0],
             "source_size_px": [original.grid.width_px, original.grid.height_px],
-            "source_nodata_share": share,
-            "resampled": used is not original,
+            "source_nodata_share": reader.invalid_share if share is None else share,
+            "resampled": not original.grid.is_metric,
             "surface_path": None if surface is None else os.fspath(surface),
         }
-        site = cls(original.path.name, used.grid, reader.read, original.grid.crs, facts)
+        site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)
         site.georeference_sigma_m = stated_sigma(
             georeference_sigma_m, original, GEOREFERENCE_TAG, "georeference_sigma_m"
         )
         heights_file = None if surface is None else open_source(surface, "surface")
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG, "slope_sigma_deg")
         if heights_file is not None:
-            heights, lies = read_surface(heights_file, site._grid)
-            site._attach(Surface(heights, warp_between(site._grid, lies)))
+            site._attach(*open_surface(heights_file, site._grid))
         return site
 
     @classmethod
@@ -192,32 +195,57 @@ class OrthoMap:
                 f"pixel_to_crs: expected a square north-up grid in a projected CRS, got {grid.crs.name!r}"
             )
 
-        def read(window: Window) -> tuple[Gray, Mask]:
-            part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
-            return gray[part], mask[part]
-
-        site = cls("arrays", grid, read, grid.crs)
+        site = cls("arrays", grid, Arrays(gray, mask), grid.crs)
         site.georeference_sigma_m = stated_sigma(
             georeference_sigma_m, None, GEOREFERENCE_TAG, "georeference_sigma_m"
         )
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG, "slope_sigma_deg")
         if heights is not None:
-            site._attach(Surface(heights, warp_between(grid, grid)))
+            site._attach(Surface(heights, warp_between(grid, grid)), grid)
         return site
 
-    def _attach(self, surface: Surface) -> None:
-        xy = np.clip(np.rint(self._grid.lattice(257)), 0, [self.width_px - 1, self.height_px - 1])
-        heights = surface.sample(xy)
-        known = heights[np.asarray(np.isfinite(heights) & self._pyramid.valid_at(xy))]
+    def _attach(self, surface: Surface, lies: Grid) -> None:
+        known = self._known_heights(surface, self._grid.lattice(257))
+        if known.size < _LEAST_KNOWN:  # a surface of a small part of the map, or a map of small parts
+            known = self._known_heights(surface, warp_between(lies, self._grid)(lies.lattice(257)))
         if known.size == 0:
             raise MapError("surface: expected known heights under the valid part of the map, got none")
         self._surface, self.has_surface = surface, True
         self.ground_m = float(np.percentile(known, GROUND_PERCENT))
 
+    def _known_heights(self, surface: Surface, xy_px: Array) -> Array:
+        """The surface's heights at those of the pixels (N, 2) where they and the map are known."""
+        last = np.array([self.width_px - 1, self.height_px - 1])
+        xy = np.rint(xy_px)
+        xy = np.clip(xy, 0, last)[((xy >= -1) & (xy <= last + 1)).all(axis=1)]
+        heights = surface.overview(xy)
+        return np.asarray(heights[np.isfinite(heights) & self._pyramid.valid_at(xy)])
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it is read from its file part by part, instead of being held in memory."""
+        return self._pyramid.is_large
+
+    @property
+    def is_searchable(self) -> bool:
+        """Whether a frame may be looked for all over it."""
+        return self.width_px * self.height_px <= SEARCH_LIMIT_PX
+
+    @property
+    def size_km(self) -> str:
+        """Width and height on the ground, in words."""
+        return " x ".join(f"{n * self.gsd_m_per_px / 1e3:.3g}" for n in (self.width_px, self.height_px)) + " km"
+
+    @property
+    def inner_px(self) -> Array:
+        """A place (2,) with map all around: the middle where that is map, else the farthest from any nodata."""
+        middle = np.array([self.width_px - 1, self.height_px - 1]) / 2.0
+        return middle if bool(self._pyramid.valid_at(middle)) else self._pyramid.innermost_px()
+
     @property
     def fully_valid(self) -> bool:
-        """Whether no pixel is nodata."""
-        return self._pyramid.nodata_share == 0.0
+        """Whether no pixel is nodata; of a large map only where its file cannot even say that one is."""
+        return self._pyramid.fully_valid
 
     def gray(self, window: Window, level: int = 0) -> Gray:
         """Grey values (h, w) of a window in pixels of ``level``; without meaning where it is not valid.

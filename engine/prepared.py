@@ -18,7 +18,7 @@ from engine.ncc_fft import Search, prepare
 from engine.orthomap import OrthoMap
 from engine.types import Window
 
-CELL_PX = 512
+CELL_PX = 256
 """Regions begin and end on multiples of this, so that neighbouring windows share one."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""

@@ -3,35 +3,70 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from engine.errors import OptionError
 from engine.grids import Array
-from engine.rasters import MEMORY_LIMIT_PX, Gray, Mask
+from engine.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, Mask, scaled_window
 from engine.types import Window
-
-Read = Callable[[Window], tuple[Gray, Mask]]
 
 SMALLEST_LEVEL_PX = 16
 
 
+class Reader(Protocol):
+    """Where pixels come from: a file, or arrays.
+
+    Attributes:
+        levels: that can be read, in rising order, 0 among them.
+        all_valid: whether no pixel can be nodata, whichever is read.
+    """
+
+    @property
+    def levels(self) -> tuple[int, ...]: ...  # noqa: D102
+
+    @property
+    def all_valid(self) -> bool: ...  # noqa: D102
+
+    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
+        """Grey and validity (h, w) of a window in pixels of one of the levels."""
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """A reader of arrays (H, W)."""
+
+    gray: Gray
+    valid: Mask
+    levels: tuple[int, ...] = (0,)
+    all_valid: bool = False
+
+    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
+        """Grey and validity (h, w) of a window."""
+        part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
+        return self.gray[part], self.valid[part]
+
+
 class Pyramid:
-    """Grey and validity at every level: in memory from the first level that is small enough, read below it.
+    """Grey and validity at every level: a small map in memory; of a large one the coarse levels, the others read.
 
     Args:
         width_px: of level 0.
         height_px: of level 0.
-        read: grey and validity (h, w) of a window of level 0.
+        reader: of the pixels. What lies between its levels is halved from the next finer one.
     """
 
-    def __init__(self, width_px: int, height_px: int, read: Read) -> None:
-        self._size, self._read = (height_px, width_px), read
+    def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
+        self._size, self._reader = (height_px, width_px), reader
         self.levels = max(1, int(math.log2(max(1.0, min(self._size) / SMALLEST_LEVEL_PX))) + 1)
         self._base = 0
-        while self._base < self.levels - 1 and math.prod(self.shape(self._base)) > MEMORY_LIMIT_PX:
+        self.is_large = math.prod(self._size) > MEMORY_LIMIT_PX
+        """Whether it is too large for memory."""
+        limit_px = min(MEMORY_LIMIT_PX, COARSE_LIMIT_PX)
+        while self.is_large and self._base < self.levels - 1 and math.prod(self.shape(self._base)) > limit_px:
             self._base += 1
         self._kept: dict[int, tuple[Gray, Mask]] = {}
         self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
@@ -48,15 +83,20 @@ class Pyramid:
         """A whole level, read in strips so that colour and masks of the file never lie in memory at once."""
         height, width = self.shape(level)
         gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
-        rows = max(1, 1024 >> level)
+        rows = max(1, 1024 >> (level - self._stored(level)))
         for y0 in range(0, height, rows):
             strip = Window(0, y0, width, min(rows, height - y0))
             gray[y0 : y0 + rows], valid[y0 : y0 + rows] = self._from_file(strip, level)
         return gray, valid
 
+    def _stored(self, level: int) -> int:
+        """The level that is read for another."""
+        return max(stored for stored in self._reader.levels if stored <= level)
+
     def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
-        both = self._read(Window(*(v << level for v in (window.x0, window.y0, window.width_px, window.height_px))))
-        for _ in range(level):
+        finer = level - self._stored(level)
+        both = self._reader.read(scaled_window(window, finer), level - finer)
+        for _ in range(finer):
             both = _halved(*both)
         return both
 
@@ -80,6 +120,11 @@ class Pyramid:
             last = self._last = ((window, level), self._from_file(window, level))
         return last[1]
 
+    @property
+    def fully_valid(self) -> bool:
+        """Whether no pixel is nodata; of a large map only where its file has no way to say that one is."""
+        return self._reader.all_valid if self.is_large else self.nodata_share == 0.0
+
     @cached_property
     def nodata_share(self) -> float:
         """Share of the pixels that are not valid, at the finest level in memory."""
@@ -90,6 +135,15 @@ class Pyramid:
         height, width = self.shape(self._base)
         x, y = np.moveaxis(xy_px.astype(np.intp) >> self._base, -1, 0)
         return np.asarray(self._level(self._base)[1][np.minimum(y, height - 1), np.minimum(x, width - 1)])
+
+    def innermost_px(self) -> Array:
+        """The pixel (2,) of level 0 that is farthest from any that is not valid."""
+        import cv2
+
+        valid = np.pad(self._level(self._base)[1].astype(np.uint8), 1)
+        inside = cv2.distanceTransform(valid, cv2.DIST_L2, 3)[1:-1, 1:-1]
+        y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
+        return (np.array([x, y]) + 0.5) * 2.0**self._base - 0.5
 
 
 def _halved(gray: Gray, valid: Mask) -> tuple[Gray, Mask]:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.grids import Array, Grid, apply_affine, earth_crs, overlap, wgs84
+from engine.tiles import local_path, openable
 from engine.types import Window
 
 if TYPE_CHECKING:
@@ -34,18 +35,6 @@ if TYPE_CHECKING:
 Gray = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-SIGNATURES = (
-    ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
-    ("PNG", (b"\x89PNG",)),
-    ("JPEG", (b"\xff\xd8\xff",)),
-    ("JP2OpenJPEG", (b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51")),
-    ("BMP", (b"BM",)),
-    ("WEBP", (b"RIFF",)),
-)
-"""GDAL drivers that may open a file, and how its content must begin; the ending of its name does not count.
-
-A VRT is not among them: it can point to any file or address.
-"""
 DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
@@ -58,6 +47,10 @@ SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
 _GDAL_CACHE_BYTES = 128 * 2**20  # GDAL's own cache is a twentieth of the machine's memory
 MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
+COARSE_LIMIT_PX = 16 * 2**20
+"""Of those the first level of up to this many pixels, and the coarser ones, are held in memory."""
+SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // 4
+"""The same of heights, which take four times the memory."""
 HEIGHT_RANGE_M = (-1000.0, 20000.0)
 """Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 
@@ -117,10 +110,10 @@ def open_source(
     bounds_deg: tuple[float, float, float, float] | None = None,
     crs: Any = None,
 ) -> Source:
-    """Open a local raster file and find where it lies.
+    """Open a local raster and find where it lies.
 
     Args:
-        path: a GeoTIFF, or a picture; GDAL reads a world file beside it.
+        path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a VRT, or a folder of tiles.
         argument: what a message calls the file.
         bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
             and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).
@@ -131,9 +124,10 @@ def open_source(
     """
     import rasterio
 
-    file = _local_file(path, argument)
+    file = local_path(path, argument)
     with map_errors(argument, file):
-        dataset = rasterio.open(file, driver=_driver(file, argument))
+        what, driver = openable(file, argument)
+        dataset = rasterio.open(what, driver=driver)
         transform, own_crs = dataset.transform, dataset.crs
     width, height = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
@@ -161,32 +155,6 @@ def _checked(grid: Grid, argument: str, file: Path) -> Grid:
     if not (abs(lat) <= 90.0 and abs(lon) <= 540.0):  # NaN and infinity fail too
         raise MapError(f"{argument}: the centre of {file} lies outside its CRS {grid.crs.name!r}")
     return grid
-
-
-def _local_file(path: str | os.PathLike[str], argument: str) -> Path:
-    text = os.fspath(path)
-    if "://" in text or text.startswith("/vsi"):
-        raise MapError(f"{argument}: expected the path of a local file, got {text!r}")
-    file = Path(text).absolute()
-    if not file.is_file():
-        what = "is a directory" if file.is_dir() else "is no file" if file.exists() else "does not exist"
-        raise MapError(f"{argument}: expected a local file, but {text!r} {what}")
-    return file
-
-
-def _driver(file: Path, argument: str) -> str:
-    with file.open("rb") as stream:
-        head = stream.read(1024)
-    for driver, starts in SIGNATURES:
-        if head.startswith(starts):
-            return driver
-    got = (
-        "a VRT, which can point anywhere: write it out with gdal_translate"
-        if b"<VRTDataset" in head
-        else "neither"
-    )
-    formats = ", ".join(driver for driver, _ in SIGNATURES)
-    raise MapError(f"{argument}: expected a raster file of {formats}; {file} is {got}")
 
 
 def _centred(transform: Any) -> Array:
@@ -234,6 +202,9 @@ class GrayReader:
     Colour becomes ITU-R BT.601 luma of the first three bands; a colour table is expanded first. Element types
     other than uint8 are stretched linearly between two percentiles of the valid pixels.
 
+    Attributes:
+        levels: of the map's pyramid that the file holds: 0, and those of its overviews.
+
     Raises:
         MapError: an element type that is no picture, pixels that cannot be read, or none that is valid.
     """
@@ -244,6 +215,7 @@ class GrayReader:
         self.dtype = dataset.dtypes[0]
         if self.dtype not in DTYPES:
             raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
+        self.levels = stored_levels(source)
         self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
         self._palette = _palette(dataset)
         shrink = max(1.0, max(dataset.width, dataset.height) / OVERVIEW_PX)
@@ -259,24 +231,39 @@ class GrayReader:
         if data.dtype != np.uint8:
             self._limits = np.percentile(_luma(data)[valid], STRETCH_PERCENT)
 
-    def _read(self, window: Window, size: tuple[int, int]) -> tuple[NDArray[Any], Mask]:
+    @property
+    def all_valid(self) -> bool:
+        """Whether no pixel can be nodata, whichever is read."""
+        flags = self._source.dataset.mask_flag_enums
+        never = all("all_valid" in {flag.name for flag in of_band} for of_band in flags)
+        return never and not self._collars and np.dtype(self.dtype).kind != "f"
+
+    def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
+        """Bands and validity of a window in pixels of the file, as so many (rows, columns)."""
+        from rasterio.enums import Resampling
         from rasterio.windows import Window as RasterWindow
 
         crop = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
+        # GDAL reads the overview that fits; its pixels lie between the level's where the size is no multiple.
+        how = Resampling.average if smooth and self._palette is None else Resampling.nearest
+        shape = (len(self._bands), *size)
         with self._lock, map_errors("map", self._source.path):  # a GDAL dataset serves one thread at a time
-            data = self._source.dataset.read(self._bands, window=crop, out_shape=(len(self._bands), *size))
+            data = self._source.dataset.read(self._bands, window=crop, out_shape=shape, resampling=how)
             mask = self._source.dataset.dataset_mask(window=crop, out_shape=size)
         if self._palette is not None:
             data = self._palette[:, data[0]]
-        return data, (mask >= 128) & np.isfinite(data).all(axis=0)
+        valid = np.asarray(mask >= 128)
+        return data, valid & np.isfinite(data).all(axis=0) if data.dtype.kind == "f" else valid
 
-    def read(self, window: Window) -> tuple[Gray, Mask]:
-        """Grey values and validity (h, w) of a window that lies inside."""
-        data, valid = self._read(window, (window.height_px, window.width_px))
+    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
+        """Grey values and validity (h, w) of a window that lies inside, in pixels of one of :attr:`levels`."""
+        full = scaled_window(window, level)
+        data, valid = self._read(full, (window.height_px, window.width_px), smooth=level > 0)
         for value, area in self._collars.items():
             height, width = area.shape
-            y = (np.arange(window.y0, window.y0 + window.height_px) + 0.5) * height / self._source.grid.height_px
-            x = (np.arange(window.x0, window.x0 + window.width_px) + 0.5) * width / self._source.grid.width_px
+            grid, scale = self._source.grid, 2.0**level
+            y = (np.arange(window.y0, window.y0 + window.height_px) + 0.5) * scale * height / grid.height_px
+            x = (np.arange(window.x0, window.x0 + window.width_px) + 0.5) * scale * width / grid.width_px
             valid &= ~((data == value).all(axis=0) & area[np.ix_(y.astype(int), x.astype(int))])
         luma = _luma(data)
         if self._limits is None:
@@ -284,6 +271,17 @@ class GrayReader:
         low, high = self._limits
         scaled = (np.nan_to_num(luma, nan=low, posinf=high, neginf=low) - low) * (255.0 / max(high - low, 1e-30))
         return np.clip(np.rint(scaled), 0, 255).astype(np.uint8), valid
+
+
+def scaled_window(window: Window, levels: int) -> Window:
+    """A window in pixels of a level so many levels finer."""
+    return Window(*(v << levels for v in (window.x0, window.y0, window.width_px, window.height_px)))
+
+
+def stored_levels(source: Source) -> tuple[int, ...]:
+    """Levels of the pyramid that a file holds: 0, and its overviews by powers of two."""
+    factors = source.dataset.overviews(1)
+    return (0, *sorted(factor.bit_length() - 1 for factor in factors if factor > 1 and factor & (factor - 1) == 0))
 
 
 def _palette(dataset: Any) -> Gray | None:
@@ -325,40 +323,64 @@ def _collars(data: NDArray[Any]) -> dict[float, Mask]:
     return found
 
 
-def read_surface(source: Source, grid: Grid) -> tuple[NDArray[np.float32], Grid]:
+def read_surface(source: Source, grid: Grid, limit_px: int = SURFACE_LIMIT_PX) -> tuple[NDArray[np.float32], Grid]:
     """Heights (NaN where unknown) and grid of the part of a surface model that lies under a map.
 
-    It is thinned by averages where it would not fit in memory.
+    It is thinned by averages where it has more pixels than the limit.
 
     Raises:
         MapError: it cannot be read, or lies elsewhere.
     """
+    part = surface_part(source, grid)
+    thin = max(1.0, math.sqrt(float(part.area_px) / limit_px))
+    shape = (math.ceil(part.height_px / thin), math.ceil(part.width_px / thin))
+    return read_heights(source, part, shape), part_grid(source.grid, part, shape)
+
+
+def surface_part(source: Source, grid: Grid) -> Window:
+    """The part of a surface model that lies under a map, in the model's pixels.
+
+    Raises:
+        MapError: it holds no heights, or lies elsewhere.
+    """
+    dtype = source.dataset.dtypes[0]
+    if np.dtype(dtype).kind not in "iuf":
+        raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
+    low, high = overlap(grid, source.grid)
+    if not (high > low).all():
+        raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
+    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Heights of a window of a surface model as so many (rows, columns), NaN where unknown.
+
+    Raises:
+        MapError: it cannot be read.
+    """
     from rasterio.enums import Resampling
     from rasterio.windows import Window as RasterWindow
 
-    dataset, own = source.dataset, source.grid
-    if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-        raise MapError(f"surface: expected heights as real numbers, got {dataset.dtypes[0]} in {source.path}")
-    low, high = overlap(grid, own)
-    if not (high > low).all():
-        raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
-    size = high - low
-    thin = max(1.0, math.sqrt(float(size.prod()) / (MEMORY_LIMIT_PX // 4)))
-    shape = tuple(int(v) for v in np.ceil(size / thin)[::-1])
+    whole = shape == (part.height_px, part.width_px)
     with map_errors("surface", source.path):
-        data = dataset.read(
+        data = source.dataset.read(
             1,
-            window=RasterWindow(*low.tolist(), *size.tolist()),
+            window=RasterWindow(part.x0, part.y0, part.width_px, part.height_px),
             out_shape=shape,
             masked=True,
-            resampling=Resampling.nearest if thin == 1.0 else Resampling.average,
+            resampling=Resampling.nearest if whole else Resampling.average,
         )
-    heights = data.astype(np.float32).filled(np.nan) * dataset.scales[0] + dataset.offsets[0]
+    heights = data.astype(np.float32).filled(np.nan) * source.dataset.scales[0] + source.dataset.offsets[0]
     heights[~((heights > HEIGHT_RANGE_M[0]) & (heights < HEIGHT_RANGE_M[1]))] = np.nan
+    return np.asarray(heights, np.float32)
+
+
+def part_grid(own: Grid, part: Window, shape: tuple[int, int]) -> Grid:
+    """The grid of a window of another, thinned to so many (rows, columns)."""
+    low, size = np.array([part.x0, part.y0]), np.array([part.width_px, part.height_px])
     scale = size / np.array(shape[::-1])
     # Pixel x of the thinned copy covers the file's pixels around low + (x + 0.5) * scale - 0.5.
     crop_to_file = np.column_stack([np.diag(scale), low + 0.5 * scale - 0.5])
     linear = own.pixel_to_crs[:, :2] @ crop_to_file[:, :2]
     origin = apply_affine(own.pixel_to_crs, crop_to_file[:, 2])
-    crop = Grid(shape[1], shape[0], np.column_stack([linear, origin]), own.crs)
-    return heights.astype(np.float32), crop
+    return Grid(shape[1], shape[0], np.column_stack([linear, origin]), own.crs)

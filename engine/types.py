@@ -180,6 +180,7 @@ class Reason(enum.Enum):
     UNCONFIRMED = "unconfirmed"
     NO_HEIGHT = "no_height"
     NO_HEADING = "no_heading"
+    MAP_TOO_LARGE = "map_too_large"
     TILTED = "tilted"
     LATE = "late"
     FAILED = "failed"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -57,7 +58,8 @@ class Script:
     """A matcher that answers from a list: a place, None for a refusal, or its reason. It keeps what is asked."""
 
     def __init__(self, *answers, site=None, sigma_m=1.0, up_m=None):
-        self.site, self.answers, self.sigma_m, self.up_m = site, list(answers), sigma_m, up_m
+        self.site = site or SimpleNamespace(is_searchable=True)
+        self.answers, self.sigma_m, self.up_m = list(answers), sigma_m, up_m
         self.frames, self.priors, self.budgets = [], [], []
 
     def locate(self, frame, prior=None, budget=None):
@@ -356,6 +358,18 @@ def test_lost_after_enough_refusals_it_searches_the_whole_map_and_then_confirms(
     assert_prior(script.priors[7], 400.0, 2.0, math.hypot(1.0, 0.5))
     assert_prior(script.priors[9], 400.0, 2.0, math.hypot(1.0, 0.5))
     assert navigator.reset_count == 1
+
+
+def test_lost_over_a_map_too_large_to_search_it_looks_where_dead_reckoning_leads():
+    script = Script((10.0, 20.0), *[None] * 9, site=SimpleNamespace(is_searchable=False))
+    options = NavigatorOptions(lost_after=4, search_every=2, lost_sigma_m=3.0)
+    navigator = Navigator(script, START, options=options)
+    for k in range(10):
+        navigator.update(at(k, STILL))
+    assert navigator.state is NavigatorState.LOST
+    assert all(prior is not None for prior in script.priors)
+    sigmas_m = [prior.sigma_m for prior in script.priors[1:]]
+    assert sigmas_m == sorted(sigmas_m)
 
 
 def test_no_single_match_is_believed_after_a_run_of_refusals():

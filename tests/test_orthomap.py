@@ -525,13 +525,10 @@ def test_georeference_that_makes_no_sense_is_refused(tmp_path, profile, words):
 
 def test_what_is_no_local_raster_is_refused(tmp_path):
     good = write(tmp_path / "good.tif", noise(20, 20))
-    vrt = f'<VRTDataset rasterXSize="20" rasterYSize="20"><SourceFilename>{good}</SourceFilename></VRTDataset>'
-    for name, content in (("vrt.tif", vrt), ("real.vrt", vrt), ("text.tif", "hello"), ("empty.tif", "")):
+    for name, content in (("text.tif", "hello"), ("empty.tif", "")):
         (tmp_path / name).write_text(content)
-        with pytest.raises(MapError, match="VRT" if "vrt" in name else "expected a raster"):
+        with pytest.raises(MapError, match="expected a raster"):
             OrthoMap.open(tmp_path / name)
-    with pytest.raises(MapError, match="directory"):
-        OrthoMap.open(tmp_path)
     elsewhere = ("https://example.org/a.tif", f"/vsizip/{good}", f"GTIFF_DIR:1:{good}", "none.tif", "", "a\0b")
     for path in elsewhere:
         with pytest.raises(MapError, match="local file"):

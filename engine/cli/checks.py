@@ -65,6 +65,19 @@ def check_needs(flight: Flight, method: str, profile: str) -> None:
         raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}")
 
 
+def check_start(place: Prior | None, site: OrthoMap) -> None:
+    """Refuse a flight without a beginning over a map that is too large to be searched for one.
+
+    Raises:
+        OptionError: no place is known.
+    """
+    if place is None and not site.is_searchable:
+        raise OptionError(
+            f"--start: expected a place to begin at, as LAT,LON or LAT,LON,SIGMA_M: the map of {site.size_km} is "
+            "not searched as a whole, and the telemetry has no position"
+        )
+
+
 def check_place(name: str, place: Prior | None, site: OrthoMap, error: type[OptionError | TelemetryError]) -> None:
     """Refuse a position in latitude and longitude that has nothing to do with the map.
 

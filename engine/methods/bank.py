@@ -123,6 +123,11 @@ def _finish(
     return replace(best, second_score=max(rival, best.second_score)), aligned
 
 
+def coarse_px(query: Query, first: Aligned, window: Window, options: NccOptions) -> int:
+    """Pixels of the map that :func:`search` looks at first, all at once."""
+    return window.area_px >> 2 * _coarse_level(query, first, window, options)[0]
+
+
 def _coarse_level(query: Query, first: Aligned, window: Window, options: NccOptions) -> tuple[int, list[Frame]]:
     """The level on which all hypotheses are scored, and the hypotheses, whose number falls with the resolution."""
     level = first.level

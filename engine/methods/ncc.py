@@ -22,6 +22,9 @@ from engine.methods.query import Query, level_for
 from engine.prepared import PreparedMap
 from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
 
+WIDE_PX = 8 << 20
+"""A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
+
 
 @dataclass(frozen=True, slots=True)
 class Found:
@@ -32,7 +35,7 @@ class Found:
         aligned: the hypothesis that it belongs to.
         fix: what the peak means, if it is believed.
         trusted: neither heading nor height was searched for.
-        expected: how its place lies to the prior; None where there is none.
+        expected: how its place lies to the prior; None where there is none, or one that says next to nothing.
         evidence: what speaks for it; None where more was searched than a window at one heading and height.
     """
 
@@ -66,7 +69,11 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     if window is None:
         return query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
     trusted = bank.is_trusted(frame, options)
-    if trusted and query.prior is not None:
+    wide = query.site.is_large and window.area_px >> 2 * aligned.level > WIDE_PX
+    if wide and bank.coarse_px(query, aligned, window, options) > WIDE_PX:
+        detail = f"a window of {window.width_px} x {window.height_px} px is not searched; a better prior is needed"
+        return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
+    if trusted and query.prior is not None and not wide:
         peak = search(query, prepared, aligned, window, options)
     else:
         peak, aligned = bank.search(query, prepared, aligned, window, options)
@@ -76,7 +83,7 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     if query.watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
     fix = _fix(query, aligned, peak, window, options)
-    expected, evidence = _expected(query, fix), None
+    expected, evidence = None if wide else _expected(query, fix), None
     if trusted and expected is not None:
         sigma = score_sigma(aligned.template.numel())
         evidence = evidence_of(peak, sigma, expected)

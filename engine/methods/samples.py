@@ -16,9 +16,9 @@ from engine.types import Window
 
 BLOCK_PX = 4
 """One sample is taken of every block of this side: the pixel with the steepest gradient."""
-CELL_PX = 504
-"""Of a large level samples are taken cell by cell."""
-MAX_CELLS = 64
+CELL_PX = 256
+"""Of a large level samples are taken cell by cell, on the cells of the prepared map."""
+MAX_CELLS = 256
 MAX_SAMPLES = 2000
 _ROUGH_REACH_PX = 1.5  # of the level: this far off a sample
 

@@ -20,6 +20,7 @@ MEANINGS = {
     Reason.UNCONFIRMED: "Nothing but the match itself vouches for the place, and too few others agree yet.",
     Reason.NO_HEIGHT: "The telemetry gives no height above the ground, without which a frame has no scale.",
     Reason.NO_HEADING: "The telemetry gives no heading, without which a frame cannot be turned.",
+    Reason.MAP_TOO_LARGE: "Too little was known of the place: so large a part of the map is not searched.",
     Reason.TILTED: "A corner of the frame looks so near the horizon that the ground is stretched beyond use.",
     Reason.LATE: "The answer came after the budget, or could not have come within it.",
     Reason.FAILED: "The frame could not be used, or the worker that matched it died.",

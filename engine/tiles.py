@@ -1,0 +1,295 @@
+"""What may be opened as a raster: a local file by its first bytes, a folder of tiles or a VRT as one picture.
+
+A folder of tiles becomes the text of a VRT, GDAL's list of what lies where. One that a user brings is read too,
+once it is seen to name nothing but local raster files.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+
+from engine.errors import MapError
+
+SIGNATURES = (
+    ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
+    ("PNG", (b"\x89PNG",)),
+    ("JPEG", (b"\xff\xd8\xff",)),
+    ("JP2OpenJPEG", (b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51")),
+    ("BMP", (b"BM",)),
+    ("WEBP", (b"RIFF",)),
+    ("MBTiles", (b"SQLite format 3\0",)),
+)
+"""GDAL drivers that may open a file, and how its content must begin; the ending of its name does not count."""
+NO_TILES = (".ovr", ".msk", ".aux", ".part")
+"""Endings of rasters that belong to another, or are being written: a folder's tiles are the others."""
+OWN_TAGS = "SCENEMATCH_"
+"""What the metadata items begin with that a map says of itself; a folder says what all its tiles say."""
+OFF_GRID_PX = 0.05
+"""So far from whole pixels of the first tile's grid another may begin; beyond it would have to be resampled."""
+_VRT_HEAD = b"<VRTDataset"
+_VRT_TAGS = frozenset(
+    (
+        *("VRTDataset", "SRS", "GeoTransform", "Metadata", "MDI", "OverviewList", "MaskBand"),
+        *("VRTRasterBand", "Description", "NoDataValue", "ColorInterp", "ColorTable", "Entry", "Offset", "Scale"),
+        *("UnitType", "SimpleSource", "ComplexSource", "SourceFilename", "SourceBand", "SourceProperties"),
+        *("SrcRect", "DstRect", "NODATA", "UseMaskBand"),
+    )
+)
+_TYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Float32", "float64": "Float64"}
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """What is read of a tile before it is laid beside others."""
+
+    path: Path
+    size: tuple[int, int]
+    transform: Any
+    crs: Any
+    kind: tuple[int, str, str, float, float]  # bands that are used, element type, nodata, scale and offset
+    block: tuple[int, int]
+    overviews: tuple[int, ...]
+    says: frozenset[tuple[str, str]]  # of itself, in metadata items of this project
+
+
+def local_path(path: str | os.PathLike[str], argument: str) -> Path:
+    """The absolute path of a file or folder of this machine.
+
+    Raises:
+        MapError: it is an address, or does not exist.
+    """
+    text = os.fspath(path)
+    if not text or "://" in text or text.startswith("/vsi"):
+        raise MapError(f"{argument}: expected the path of a local file, got {text!r}")
+    found = Path(text).absolute()
+    if not (found.is_file() or found.is_dir()):
+        what = "is no file" if found.exists() else "does not exist"
+        raise MapError(f"{argument}: expected a local file, but {text!r} {what}")
+    return found
+
+
+def driver_of(file: Path, argument: str) -> str:
+    """GDAL's driver for a file, or "VRT".
+
+    Raises:
+        MapError: it is none of those that may be opened.
+    """
+    with file.open("rb") as stream:
+        head = stream.read(1024)
+    for driver, starts in SIGNATURES:
+        if head.startswith(starts):
+            return driver
+    if _VRT_HEAD in head:
+        return "VRT"
+    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "VRT"])
+    raise MapError(f"{argument}: expected a raster file of {formats}; {file} is neither")
+
+
+def openable(path: Path, argument: str) -> tuple[str | Path, str]:
+    """What GDAL is to open for a file or folder, and by which driver: the file itself, or the text of a VRT.
+
+    Raises:
+        MapError: it is no raster, or its tiles do not fit together.
+    """
+    if path.is_dir():
+        return vrt_of_folder(path, argument), "VRT"
+    driver = driver_of(path, argument)
+    return (_vrt_of_file(path, argument), driver) if driver == "VRT" else (path, driver)
+
+
+# ------------------------------------------------------------------------------------------ a folder of tiles
+
+
+def vrt_of_folder(folder: Path, argument: str) -> str:
+    """The text of a VRT that lays the tiles of a folder beside each other; what no tile covers is nodata.
+
+    Raises:
+        MapError: there are none, or they differ in CRS, size of a pixel, bands or element type, or are no tiles
+            of one grid.
+    """
+    tiles = [_read_tile(file, driver, argument) for file, driver in _rasters_in(folder)]
+    if not tiles:
+        raise MapError(f"{argument}: expected raster files in the folder {folder}, found none")
+    first = tiles[0]
+    for tile in tiles[1:]:
+        _check_beside(first, tile, argument)
+    places = [_place(first, tile, argument) for tile in tiles]
+    left, top = (min(place[axis] for place in places) for axis in (0, 1))
+    right, bottom = (
+        max(place[axis] + tile.size[axis] for place, tile in zip(places, tiles, strict=True)) for axis in (0, 1)
+    )
+    corners = [(x - left, y - top) for x, y in places]
+    return _vrt_text(tiles, corners, (right - left, bottom - top), _moved(first.transform, left, top))
+
+
+def _moved(transform: Any, x: int, y: int) -> list[float]:
+    """GDAL's six numbers of a transform whose first pixel is another."""
+    a, b, c, d, e, f = list(transform)[:6]
+    return [c + a * x + b * y, a, b, f + d * x + e * y, d, e]
+
+
+def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
+    """The raster files of a folder with their drivers, by name."""
+    found = []
+    for file in sorted(folder.iterdir()):
+        if file.is_file() and file.suffix.lower() not in NO_TILES and not file.name.startswith("."):
+            try:
+                found.append((file, driver_of(file, "")))
+            except MapError:
+                continue  # a licence, a world file, an index: not every file is a tile
+    return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles")]
+
+
+def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
+    import rasterio
+
+    with rasterio.open(file, driver=driver) as dataset:
+        if dataset.transform.is_identity:
+            raise MapError(f"{argument}: expected a georeference in every tile of a folder, got none in {file}")
+        bands, dtype = 3 if dataset.count >= 3 else 1, dataset.dtypes[0]
+        if dtype not in _TYPES:
+            raise MapError(f"{argument}: expected tiles of {', '.join(_TYPES)}, got {dtype} in {file}")
+        if dataset.colorinterp[0].name == "palette":
+            raise MapError(f"{argument}: expected tiles without a colour table, got one in {file}")
+        return _Tile(
+            path=file,
+            size=(dataset.width, dataset.height),
+            transform=dataset.transform,
+            crs=dataset.crs,
+            kind=(bands, dtype, str(dataset.nodata), dataset.scales[0], dataset.offsets[0]),
+            block=dataset.block_shapes[0],
+            overviews=tuple(dataset.overviews(1)),
+            says=frozenset((k, v) for k, v in dataset.tags().items() if k.startswith(OWN_TAGS)),
+        )
+
+
+def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:
+    def pixel(one: _Tile) -> list[float]:
+        t = one.transform
+        return [t.a, t.b, t.d, t.e]
+
+    names = ("CRS", "size of a pixel", "bands, element type, nodata, scale and offset")
+    size_px = max(abs(v) for v in pixel(first))
+    same_pixel = all(abs(a - b) <= 1e-7 * size_px for a, b in zip(pixel(first), pixel(tile), strict=True))
+    for name, same, got in zip(
+        names,
+        (first.crs == tile.crs, same_pixel, first.kind == tile.kind),
+        ((first.crs, tile.crs), (pixel(first), pixel(tile)), (first.kind, tile.kind)),
+        strict=True,
+    ):
+        if not same:
+            a, b = (str(v) for v in got)
+            raise MapError(
+                f"{argument}: expected tiles of one {name}, got {a} in {first.path.name} and {b} in {tile.path}"
+            )
+
+
+def _place(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:
+    """Column and row of the first tile's grid at which another begins."""
+    a, b, c, d, e, f = list(first.transform)[:6]
+    x, y = np.linalg.solve([[a, b], [d, e]], [tile.transform.c - c, tile.transform.f - f])
+    if max(abs(x - round(x)), abs(y - round(y))) > OFF_GRID_PX:
+        off = f"{x - round(x):+.2f}, {y - round(y):+.2f} px"
+        raise MapError(
+            f"{argument}: expected tiles of one grid, got {tile.path} {off} off that of {first.path.name}"
+        )
+    return round(x), round(y)
+
+
+def _vrt_text(
+    tiles: Sequence[_Tile], corners: Sequence[tuple[int, int]], size: tuple[int, int], transform: Sequence[float]
+) -> str:
+    """The VRT of tiles by their top-left corners.
+
+    Where no tile lies is what their tag calls nodata. Where they have no tag, a mask band joins their own masks;
+    those of tagged tiles GDAL would read into it in pieces of the wrong width.
+    """
+    bands, dtype, nodata, scale, offset = tiles[0].kind
+    root = Xml.Element("VRTDataset", rasterXSize=str(size[0]), rasterYSize=str(size[1]))
+    if tiles[0].crs is not None:
+        Xml.SubElement(root, "SRS").text = tiles[0].crs.to_wkt()
+    Xml.SubElement(root, "GeoTransform").text = ", ".join(repr(v) for v in transform)
+    metadata = Xml.SubElement(root, "Metadata")
+    for key, value in sorted(frozenset.intersection(*(tile.says for tile in tiles))):
+        Xml.SubElement(metadata, "MDI", key=key).text = value
+    _add_overviews(root, max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews)
+    for band in range(1, bands + 1):
+        element = Xml.SubElement(root, "VRTRasterBand", dataType=_TYPES[dtype], band=str(band))
+        Xml.SubElement(element, "ColorInterp").text = ("Red", "Green", "Blue")[band - 1] if bands == 3 else "Gray"
+        Xml.SubElement(element, "Scale").text, Xml.SubElement(element, "Offset").text = repr(scale), repr(offset)
+        if nodata != "None":
+            Xml.SubElement(element, "NoDataValue").text = nodata
+        _add_sources(element, tiles, corners, str(band))
+    if nodata == "None":
+        mask = Xml.SubElement(Xml.SubElement(root, "MaskBand"), "VRTRasterBand", dataType="Byte")
+        _add_sources(mask, tiles, corners, "mask,1")
+    return Xml.tostring(root, encoding="unicode")
+
+
+def _add_overviews(root: Xml.Element, factors: Sequence[int]) -> None:
+    """Let the VRT have the overviews of its largest tile; what a smaller one lacks, GDAL makes as it reads."""
+    if factors:
+        Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
+
+
+def _add_sources(
+    element: Xml.Element, tiles: Sequence[_Tile], corners: Sequence[tuple[int, int]], band: str
+) -> None:
+    for tile, (x, y) in zip(tiles, corners, strict=True):
+        width, height = (str(n) for n in tile.size)
+        nodata = element.findtext("NoDataValue")
+        source = Xml.SubElement(element, "SimpleSource" if nodata is None else "ComplexSource")
+        Xml.SubElement(source, "SourceFilename", relativeToVRT="0").text = str(tile.path)
+        Xml.SubElement(source, "SourceBand").text = band
+        if "mask" not in band:  # so that a tile is opened when it is read, not with the folder
+            rows, columns = (str(n) for n in tile.block)
+            of = {"RasterXSize": width, "RasterYSize": height, "BlockXSize": columns, "BlockYSize": rows}
+            Xml.SubElement(source, "SourceProperties", of | {"DataType": _TYPES[tile.kind[1]]})
+        Xml.SubElement(source, "SrcRect", xOff="0", yOff="0", xSize=width, ySize=height)
+        Xml.SubElement(source, "DstRect", xOff=str(x), yOff=str(y), xSize=width, ySize=height)
+        if nodata is not None:  # so that the nodata of one tile does not hide what another has there
+            Xml.SubElement(source, "NODATA").text = nodata
+
+
+# ------------------------------------------------------------------------------------------------- a user's VRT
+
+
+def _vrt_of_file(file: Path, argument: str) -> str:
+    """The text of a VRT that names nothing but local raster files, with their absolute paths.
+
+    Raises:
+        MapError: it can do more than lay rasters beside each other, or names what may not be opened.
+    """
+    import rasterio
+
+    try:
+        root = Xml.fromstring(file.read_bytes())
+    except Xml.ParseError as error:
+        raise MapError(f"{argument}: cannot read {file}: {error}") from None
+    for element in root.iter():
+        if element.tag not in _VRT_TAGS or "subClass" in element.attrib:
+            what = element.attrib.get("subClass", element.tag)
+            raise MapError(f"{argument}: expected a VRT that lays local files side by side, got {what} in {file}")
+    largest, overviews = 0, ()
+    for element in root.iter("SourceFilename"):
+        name = element.text or ""
+        beside = element.attrib.get("relativeToVRT") == "1" and not os.path.isabs(name)
+        source = local_path(os.path.join(file.parent, name) if beside else name, f"{argument}: {file}")
+        driver = "VRT" if source.is_dir() else driver_of(source, argument)
+        if driver == "VRT":
+            raise MapError(f"{argument}: expected raster files in {file}, got {source}")
+        with rasterio.open(source, driver=driver) as dataset:
+            if dataset.width * dataset.height > largest:
+                largest, overviews = dataset.width * dataset.height, dataset.overviews(1)
+        element.text = str(source)
+        element.attrib["relativeToVRT"] = "0"
+    if root.find("OverviewList") is None:
+        _add_overviews(root, overviews)
+    return Xml.tostring(root, encoding="unicode")

@@ -1,0 +1,231 @@
+"""Folders of tiles, VRTs and MBTiles: the picture that they were cut from, or one clear line."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from rasterio.enums import Resampling
+from rasterio.shutil import copy
+
+from engine.errors import MapError
+from engine.orthomap import OrthoMap
+from engine.rasters import GEOREFERENCE_TAG
+from engine.tiles import vrt_of_folder
+from engine.types import Window
+
+UTM, WEST, NORTH, STEP_M = "EPSG:32633", 607400.0, 5345369.0, 0.5
+SIDE, TILE = 300, 128
+GAP = (1, 2)  # row and column of the tile that is missing
+WINDOWS = [Window(0, 0, SIDE, SIDE), Window(100, 90, 77, 61), Window(127, 127, 2, 2), Window(250, 120, 40, 20)]
+
+
+def transform_at(x=0.0, y=0.0, step=STEP_M):
+    return Affine(step, 0.0, WEST + x * STEP_M, 0.0, -step, NORTH - y * STEP_M)
+
+
+def write(path, data, *, overviews=(), tags=None, **profile):
+    data = np.asarray(data)
+    data = data[None] if data.ndim == 2 else data
+    count, height, width = data.shape
+    settings = {"driver": "GTiff", "dtype": data.dtype, "crs": UTM, "transform": transform_at()} | profile
+    with rasterio.open(path, "w", width=width, height=height, count=count, **settings) as dataset:
+        dataset.write(data)
+        dataset.update_tags(**(tags or {}))
+        if overviews:
+            dataset.build_overviews(list(overviews), Resampling.average)
+    return path
+
+
+def tiles_of(folder, data, *, gap=GAP, **profile):
+    """Cut (bands, H, W) into tiles of a folder."""
+    folder.mkdir()
+    for row in range(0, data.shape[1], TILE):
+        for column in range(0, data.shape[2], TILE):
+            if (row // TILE, column // TILE) != gap:
+                part = data[:, row : row + TILE, column : column + TILE]
+                name = f"{row // TILE}-{column // TILE}.tif"
+                write(folder / name, part, transform=transform_at(column, row), **profile)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """(3, H, W) without pure black or white; what is smooth in it survives a JPEG."""
+    import cv2
+
+    noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)
+    return np.moveaxis(np.clip(cv2.GaussianBlur(noise, (0, 0), 3.0) * 3.0 - 256.0, 2, 253), -1, 0).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory, picture):
+    return write(tmp_path_factory.mktemp("plain") / "map.tif", picture)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, picture):
+    return tiles_of(tmp_path_factory.mktemp("cut") / "tiles", picture)
+
+
+@pytest.mark.parametrize("nodata", [None, 1])
+@pytest.mark.parametrize("window", WINDOWS, ids=str)
+def test_a_folder_of_tiles_is_the_picture_that_it_was_cut_from_and_a_gap_is_nodata(
+    tmp_path, plain, picture, window, nodata
+):
+    whole, cut = OrthoMap.open(plain), OrthoMap.open(tiles_of(tmp_path / "tiles", picture, nodata=nodata))
+    assert (cut.width_px, cut.height_px, cut.bounds_deg) == (whole.width_px, whole.height_px, whole.bounds_deg)
+    there = np.ones((SIDE, SIDE), np.bool_)
+    there[TILE * GAP[0] : TILE * (GAP[0] + 1), TILE * GAP[1] : TILE * (GAP[1] + 1)] = False
+    part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
+    np.testing.assert_array_equal(cut.valid(window), there[part])
+    np.testing.assert_array_equal(cut.gray(window)[there[part]], whole.gray(window)[there[part]])
+    assert not cut.fully_valid
+    assert cut.info()["driver"] == "VRT"
+
+
+@pytest.mark.parametrize("kind", ["cog", "vrt", "relative vrt"])
+def test_a_cog_and_a_vrt_are_the_picture_byte_by_byte(tmp_path, plain, picture, kind):
+    if kind == "cog":
+        path = tmp_path / "map.tif"
+        copy(plain, path, driver="COG", compress="deflate")
+    else:
+        cut = tiles_of(tmp_path / "tiles", picture, gap=None)
+        text = vrt_of_folder(cut, "map")
+        if kind == "relative vrt":
+            text = text.replace(str(cut), "tiles").replace('relativeToVRT="0"', 'relativeToVRT="1"')
+        path = tmp_path / "map.vrt"
+        path.write_text(text)
+    whole, other = OrthoMap.open(plain), OrthoMap.open(path)
+    for window in WINDOWS:
+        np.testing.assert_array_equal(other.gray(window), whole.gray(window))
+        assert other.valid(window).all()
+    assert other.bounds_deg == whole.bounds_deg
+
+
+def test_tiles_of_any_order_sign_and_kind_join(tmp_path, picture):
+    """Sixteen bits, a tag for nodata in each tile, and files beside them that are none."""
+    deep = picture[:1].astype(np.uint16) * 100
+    deep[0, 40:60, 50:90] = 7
+    cut = tiles_of(tmp_path / "tiles", deep, nodata=7)
+    (cut / "README.txt").write_text("tiles of a survey")
+    (cut / "0-0.tfw").write_text("0.5\n0\n0\n-0.5\n0\n0\n")
+    (cut / "more").mkdir()
+    write(cut / "0-0.tif.ovr", picture[:1, :5, :5])
+    whole, joined = OrthoMap.open(write(tmp_path / "map.tif", deep, nodata=7)), OrthoMap.open(cut)
+    known = joined.valid(WINDOWS[0])
+    np.testing.assert_array_equal(known[:TILE], whole.valid(WINDOWS[0])[:TILE])
+    assert not known[40:60, 50:90].any()
+    apart = joined.gray(WINDOWS[0])[known].astype(int) - whole.gray(WINDOWS[0])[known]
+    assert np.abs(apart).max() <= 12  # the stretch is that of the pixels that are there
+
+
+def test_a_folder_says_of_itself_what_all_its_tiles_say(tmp_path, picture):
+    cut = tiles_of(tmp_path / "tiles", picture, tags={GEOREFERENCE_TAG: "0.4"})
+    assert OrthoMap.open(cut).georeference_sigma_m == 0.4
+    write(cut / "0-0.tif", picture[:, :TILE, :TILE], tags={GEOREFERENCE_TAG: "0.9"})
+    assert OrthoMap.open(cut).georeference_sigma_m is None
+
+
+def test_a_surface_may_be_a_folder_too(tmp_path, plain):
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    heights = (100.0 + 0.1 * columns + 0.05 * rows).astype(np.float32)[None]
+    cut = tiles_of(tmp_path / "dsm", heights, gap=None)
+    site, other = (OrthoMap.open(plain, f) for f in (cut, write(tmp_path / "dsm.tif", heights)))
+    xy = np.random.default_rng(0).uniform(0, SIDE - 1, (500, 2))
+    np.testing.assert_array_equal(site.surface_at(xy), other.surface_at(xy))
+    assert site.ground_m == other.ground_m
+
+
+# ------------------------------------------------------------------------------------------------- refusals
+
+
+def test_a_folder_without_a_raster_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing here")
+    with pytest.raises(MapError, match=r"map: expected raster files in the folder .*, found none"):
+        OrthoMap.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"crs": "EPSG:32634"}, "tiles of one CRS, got EPSG:32633 in 0-0.tif and EPSG:32634 in .*9-9.tif"),
+        ({"transform": transform_at(0, 400, 0.25)}, "tiles of one size of a pixel"),
+        ({"transform": transform_at(0.4, 400)}, r"tiles of one grid, got .*9-9.tif \+0.40, \+0.00 px off"),
+        ({"dtype": np.uint16}, "tiles of one bands, element type, nodata, scale and offset"),
+        ({"dtype": np.int32}, "expected tiles of uint8, .* got int32"),
+    ],
+)
+def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, words):
+    cut = tiles_of(tmp_path / "tiles", picture)
+    changed = {"transform": transform_at(0, 400)} | changed
+    write(cut / "9-9.tif", picture[:, :50, :50].astype(changed.pop("dtype", np.uint8)), **changed)
+    with pytest.raises(MapError, match=words) as caught:
+        OrthoMap.open(cut)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("<VRTDataset ", '<VRTDataset subClass="VRTWarpedDataset" ', "got VRTWarpedDataset"),
+        ('band="1">', 'band="1" subClass="VRTDerivedRasterBand">', "got VRTDerivedRasterBand"),
+        (
+            "<ColorInterp>Red",
+            "<PixelFunctionType>evil</PixelFunctionType><ColorInterp>Red",
+            "got PixelFunctionType",
+        ),
+        ("0-0.tif", "gone.tif", "does not exist"),
+        ("0-0.tif", "self.vrt", r"expected raster files in .*map\.vrt, got .*self\.vrt"),
+        ("</VRTDataset>", "", "cannot read"),
+    ],
+)
+def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tmp_path, folder, old, new, words):
+    here = tmp_path / "tiles"
+    shutil.copytree(folder, here)
+    text = vrt_of_folder(here, "map")
+    (here / "self.vrt").write_text(text)
+    (tmp_path / "map.vrt").write_text(text.replace(old, new))
+    with pytest.raises(MapError, match=words) as caught:
+        OrthoMap.open(tmp_path / "map.vrt")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("address", ["https://example.org/a.tif", "/vsicurl/http://example.org/a.tif"])
+def test_a_vrt_that_names_an_address_is_refused(tmp_path, folder, address):
+    first = str(folder / "0-0.tif")
+    (tmp_path / "map.vrt").write_text(vrt_of_folder(folder, "map").replace(first, address))
+    with pytest.raises(MapError, match="expected the path of a local file"):
+        OrthoMap.open(tmp_path / "map.vrt")
+
+
+# -------------------------------------------------------------------------------------------------- MBTiles
+
+
+@pytest.mark.parametrize(("form", "most"), [("PNG", 0.0), ("JPEG", 4.0)])
+def test_mbtiles_are_the_mercator_picture_that_they_were_made_of(tmp_path, picture, form, most):
+    step = 156543.03392804097 / 2**18  # the pixels of zoom level 18
+    origin, column, row = 20037508.342789244, 36621000, 23256000
+    at = Affine(step, 0.0, column * step - origin, 0.0, -step, origin - row * step)
+    mercator = write(tmp_path / "map.tif", picture, crs="EPSG:3857", transform=at)
+    path = tmp_path / "map.mbtiles"
+    copy(mercator, path, driver="MBTiles", tile_format=form, quality=95)
+    whole, cached = OrthoMap.open(mercator), OrthoMap.open(path)
+    assert cached.info()["driver"] == "MBTiles"
+    corner = np.rint(cached.pixel_from_geodetic(*whole.geodetic_from_pixel([0.0, 0.0]))).astype(int)
+    lies = Window(int(corner[0]) + 20, int(corner[1]) + 20, 200, 200)
+    assert np.allclose(
+        cached.geodetic_from_pixel([lies.x0, lies.y0]), whole.geodetic_from_pixel([20, 20]), rtol=0, atol=1e-9
+    )
+    apart = cached.gray(lies).astype(float) - whole.gray(Window(20, 20, 200, 200))
+    assert np.abs(apart).mean() <= most
+    assert cached.valid(lies).all()
+
+
+def test_a_file_that_only_calls_itself_mbtiles_is_refused(tmp_path):
+    for name, content in (("a.mbtiles", b"hello"), ("b.mbtiles", b"SQLite format 3\0 and nothing more")):
+        Path(tmp_path / name).write_bytes(content)
+        with pytest.raises(MapError, match="map: "):
+            OrthoMap.open(tmp_path / name)
