@@ -1,14 +1,21 @@
 """A headless Chromium: what a page does in it, and pictures of pages for the documentation.
 
 ``python -m bench.browser PAGE.html docs/img/report.png [--height 1500] [--script JS] [--element CSS]``
+``python -m bench.browser FLIGHT.rrd docs/img/live-view.png [--width 1500] [--height 900]`` is rerun's own viewer.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
+import signal
+import socket
+import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,13 +24,21 @@ from typing import Any
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
-    "--disable-gpu",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
     "--no-first-run",
     "--hide-scrollbars",
 )
+WITHOUT_GL = ("--disable-gpu",)
+SOFTWARE_GL = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+_PATIENCE_S = 200.0
+_STILL_S = 3.0  # without a change, after which a viewer has drawn all that it has
 
 
 def missing() -> str:
@@ -42,11 +57,33 @@ class Browser:
     def __init__(self, driver: Any) -> None:
         self.driver = driver
 
-    def open(self, page: Path, width_px: int, height_px: int = 900) -> None:
-        """Load a file in a window of this size."""
+    def open(self, page: Path | str, width_px: int, height_px: int = 900) -> None:
+        """Load a file or an address in a window of this size."""
         self.resize(width_px, height_px)
         self.requests()  # those of the page before, and of the browser's own first one
-        self.driver.get(page.resolve().as_uri())
+        self.driver.get(page if isinstance(page, str) else page.resolve().as_uri())
+
+    def wait_until_still(self) -> None:
+        """Wait until what is shown has colours and does not change any more.
+
+        Raises:
+            TimeoutError: it is blank, or changes on and on.
+        """
+        from selenium.common.exceptions import TimeoutException
+
+        before, since = b"", time.monotonic()
+        end = since + _PATIENCE_S
+        while time.monotonic() < end:
+            try:
+                now = self.driver.get_screenshot_as_png()
+            except TimeoutException:  # it is busy drawing
+                continue
+            if now != before:
+                before, since = now, time.monotonic()
+            elif time.monotonic() - since > _STILL_S and len(now) > 50_000:  # a blank one has a few kilobytes
+                return
+            time.sleep(0.5)
+        raise TimeoutError("the page did not come to rest")
 
     def resize(self, width_px: int, height_px: int) -> None:
         """Change the window."""
@@ -83,15 +120,15 @@ class Browser:
 
 
 @contextmanager
-def open_browser() -> Iterator[Browser]:
-    """A browser with a profile of its own, closed at the end."""
+def open_browser(gl: tuple[str, ...] = WITHOUT_GL) -> Iterator[Browser]:
+    """A browser with a profile of its own, closed at the end; with ``SOFTWARE_GL`` it draws in 3D."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or ""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        for flag in (*FLAGS, *gl, f"--user-data-dir={profile}"):
             options.add_argument(flag)
         options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
         driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
@@ -101,8 +138,44 @@ def open_browser() -> Iterator[Browser]:
             driver.quit()
 
 
+@contextmanager
+def serve_recording(recording: Path) -> Iterator[str]:
+    """The address of rerun's viewer in the browser, on loopback, with a recording in it.
+
+    Raises:
+        TimeoutError: it does not begin to listen.
+    """
+    data_port, page_port = _free_port(), _free_port()
+    command = [sys.executable, "-m", "rerun_cli", "--serve-web", "--bind", "127.0.0.1"]
+    command += ["--port", str(data_port), "--web-viewer-port", str(page_port), str(recording)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    server = subprocess.Popen(command, start_new_session=True, **quiet)  # Python starts the server proper
+    try:
+        end = time.monotonic() + _PATIENCE_S
+        while not (_listens(page_port) and _listens(data_port)):
+            if time.monotonic() > end or server.poll() is not None:
+                raise TimeoutError("rerun did not begin to listen")
+            time.sleep(0.2)
+        source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
+        yield f"http://127.0.0.1:{page_port}/?url={source}&renderer=webgl&hide_welcome_screen=1"
+    finally:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as made:
+        made.bind(("127.0.0.1", 0))
+        return int(made.getsockname()[1])
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as made:
+        return made.connect_ex(("127.0.0.1", port)) == 0
+
+
 def main() -> None:
-    """Take a picture of a page."""
+    """Take a picture of a page, or of a recording in rerun's viewer."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("page", type=Path)
     parser.add_argument("picture", type=Path)
@@ -111,6 +184,12 @@ def main() -> None:
     parser.add_argument("--script", default="", help="run before the picture is taken")
     parser.add_argument("--element", help="CSS selector of what is taken; all of the window unless given")
     arguments = parser.parse_args()
+    if arguments.page.suffix == ".rrd":
+        with serve_recording(arguments.page) as address, open_browser(SOFTWARE_GL) as browser:
+            browser.open(address, arguments.width, arguments.height)
+            browser.wait_until_still()
+            browser.save(arguments.picture)
+        return
     with open_browser() as browser:
         browser.open(arguments.page, arguments.width, arguments.height)
         browser.run(arguments.script)

@@ -135,15 +135,19 @@ class Live:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Take no more frames; the one in work is answered still, one that waits is dropped."""
+        """Take no more frames; the one in work is answered still, one that waits is dropped.
+
+        Waits for the worker too where its frame was answered without it: a process that ends while one of its
+        threads is within compiled code is aborted.
+        """
         with self._changed:
             self._closed = True
             if self._waiting is not None:
                 self._count("dropped")
                 self._waiting = None
             self._changed.notify_all()
-            due_s = (self._options.deadline_ms + self._options.patience_ms) * 1e-3
-            self._changed.wait_for(lambda: self._working is None or self._working.answered, timeout=due_s)
+            job, due_s = self._working, (self._options.deadline_ms + self._options.patience_ms) * 1e-3
+            self._changed.wait_for(lambda: self._working is None and (job is None or job.answered), timeout=due_s)
 
     def __enter__(self) -> Live:
         return self
@@ -173,6 +177,7 @@ class Live:
                 if self._number != number:
                     return  # replaced meanwhile
                 self._working = None
+                self._changed.notify_all()
                 if isinstance(result, Fix):
                     self._last = (result, job.captured_ns)
             self._answer(job, result)

@@ -174,7 +174,7 @@ class _Serial:
             import serial
         except ImportError:
             raise BackendError(
-                "serial: expected pyserial to be installed: pip install 'scenematch[mavlink]'"
+                "serial: expected pyserial to be installed, the extra [mavlink]: pip install pyserial"
             ) from None
         self._port: Any = serial.Serial(device, baud, timeout=0, write_timeout=1.0)
 

@@ -88,6 +88,7 @@ class Bridge:
         use_velocity: whether the autopilot's velocity carries the engine from fix to fix; without, its fixes do.
         system_id: of the vehicle; whoever has another is not heard.
         key: of MAVLink's signing; None sends and takes unsigned packets.
+        watch: is told every answer, and must not take long; None tells nobody.
 
     Raises:
         OSError: the link cannot be opened. Later it is opened again whenever it fails.
@@ -105,8 +106,10 @@ class Bridge:
         use_velocity: bool = True,
         system_id: int = 1,
         key: bytes | None = None,
+        watch: Callable[[Answer], None] | None = None,
     ) -> None:
         self.telemetry = Telemetry()
+        self._watch = watch
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
         self._system_id, self._key = system_id, key
@@ -180,6 +183,12 @@ class Bridge:
 
     def deliver(self, answer: Answer) -> None:
         """Send what became of a frame, where it is fit to be sent."""
+        self._tell(answer)
+        if self._watch is not None:
+            self._watch(answer)
+
+    def _tell(self, answer: Answer) -> None:
+        """Count it, and send what is fit."""
         self._counts["answered"] += 1
         if isinstance(answer.result, NoFix):
             self._refused[answer.result.reason.value] += 1

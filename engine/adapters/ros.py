@@ -177,6 +177,7 @@ class RosBridge:
         options: how fixes are told.
         start: where the flight begins.
         live: deadlines of the frames.
+        watch: is told every answer, and must not take long; None tells nobody.
     """
 
     def __init__(
@@ -187,8 +188,11 @@ class RosBridge:
         options: RosOptions,
         start: Prior | None = None,
         live: LiveOptions | None = None,
+        *,
+        watch: Callable[[Answer], None] | None = None,
     ) -> None:
         self.telemetry = RosTelemetry()
+        self._watch = watch
         self._node, self._site, self._options, self._start = node, site, options, start
         self._make_navigator, self._live_options = make_navigator, live
         self._live = Live(make_navigator, self.deliver, start, live)
@@ -275,6 +279,8 @@ class RosBridge:
         if result.window is not None and self._node.is_wanted("window"):
             shown = window_picture(self._site, result.window, result if isinstance(result, Fix) else None)
             self._node.publish("window", self._node.maker.image(captured_ns, self._options.frame_id, shown))
+        if self._watch is not None:
+            self._watch(answer)
 
     def beat(self) -> None:
         """Once a second: say so where no pictures come."""

@@ -18,6 +18,7 @@ from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_choice, parse_position
 from engine.cli.checks import check_place
+from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.live import LiveOptions
 from engine.matcher import METHODS, SceneMatcher
@@ -87,9 +88,10 @@ class Matching:
     seconds: float | None
 
 
-def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool) -> None:
+def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool, watching: Watching) -> None:
     """Bridge until the pictures end, the time is over or somebody interrupts, and print what was done."""
     _need_pymavlink()
+    watching.check()
     from engine.adapters.mavlink import Bridge
     from engine.adapters.packets import read_key
 
@@ -105,19 +107,23 @@ def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool)
     matcher = SceneMatcher(site, camera, matching.method, matching.device)
     matcher.warmup()
 
-    def make_navigator(prior: Prior | None) -> Navigator:
-        return Navigator(matcher, prior)
+    with watched_beside(matcher, watching) as watcher:
 
-    try:
-        bridge = Bridge(
-            connection, make_navigator, options, start, LiveOptions(deadline_ms=matching.deadline_ms),
-            origin=_origin(site, wire), use_velocity=wire.use_velocity, system_id=wire.system_id, key=key,
-        )  # fmt: skip
-    except OSError as error:
-        raise BackendError(f"--connect: {wire.connect} cannot be opened: {error.strerror or error}") from None
-    with bridge:
-        _follow(bridge, inputs.pictures(), camera, matching.seconds)
-        status = bridge.status
+        def make_navigator(prior: Prior | None) -> Navigator:
+            navigator = Navigator(matcher, prior)
+            return navigator if watcher is None else watcher.follow(navigator)
+
+        try:
+            bridge = Bridge(
+                connection, make_navigator, options, start, LiveOptions(deadline_ms=matching.deadline_ms),
+                origin=_origin(site, wire), use_velocity=wire.use_velocity, system_id=wire.system_id, key=key,
+                watch=watcher,
+            )  # fmt: skip
+        except OSError as error:
+            raise BackendError(f"--connect: {wire.connect} cannot be opened: {error.strerror or error}") from None
+        with bridge:
+            _follow(bridge, inputs.pictures(), camera, matching.seconds)
+            status = bridge.status
     console.facts(asdict(status), as_json, title=f"{options.kind} to {wire.connect}")
 
 
@@ -139,7 +145,7 @@ def _need_pymavlink() -> None:
         import pymavlink  # noqa: F401
     except ImportError:
         raise BackendError(
-            "bridge: expected pymavlink to be installed: pip install 'scenematch[mavlink]'"
+            "bridge: expected pymavlink to be installed, the extra [mavlink]: pip install pymavlink"
         ) from None
 
 

@@ -18,6 +18,8 @@ from engine.cli.options import (
     MaxSigmaOption,
     MessageOption,
     MethodOption,
+    RerunConnectOption,
+    RerunOption,
     SecondsOption,
     StartOption,
     SurfaceOption,
@@ -84,6 +86,8 @@ def mavlink(
     device: DeviceOption = "auto",
     deadline: DeadlineOption = 121.0,
     seconds: SecondsOption = None,
+    rerun: RerunOption = None,
+    rerun_connect: RerunConnectOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -93,6 +97,7 @@ def mavlink(
     played at their own pace, until they end.
     """
     from engine.cli.bridge import Inputs, Matching, Wire, run_bridge
+    from engine.cli.watching import Watching
 
     use_threads(threads)
     inputs = Inputs(map_path, surface, camera, frames, telemetry, source, rate, grab, map_sigma)
@@ -102,7 +107,7 @@ def mavlink(
         use_velocity=use_velocity,
     )  # fmt: skip
     matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
-    run_bridge(inputs, wire, matching, as_json=as_json)
+    run_bridge(inputs, wire, matching, as_json=as_json, watching=Watching(rerun, rerun_connect))
 
 
 def mavlink_params(
@@ -166,6 +171,8 @@ def ros(
     device: DeviceOption = "auto",
     deadline: DeadlineOption = 121.0,
     seconds: SecondsOption = None,
+    rerun: RerunOption = None,
+    rerun_connect: RerunConnectOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -177,6 +184,7 @@ def ros(
     from engine.adapters.ros import Topics
     from engine.cli.bridge import Matching
     from engine.cli.bridge_ros import Inputs, run_bridge_ros
+    from engine.cli.watching import Watching
 
     use_threads(threads)
     topics = Topics(
@@ -185,4 +193,5 @@ def ros(
     )  # fmt: skip
     matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
     inputs = Inputs(map_path, surface, camera, topics, map_sigma)
-    run_bridge_ros(version, inputs, matching, firmware, origin, as_json=as_json)
+    watching = Watching(rerun, rerun_connect)
+    run_bridge_ros(version, inputs, matching, firmware, origin, as_json=as_json, watching=watching)

@@ -14,6 +14,7 @@ from engine.cli import console
 from engine.cli.arguments import check_choice, parse_position
 from engine.cli.bridge import Matching
 from engine.cli.checks import check_place
+from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError
 from engine.formats.ros_messages import camera_of
 from engine.live import LiveOptions
@@ -41,9 +42,17 @@ class Inputs:
 
 
 def run_bridge_ros(
-    version: int, inputs: Inputs, matching: Matching, firmware: str, origin: str | None, *, as_json: bool
+    version: int,
+    inputs: Inputs,
+    matching: Matching,
+    firmware: str,
+    origin: str | None,
+    *,
+    as_json: bool,
+    watching: Watching,
 ) -> None:
     """Run the node until ROS, the time or somebody ends it, and print what was done."""
+    watching.check()
     check_choice("--method", matching.method, METHODS)
     devices.resolve(matching.device)
     start, place = parse_position("--start", matching.start), parse_position("--origin", origin)
@@ -61,15 +70,19 @@ def run_bridge_ros(
     )
     matcher.warmup()
 
-    def make_navigator(prior: Prior | None) -> Navigator:
-        return Navigator(matcher, prior)
+    with watched_beside(matcher, watching) as watcher:
 
-    bridge = RosBridge(node, site, make_navigator, options, start, LiveOptions(deadline_ms=matching.deadline_ms))
-    console.say(f"listening to {inputs.topics.image}")
-    try:
-        node.spin(bridge.handlers(inputs.topics), bridge.beat, matching.seconds)
-    finally:
-        bridge.close()
+        def make_navigator(prior: Prior | None) -> Navigator:
+            navigator = Navigator(matcher, prior)
+            return navigator if watcher is None else watcher.follow(navigator)
+
+        live = LiveOptions(deadline_ms=matching.deadline_ms)
+        bridge = RosBridge(node, site, make_navigator, options, start, live, watch=watcher)
+        console.say(f"listening to {inputs.topics.image}")
+        try:
+            node.spin(bridge.handlers(inputs.topics), bridge.beat, matching.seconds)
+        finally:
+            bridge.close()
     console.facts(asdict(bridge.status), as_json, title=f"ROS {version} on {inputs.topics.image}")
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from engine.cli import console
 from engine.cli.arguments import check_choice, check_folder, prepare_folder
 from engine.cli.demo import START_SIGMA_M, write_flight
 from engine.cli.track import OWNED
+from engine.cli.watching import Watching, watched
 from engine.device import resolve
 from engine.errors import OptionError
 from engine.formats.flight import write_flight_folder
@@ -34,7 +35,10 @@ from engine.sim.loop import START_NS, ClosedLoop
 from engine.sim.pilot import plan_rounds
 from engine.sim.quadrotor import State
 from engine.sim.town import EXACT, generator
-from engine.types import Prior, Truth
+from engine.types import Frame, Prior, Truth
+
+if TYPE_CHECKING:  # rerun is optional
+    from engine.report.live_view import LiveView
 
 FOLDER = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")
 RESULTS = ("loop.csv", "loop.json", "loop.png", "loop-path.png", *OWNED)
@@ -121,14 +125,22 @@ def run_simulate(out: Path, scene: Scene, *, frames: int | None, force: bool) ->
     plan = plan_flight(scene.seed, frames=frames, town=scene.build())
     prepare_folder(out, force, (*FOLDER, *RESULTS))
     write_flight(out, plan)
+    console.say(
+        f"follow it: scenematch track --map {out}/map.tif --surface {out}/dsm.tif --camera {out}/camera.yaml "
+        f"--frames {out}/frames --telemetry {out}/telemetry.csv --out {out}-track"
+    )
     way_m = float(np.hypot(*np.diff(plan.truth.position_m[:, :2], axis=0).T).sum())
     seconds = (plan.timestamps_ns[-1] - plan.timestamps_ns[0]) * 1e-9
     return {"frames": len(plan), "seconds": seconds, "way_m": way_m, **scene.facts(), "folder": str(out.resolve())}
 
 
-def run_closed_loop(out: Path, scene: Scene, loop: Loop, *, force: bool) -> dict[str, Any]:
+def run_closed_loop(
+    out: Path, scene: Scene, loop: Loop, *, force: bool, watching: Watching | None = None
+) -> dict[str, Any]:
     """Fly by the engine's fixes, and write the flight's folder with its track and figures; returns the figures."""
     check_folder(out, force)
+    watching = watching or Watching()
+    watching.check(force=force)
     console.say("drawing the world")
     town, camera = scene.build(), Camera.from_fov(300, 300, 60.0)
     site = town.site()
@@ -136,7 +148,8 @@ def run_closed_loop(out: Path, scene: Scene, loop: Loop, *, force: bool) -> dict
     matcher.warmup()
     flight = close_loop(town, camera, matcher, scene.seed, loop)
     prepare_folder(out, force, (*FOLDER, *RESULTS))
-    _write_folder(out, flight, town, camera, site, loop)
+    with watched(matcher, watching) as view:
+        _write_folder(out, flight, town, camera, site, loop, view)
     record = _record(out, scene, loop, site, town, str(matcher.device))
     return _write_results(out, flight, site, record)
 
@@ -196,11 +209,29 @@ def _name(k: int) -> str:
     return f"{k:06d}.jpg"
 
 
-def _write_folder(out: Path, flight: ClosedLoop, town: Town, camera: Camera, site: OrthoMap, loop: Loop) -> None:
+def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[Frame]:
+    """The frames of a flight while it is flown, each shown once it is answered."""
+    told_ms = 1e3 * flight.options.latency_s
+    for k, frame in enumerate(flight.fly(seconds)):
+        if view is not None:
+            answer = flight.flown.answers[-1]
+            view.show(k, _name(k), frame, answer.result, answer.state, told_ms)
+        yield frame
+
+
+def _write_folder(
+    out: Path,
+    flight: ClosedLoop,
+    town: Town,
+    camera: Camera,
+    site: OrthoMap,
+    loop: Loop,
+    view: LiveView | None,
+) -> None:
     """Fly, and write the folder as it goes: pictures, telemetry by the filter, truth, camera and map."""
     seconds = 60.0 * loop.minutes
     count = int(seconds * flight.options.frame_rate_hz)
-    frames = console.progress(flight.fly(seconds), count, "flying")
+    frames = console.progress(_fly(flight, seconds, view), count, "flying")
     start = flight.flown.start_m
     lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
     write_flight_folder(

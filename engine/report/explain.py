@@ -27,8 +27,9 @@ Image = NDArray[np.uint8]
 
 MOST_FRAMES = 60
 """Frames that are shown of a longer flight."""
+SIDE_PX = 360
+"""Longer side of a picture."""
 _MOST_REMARKABLE = 40  # of these wrong ones and refusals, so that ordinary ones stay beside them
-_SIDE_PX = 360  # longer side of a picture
 _MOST_BYTES = 32_000  # of one, so that a report of 60 frames stays below 15 MB
 _QUALITIES = (82, 70, 55, 40, 25)
 _ELLIPSE_SIGMAS = 3.0
@@ -124,6 +125,28 @@ def encode(image: Image, most_bytes: int = _MOST_BYTES) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
 
 
+def explain_again(
+    matcher: SceneMatcher, frame: Frame, row: TrackRow, note: Note
+) -> tuple[Window, Explanation] | None:
+    """The window that a frame was matched in and what was seen there; None where neither can be had.
+
+    Args:
+        matcher: of the run, or one like it.
+        frame: as it was matched.
+        row: what became of it.
+        note: the rest of that.
+    """
+    window = _window(row, note)
+    if window is None:
+        return None
+    told = _as_matched(frame, row, note, matcher.site)
+    method = row.method if row.method in ("ncc", "sift") else None
+    try:
+        return window, matcher.explain(told, window, method)
+    except EngineError:  # a picture of another size: the run said so already
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class _Drawer:
     matcher: SceneMatcher
@@ -134,19 +157,14 @@ class _Drawer:
         image = item.frame.image
         assert isinstance(image, np.ndarray)  # read from a file
         frame = _picture(image, "the frame as it was taken", f"Frame {item.name} as the camera took it.")
-        window = _window(row, note)
-        if window is None:
+        explained = explain_again(self.matcher, item.frame, row, note)
+        if explained is None:
             return [frame]
-        told = _as_matched(item.frame, row, note, self.matcher.site)
-        method = row.method if row.method in ("ncc", "sift") else None
-        try:
-            found = self.matcher.explain(told, window, method)
-        except EngineError:  # a picture of another size: the run said so already
-            return [frame]
+        window, found = explained
         out = [frame]
         if found.rectified is not None:
             text, alt = "rectified onto the map, contrast stretched", "The frame in the map's pixels and axes."
-            out.append(_picture(_stretched(found.rectified), text, alt))
+            out.append(_picture(stretched(found.rectified), text, alt))
         out.append(self._map(index, window, found, row))
         if found.surface is not None:
             out.append(_surface(found.surface))
@@ -156,10 +174,10 @@ class _Drawer:
 
     def _map(self, index: int, window: Window, found: Explanation, row: TrackRow) -> Picture:
         """The window, with the place that was found, the fix and the truth."""
-        crop, per_px = _crop(self.matcher.site, window)
+        crop, per_px = draw_window(self.matcher.site, window)
         marks = [] if found.surface is None else [_tried(found.surface, window, per_px)]
         if found.outline_px is not None:
-            corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in _within(found.outline_px, window, per_px))
+            corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in within_window(found.outline_px, window, per_px))
             marks.append(f'<polygon class="{"found" if row.fixed else "doubted"}" points="{corners}"/>')
         caption = f"the window, {window.width_px} by {window.height_px} map pixels"
         for name, place in (
@@ -167,7 +185,7 @@ class _Drawer:
             ("cross: fix", self.errors.fix_en_m[index]),
         ):
             if np.isfinite(place).all():
-                marks.append(_mark(_within(self.matcher.site.pixel_from_enu(place), window, per_px), name))
+                marks.append(_mark(within_window(self.matcher.site.pixel_from_enu(place), window, per_px), name))
                 caption += f"; {name}"
         alt = "The window of the map that was searched, with the place that was found."
         return replace(_picture(crop, caption, alt), overlay="".join(marks))
@@ -191,9 +209,9 @@ def _as_matched(frame: Frame, row: TrackRow, note: Note, site: OrthoMap) -> Fram
     )
 
 
-def _crop(site: OrthoMap, window: Window) -> tuple[Image, float]:
+def draw_window(site: OrthoMap, window: Window) -> tuple[Image, float]:
     """The window as drawn, and pixels of the picture per pixel of the map."""
-    per_px = _SIDE_PX / max(window.width_px, window.height_px)
+    per_px = SIDE_PX / max(window.width_px, window.height_px)
     level = 0
     while per_px * 2.0 ** (level + 1) <= 1.0 and level + 1 < site.levels:
         level += 1
@@ -203,7 +221,7 @@ def _crop(site: OrthoMap, window: Window) -> tuple[Image, float]:
     return np.asarray(cv2.resize(gray, size, interpolation=how), np.uint8), per_px
 
 
-def _within(map_px: Array, window: Window, per_px: float) -> Array:
+def within_window(map_px: Array, window: Window, per_px: float) -> Array:
     """Places of the map in a picture of the window, whose top-left corner is (0, 0)."""
     return np.asarray((map_px - [window.x0, window.y0] + 0.5) * per_px, np.float64)
 
@@ -220,58 +238,76 @@ def _mark(place: Array, name: str) -> str:
 
 def _picture(image: Image, caption: str, alt: str) -> Picture:
     """Reduced to what is shown."""
-    scale = min(1.0, _SIDE_PX / max(image.shape[:2]))
+    scale = min(1.0, SIDE_PX / max(image.shape[:2]))
     if scale < 1.0:
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     return Picture(encode(image), image.shape[1], image.shape[0], caption, alt)
 
 
-def _surface(surface: Surface) -> Picture:
-    """The correlation at each place of the patch's middle; what correlates negatively is as dark as nothing."""
+def draw_surface(surface: Surface) -> tuple[Image, Array]:
+    """The correlation at each place of the patch's middle in colour (H, W, 3), and where (2,) its peak is in that.
+
+    What correlates negatively is as dark as nothing.
+    """
     high, rows, columns = surface.score, *surface.scores.shape
-    low = min(max(0.0, float(surface.scores.min())), high)
+    low = lowest_shown(surface)
     levels = np.clip((surface.scores - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
-    scale = _SIDE_PX / max(rows, columns)
+    scale = SIDE_PX / max(rows, columns)
     size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
     if scale < 1.0:  # the highest of each pixel's places: a mean would wash a narrow peak away
         reach = math.ceil(1.0 / scale)
         levels = np.asarray(cv2.dilate(levels, np.ones((reach, reach), np.uint8)), np.uint8)
     levels = np.asarray(cv2.resize(levels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-    coloured = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)
-    x, y = (np.array(surface.peak_px) + 0.5) * scale
+    coloured = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    return np.asarray(coloured, np.uint8), (np.array(surface.peak_px) + 0.5) * scale
+
+
+def lowest_shown(surface: Surface) -> float:
+    """The correlation that is drawn as dark as can be."""
+    return min(max(0.0, float(surface.scores.min())), surface.score)
+
+
+def _surface(surface: Surface) -> Picture:
+    image, (x, y) = draw_surface(surface)
+    low, high = lowest_shown(surface), surface.score
     caption = f"correlation in the dotted area, {low:.2f} (dark) to {high:.2f} (bright)"
-    picture = _picture(cv2.cvtColor(coloured, cv2.COLOR_BGR2RGB), caption, f"The surface; its peak is {high:.2f}.")
+    picture = _picture(image, caption, f"The surface; its peak is {high:.2f}.")
     return replace(picture, overlay=f'<circle class="peak" cx="{x:.1f}" cy="{y:.1f}" r="10"/>')
 
 
 def _tried(surface: Surface, window: Window, per_px: float) -> str:
     """The area of the window in which the patch's middle was tried."""
-    x, y = _within(surface.corner_px - surface.step_px / 2.0, window, per_px)
+    x, y = within_window(surface.corner_px - surface.step_px / 2.0, window, per_px)
     height, width = (n * surface.step_px * per_px for n in surface.scores.shape)
     return f'<rect class="tried" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}"/>'
 
 
-def _stretched(gray: Image) -> Image:
+def stretched(gray: Image) -> Image:
     """From black to white, so that dusk shows; noise of a flat picture stays dark."""
     low, high = np.percentile(gray, [0.5, 99.5])
     return np.asarray(np.clip((gray - low) * (255.0 / max(high - low, 24.0)), 0.0, 255.0), np.uint8)
 
 
-def _matches(found: Explanation, matches: Matches, site: OrthoMap, window: Window) -> Picture:
-    """Frame and window side by side, a line for each match."""
-    right, per_px = _crop(site, window)
-    scale = min(_SIDE_PX / max(found.gray.shape), right.shape[0] / found.gray.shape[0])
-    left = cv2.resize(_stretched(found.gray), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+def draw_matches(found: Explanation, matches: Matches, site: OrthoMap, window: Window) -> Image:
+    """Frame and window (H, W, 3) side by side, a line for each match."""
+    right, per_px = draw_window(site, window)
+    scale = min(SIDE_PX / max(found.gray.shape), right.shape[0] / found.gray.shape[0])
+    left = cv2.resize(stretched(found.gray), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     canvas = np.full((max(left.shape[0], right.shape[0]), left.shape[1] + 8 + right.shape[1]), 238, np.uint8)
     canvas[: left.shape[0], : left.shape[1]] = left
     canvas[: right.shape[0], left.shape[1] + 8 :] = right
     rgb = np.repeat(canvas[:, :, None], 3, axis=2)
     begin = (matches.frame_px + 0.5) * scale
-    end = _within(matches.map_px, window, per_px) + np.array([left.shape[1] + 8, 0])
+    end = within_window(matches.map_px, window, per_px) + np.array([left.shape[1] + 8, 0])
     for agreeing, colour in ((False, _OTHER), (True, _AGREE)):
         for a, b in zip(begin[matches.agree == agreeing], end[matches.agree == agreeing], strict=True):
             cv2.line(rgb, _fixed(a), _fixed(b), colour, 1, cv2.LINE_AA, shift=4)
+    return rgb
+
+
+def _matches(found: Explanation, matches: Matches, site: OrthoMap, window: Window) -> Picture:
+    rgb = draw_matches(found, matches, site, window)
     count, agree = len(matches.agree), int(matches.agree.sum())
     caption = f"{count} matches" + (f", {agree} agree with the pose (green)" if agree else "")
     uri = encode(rgb, 2 * _MOST_BYTES)

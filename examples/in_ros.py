@@ -1,0 +1,22 @@
+"""In ROS: in_ros.py 1|2, a node of your own with the engine inside. Run it where the map and camera.yaml lie."""
+
+import sys
+from importlib import import_module
+
+from engine import Camera, Navigator, OrthoMap, SceneMatcher
+from engine.adapters.ros import RosBridge, Topics
+from engine.adapters.ros_out import RosOptions
+from engine.device import set_threads
+
+set_threads(1)  # two wait for each other where other work shares the processor
+site = OrthoMap.open("map.tif", surface="dsm.tif")
+matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
+matcher.warmup()
+node = import_module(f"engine.adapters.ros{sys.argv[1]}").Node("scenematch")
+bridge = RosBridge(node, site, lambda prior: Navigator(matcher, prior), RosOptions())
+topics = Topics(image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt")  # "" leaves one out
+try:
+    node.spin(bridge.handlers(topics), bridge.beat, None)  # until ROS ends it
+finally:
+    bridge.close()
+print(bridge.status)

@@ -1,0 +1,126 @@
+"""The examples run as they stand: in a flight folder, beside a stand-in autopilot, in a ROS that is none."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+import time
+import types
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.cli.demo import write_flight
+from engine.formats.flight import open_flight
+from engine.formats.truth import read_truth
+from engine.sim import plan_flight
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A flight folder."""
+    folder = tmp_path_factory.mktemp("examples")
+    write_flight(folder, plan_flight(frames=FRAMES))
+    return folder
+
+
+@pytest.mark.parametrize("script", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_is_short(script):
+    lines = script.read_text(encoding="utf-8").split('"""', 2)[2].splitlines()
+    code = [line for line in lines if line.strip() and not line.startswith(("import ", "from ", "#"))]
+    assert len(code) <= 20
+
+
+def test_your_own_loop_fixes_every_frame(flight, monkeypatch, capsys):
+    monkeypatch.chdir(flight)
+    runpy.run_path(str(EXAMPLES / "your_own_loop.py"))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == FRAMES
+    assert all("NCC" in line for line in lines)
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    from bench.bridge_counts import free_port
+    from bench.fly_standin import fly
+
+    port, start = free_port(), read_truth(flight / "truth.csv")[0]
+    link, place = f"udpin:127.0.0.1:{port}", [str(start.lat_deg), str(start.lon_deg)]
+    command = [sys.executable, str(EXAMPLES / "beside_autopilot.py"), firmware, link, *place]
+    told = {"cwd": flight, "env": os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **told) as bridge:
+        try:
+            came = fly(flight, port, firmware)
+            said, _ = bridge.communicate(timeout=60)
+        finally:
+            bridge.kill()
+    assert bridge.returncode == 0
+    assert "connected=True" in said
+    # A busy machine hears of the height after its first fix, and is late with some.
+    assert set(re.findall(r"'([\w ]+)': \d+", said)) <= {"late", "unconfirmed", "no height"}
+    assert came["fixes"] == int(re.search(r"sent=(\d+)", said)[1])
+    assert came["median_m"] is None or came["median_m"] < 3.0
+
+
+def test_a_video_and_its_telemetry_are_the_flight_again(flight, monkeypatch):
+    monkeypatch.chdir(flight)
+    runpy.run_path(str(EXAMPLES / "video_of_flight.py"))
+    video = list(open_flight("flight.mp4", "video.csv"))
+    for item, of_folder in zip(video, open_flight("frames", "telemetry.csv"), strict=True):
+        assert replace(item.frame, image=of_folder.frame.image) == of_folder.frame
+        assert np.abs(item.frame.image.astype(int) - of_folder.frame.image).mean() < 12.0  # compressed once more
+
+
+class NodeOfNoRos:
+    """What :mod:`engine.adapters.ros1` has, without ROS: it plays three pictures and keeps what is published."""
+
+    made = None
+
+    def __init__(self, name):
+        from rosbags.typesys import Stores, get_typestore
+
+        from engine.formats.ros_messages import Maker
+
+        self.maker = Maker(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
+        self.published, self.topics = [], None
+        type(self).made = self
+
+    def now_ns(self):
+        return 1_000_000_000
+
+    def is_wanted(self, output):
+        return False
+
+    def publish(self, output, message):
+        self.published.append(output)
+
+    def spin(self, handlers, beat, seconds):
+        self.topics = {topic: kind for topic, (kind, _) in handlers.items()}
+        picture = self.maker.image(1_000_000_000, "camera", np.zeros((300, 300), np.uint8))
+        handlers["/down/image_raw"][1](picture)
+        end = time.monotonic() + 10.0
+        while not self.published and time.monotonic() < end:
+            time.sleep(0.01)
+        beat()
+
+
+def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monkeypatch, capsys):
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    module = types.ModuleType("engine.adapters.ros1")
+    module.Node = NodeOfNoRos
+    monkeypatch.setitem(sys.modules, "engine.adapters.ros1", module)
+    monkeypatch.setattr(sys, "argv", ["in_ros.py", "1"])
+    monkeypatch.chdir(flight)
+    runpy.run_path(str(EXAMPLES / "in_ros.py"))
+    node = NodeOfNoRos.made
+    assert node.topics["/down/image_raw"] == "sensor_msgs/msg/Image"
+    assert "/mavros/global_position/compass_hdg" not in node.topics
+    assert node.published == ["diagnostics"]  # a black picture has no pose
+    assert re.search(r"answered=1\b", capsys.readouterr().out)
