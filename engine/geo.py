@@ -63,7 +63,8 @@ class LocalFrame:
     lon_deg: float
 
     @cached_property
-    def _enu_from_ecef(self) -> Array:
+    def enu_from_ecef(self) -> Array:
+        """Rotation (3, 3) that takes the Earth's axes to east, north and up."""
         lat, lon = math.radians(self.lat_deg), math.radians(self.lon_deg)
         sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
         return np.array(
@@ -81,7 +82,7 @@ class LocalFrame:
     def enu_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
         """East and north (..., 2) in metres of points on the ellipsoid."""
         offset = ecef_from_geodetic(lat_deg, lon_deg) - self._origin_ecef_m
-        return (offset @ self._enu_from_ecef.T)[..., :2]
+        return (offset @ self.enu_from_ecef.T)[..., :2]
 
     def geodetic_from_enu(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[Array, Array]:
         """Latitude and longitude in degrees of the points on the ellipsoid above (east, north)."""
@@ -90,7 +91,7 @@ class LocalFrame:
         drop = np.zeros_like(east)
         for _ in range(3):
             enu = np.stack([east, north, -drop], axis=-1)
-            lat, lon, height = geodetic_from_ecef(enu @ self._enu_from_ecef + self._origin_ecef_m)
+            lat, lon, height = geodetic_from_ecef(enu @ self.enu_from_ecef + self._origin_ecef_m)
             drop = drop + height
         return lat, lon
 

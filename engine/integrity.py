@@ -101,7 +101,7 @@ class PeakRule:
     max_prior_chi_square: float = 18.4
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
-    min_confidence: float = 0.97
+    min_confidence: float = 0.98
     sure: float = 0.995
     min_deviation: float = 3.0
     exclusion_m: float = 6.0

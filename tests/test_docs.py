@@ -2,11 +2,13 @@
 
 import re
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 import engine
+from docs.site_roles import on_page_content
 from engine.cli.app import app
 from engine.cli.demo import write_flight
 from engine.formats.track import COLUMNS
@@ -20,6 +22,7 @@ from engine.types import Reason
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 FENCE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INCLUDE = re.compile(r'^--8<-- "(.+)"$', re.MULTILINE)
 CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
@@ -44,8 +47,29 @@ def flight(tmp_path_factory):
 def test_snippets_run_as_they_stand(page, flight, monkeypatch):
     monkeypatch.chdir(flight)
     names = {"__name__": page.stem}  # the snippets of a page follow each other
-    for number, snippet in enumerate(FENCE.findall(page.read_text(encoding="utf-8"))):
+    for number, snippet in enumerate(FENCE.findall(with_examples(page))):
         exec(compile(snippet, f"{page.name}, snippet {number + 1}", "exec"), names)
+
+
+def with_examples(page):
+    """The page as the site shows it, with the examples that it includes."""
+    return INCLUDE.sub(lambda name: read(f"examples/{name[1]}"), page.read_text(encoding="utf-8"))
+
+
+def test_every_example_is_shown_by_a_page():
+    shown = {name for page in PAGES for name in INCLUDE.findall(page.read_text(encoding="utf-8"))}
+    assert shown == {path.name for path in (ROOT / "examples").glob("*.py")}
+
+
+def test_no_role_is_shown_raw_on_the_site():
+    found = Counter()
+    for path in (ROOT / "engine").rglob("*.py"):
+        for role, name in re.findall(r"(:[a-z]+:)`([^`]*)`", path.read_text(encoding="utf-8")):
+            html = on_page_content(f"<p>see {role}<code>{name}</code>, and more</p>")
+            assert role not in html, f"{path.name}: {role}`{name}`"
+            assert f'identifier="{name}"' in html
+            found[role] += 1
+    assert found[":func:"] > 10
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

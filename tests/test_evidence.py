@@ -96,7 +96,7 @@ def test_a_refusal_tells_its_figures():
     verdict = judge_evidence(replace(MIDDLING, ratio=0.9), PeakRule())
     assert verdict is not None
     assert verdict[0] is Reason.AMBIGUOUS
-    for figure in ("0.97", "10.0 sigmas", "90%", "4.0"):
+    for figure in ("0.98", "10.0 sigmas", "90%", "4.0"):
         assert figure in verdict[1]
     assert judge_evidence(Evidence(sigmas=20.0, ratio=0.2, expected=Expected(1.0, 8.0)), PeakRule()) is None
 

@@ -385,7 +385,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
 
     path = ulog_flight(tmp_path / "a.ulg")
     monkeypatch.setattr(builtins, "__import__", without)
-    assert "a ULog needs pyulog: pip install 'scenematch[logs]'" in refusal(open_log, path)
+    assert "a ULog needs pyulog, the extra [logs]: pip install pyulog" in refusal(open_log, path)
 
 
 @pytest.mark.parametrize("piece", [" ", "\n", "a.", "<", "GPS(1,2,", "a  ", "1", "a:"])

@@ -7,7 +7,14 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
-from engine.cli import bridge_commands, console, flight_commands, map_commands
+from engine.cli import (
+    bridge_commands,
+    campaign_commands,
+    console,
+    dataset_commands,
+    flight_commands,
+    map_commands,
+)
 from engine.cli.options import JsonOption
 from engine.errors import EngineError, OptionError
 
@@ -20,6 +27,7 @@ app = typer.Typer(
 app.command()(flight_commands.demo)
 app.command()(flight_commands.track)
 app.command()(flight_commands.compare)
+app.command()(campaign_commands.campaign)
 app.command()(flight_commands.init)
 app.command()(flight_commands.locate)
 app.command()(flight_commands.simulate)
@@ -30,6 +38,10 @@ map_app = typer.Typer(help="Facts about a map.")
 map_app.command("info")(map_commands.info)
 map_app.command("audit")(map_commands.audit)
 app.add_typer(map_app, name="map")
+dataset_app = typer.Typer(help="Published data sets.")
+dataset_app.command("import")(dataset_commands.import_dataset)
+dataset_app.command("check")(dataset_commands.check)
+app.add_typer(dataset_app, name="dataset")
 bridge_app = typer.Typer(help="Live, beside an autopilot.")
 bridge_app.command("mavlink")(bridge_commands.mavlink)
 bridge_app.command("mavlink-params")(bridge_commands.mavlink_params)

@@ -9,7 +9,7 @@ from engine import device as devices
 from engine.cli import console
 from engine.cli.arguments import check_folder, prepare_folder
 from engine.cli.compare import CHART, COLUMNS, TABLE, USUAL, cells, parse_runs, run_compare
-from engine.cli.track import Inputs
+from engine.cli.track import Inputs, folder_inputs
 from engine.formats.flight import write_flight_folder
 from engine.sim import Plan, plan_flight
 from engine.sim.town import EXACT
@@ -59,14 +59,7 @@ def write_flight(directory: Path, plan: Plan) -> Inputs:
         georeference_sigma_m=EXACT,
         slope_sigma_deg=EXACT,
     )
-    return Inputs(
-        map=directory / "map.tif",
-        surface=directory / "dsm.tif",
-        camera=directory / "camera.yaml",
-        frames=directory / "frames",
-        telemetry=directory / "telemetry.csv",
-        truth=directory / "truth.csv",
-    )
+    return folder_inputs(directory)
 
 
 def _print_table(results: dict[str, dict[str, Any]], seed: int) -> None:

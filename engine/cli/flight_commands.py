@@ -19,6 +19,8 @@ from engine.cli.options import (
     MethodOption,
     OtherDeviceOption,
     OutOption,
+    RerunConnectOption,
+    RerunOption,
     SettingsOption,
     StartOption,
     SurfaceOption,
@@ -102,6 +104,8 @@ def track(
             "--profile", metavar="engine|paper", help="paper is the paper's own recipe; engine unless told."
         ),
     ] = None,
+    rerun: RerunOption = None,
+    rerun_connect: RerunConnectOption = None,
     threads: ThreadsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -112,6 +116,7 @@ def track(
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
     from engine.cli.track import Inputs, camera_or_bag, run_track, settings_from
+    from engine.cli.watching import Watching
     from engine.formats.logs import LogClock
 
     use_threads(threads)
@@ -121,7 +126,7 @@ def track(
     settings = settings_from(
         settings_path, method=method, profile=profile, device=device, start=start, budget_ms=budget_ms
     )
-    result = run_track(inputs, out, settings, force=force)
+    result = run_track(inputs, out, settings, force=force, watching=Watching(rerun, rerun_connect))
     console.report(result, as_json, title=f"{settings.method} ({settings.profile} profile) on {frames}", out=out)
 
 
@@ -249,6 +254,8 @@ def simulate(
         str | None,
         typer.Option("--fault", metavar="none|killed|shifted|frozen", help="With --closed-loop: what goes wrong."),
     ] = None,
+    rerun: RerunOption = None,
+    rerun_connect: RerunConnectOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 1,
     force: ForceOption = False,
@@ -260,10 +267,11 @@ def simulate(
     folder holds its track, estimate, figures and summary too.
     """
     from engine.cli.simulate import Loop, Scene, run_closed_loop, run_simulate
+    from engine.cli.watching import Watching
 
     use_threads(threads)
     scene = Scene(seed=seed, condition=condition, relief_m=relief, map=map_path, surface=surface)
-    given = {"minutes": minutes, "method": method, "fault": fault}
+    given = {"minutes": minutes, "method": method, "fault": fault, "rerun": rerun, "rerun-connect": rerun_connect}
     unwanted = [name for name, value in given.items() if value is not None and not closed_loop]
     if unwanted:
         raise OptionError(f"--{unwanted[0]}: expected with --closed-loop only")
@@ -272,7 +280,7 @@ def simulate(
     if closed_loop:
         minutes = 5.0 if minutes is None else minutes
         loop = Loop(minutes=minutes, method=method or "auto", fault=fault or "none", device=device)
-        facts = run_closed_loop(out, scene, loop, force=force)
+        facts = run_closed_loop(out, scene, loop, force=force, watching=Watching(rerun, rerun_connect))
     else:
         facts = run_simulate(out, scene, frames=frames, force=force)
     console.facts(facts, as_json, title=f"simulated flight {seed}")

@@ -64,6 +64,13 @@ SecondsOption = Annotated[
 OtherDeviceOption = Annotated[
     str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
 ]
+RerunOption = Annotated[
+    Path | None, typer.Option("--rerun", metavar="FILE.rrd", help="Record the live view, for rerun's viewer.")
+]
+RerunConnectOption = Annotated[
+    str | None,
+    typer.Option("--rerun-connect", metavar="HOST:PORT", help="Show it live in a viewer of rerun that listens."),
+]
 
 
 def use_threads(count: int) -> None:

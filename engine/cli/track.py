@@ -6,14 +6,15 @@ import json
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from engine import device as devices
 from engine.budget import Budget
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_choice, check_folder, parse_budget, parse_position, prepare_folder
-from engine.cli.checks import check_needs, check_pictures, check_place
+from engine.cli.checks import check_needs, check_pictures, check_place, check_start
+from engine.cli.watching import Watching, watched
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.bags import is_bag, read_bag_camera
 from engine.formats.flight import Flight, FlightFrame, open_flight
@@ -33,6 +34,9 @@ from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
 from engine.report.page import Flown, write_page
 from engine.types import Fix, NoFix, Prior, Truth
+
+if TYPE_CHECKING:  # rerun is optional
+    from engine.report.live_view import LiveView
 
 FIGURES = ("path.png", "position.png", "height.png", "error.png")
 NOTES, PAGE = "notes.csv", "report.html"
@@ -68,6 +72,18 @@ class Inputs:
             return self.truth
         beside = self.telemetry.with_name("truth.csv")
         return beside if beside.is_file() else None
+
+
+def folder_inputs(directory: Path) -> Inputs:
+    """The files of a flight folder that has all of them, by their usual names."""
+    return Inputs(
+        map=directory / "map.tif",
+        surface=directory / "dsm.tif",
+        camera=directory / "camera.yaml",
+        frames=directory / "frames",
+        telemetry=directory / "telemetry.csv",
+        truth=directory / "truth.csv",
+    )
 
 
 def camera_or_bag(camera: Path | None, frames: Path) -> Path:
@@ -150,12 +166,23 @@ class Replay:
     why_not: str = "the frames were not kept."
 
 
-def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = False) -> dict[str, Any]:
+def run_track(
+    inputs: Inputs,
+    out: Path,
+    settings: Settings,
+    *,
+    force: bool = False,
+    report: bool = True,
+    watching: Watching | None = None,
+) -> dict[str, Any]:
     """Follow a flight and write the output folder; returns the summary.
 
-    Everything that can be wrong with the input is found before the output folder is made.
+    Everything that can be wrong with the input is found before the output folder is made. Without ``report`` there
+    are no figures and no page; ``evaluate`` makes them at any later time.
     """
     check_folder(out, force)
+    watching = watching or Watching()
+    watching.check(force=force)
     start, budget = parse_position("--start", settings.start), parse_budget("--budget-ms", settings.budget_ms)
     opened = _open(inputs, settings, start)
     site, flight = opened.site, opened.flight
@@ -166,13 +193,14 @@ def run_track(inputs: Inputs, out: Path, settings: Settings, *, force: bool = Fa
         matcher, start, budget, BELIEVE_ALL if settings.profile == "paper" else settings.navigator
     )
     what = f"{settings.method}, {settings.profile} profile"
-    attitude = follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None)
+    with watched(matcher, watching) as view:
+        attitude = follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None, view=view)
     ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
     record = _record(inputs, settings, opened, str(matcher.device), ground)
     record["attitude"] = None if attitude is None else asdict(attitude)
     # From the rows as they stand in the file, so that evaluate gives the same figures.
     rows = read_track(out / "track.csv")
-    return conclude(out, rows, opened.truth, site, ground, record, Replay(flight, matcher))
+    return conclude(out, rows, opened.truth, site, ground, record, Replay(flight, matcher), report=report)
 
 
 def _matcher(site: OrthoMap, camera: Camera, settings: Settings) -> SceneMatcher:
@@ -195,6 +223,7 @@ def _open(inputs: Inputs, settings: Settings, start: Prior | None) -> _Opened:
     if start is None:
         first = next((row.prior for row in flight.rows if row.prior is not None), None)
         check_place(str(inputs.telemetry or inputs.frames), first, site, TelemetryError)
+        check_start(first, site)
     check_pictures(flight, camera)
     if flight.unused:
         console.say(f"frames without a row in the telemetry, left out: {flight.unused}")
@@ -231,7 +260,14 @@ def _record(inputs: Inputs, settings: Settings, opened: _Opened, device: str, gr
 
 
 def follow(
-    flight: Flight, navigator: Navigator, path: Path, budget: Budget | None, what: str, *, use_priors: bool
+    flight: Flight,
+    navigator: Navigator,
+    path: Path,
+    budget: Budget | None,
+    what: str,
+    *,
+    use_priors: bool,
+    view: LiveView | None = None,
 ) -> AttitudeCheck | None:
     """Every frame through the navigator, each row on disk as soon as it is known.
 
@@ -243,6 +279,7 @@ def follow(
         what: for the progress bar.
         use_priors: whether the flight may begin at the telemetry's position; once it has begun, the fixes
             carry on.
+        view: is shown each frame once it is answered.
 
     Returns:
         AttitudeCheck | None: what the fixes say of the telemetry's attitude.
@@ -250,7 +287,7 @@ def follow(
     attitudes: list[AttitudeRow | None] = []
     notes = []
     with TrackWriter(path) as writer:
-        for item in console.progress(flight, len(flight), what):
+        for index, item in enumerate(console.progress(flight, len(flight), what)):
             prior = item.prior if use_priors else None
             begin = time.perf_counter()
             result = _update(navigator, item, prior)
@@ -260,6 +297,8 @@ def follow(
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
             attitudes.append(attitude_row(item.frame, result))
             notes.append(note_of(item.name, result, navigator.state.value))
+            if view is not None:
+                view.show(index, item.name, item.frame, result, navigator.state, latency_ms)
     write_notes(path.with_name(NOTES), notes)
     return check_attitude([row for row in attitudes if row is not None])
 
@@ -280,12 +319,16 @@ def conclude(
     ground: Ground,
     record: dict[str, Any],
     replay: Replay | None = None,
+    *,
+    report: bool = True,
 ) -> dict[str, Any]:
-    """Write summary.json, the figures and the report page, in place of older ones."""
+    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones."""
     summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         console.say(f"no fix is scored: {record['truth']} says nothing of the times of this flight")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if not report:
+        return summary
     for name in FIGURES:
         (out / name).unlink(missing_ok=True)
     title = f"{record['method']} ({record['profile']} profile)"

@@ -306,5 +306,5 @@ def import_rosbags(path: Path) -> tuple[Any, Any]:
     try:
         from rosbags import highlevel, typesys
     except ImportError:
-        raise TelemetryError(f"{path}: a bag needs rosbags: pip install 'scenematch[bags]'") from None
+        raise TelemetryError(f"{path}: a bag needs rosbags, the extra [bags]: pip install rosbags") from None
     return highlevel, typesys

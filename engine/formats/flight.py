@@ -176,7 +176,7 @@ def write_flight_folder(
         rows.append(_telemetry_row(name, frame, start if not rows else None))
     write_telemetry(directory / "telemetry.csv", rows)
     write_truth(directory / "truth.csv", list(truth))
-    (directory / "camera.yaml").write_text(_camera_info(camera), encoding="utf-8")
+    (directory / "camera.yaml").write_text(camera_info(camera), encoding="utf-8")
     tags = {} if georeference_sigma_m is None else {GEOREFERENCE_TAG: georeference_sigma_m}
     write_geotiff(directory / "map.tif", ortho_rgb, pixel_to_crs, crs_epsg, tags=tags)
     if surface_m is not None:
@@ -213,7 +213,9 @@ def _write_picture(path: Path, frame: Frame) -> None:
         raise TelemetryError(f"{path}: cannot be written: {error}") from None
 
 
-def _camera_info(camera: Camera) -> str:
+def camera_info(camera: Camera) -> str:
+    """The text of camera.yaml."""
+
     def block(name: str, rows: int, values: NDArray[np.float64]) -> str:
         data = ", ".join(repr(float(value)) for value in values.ravel())
         return f"{name}:\n  rows: {rows}\n  cols: {values.size // rows}\n  data: [{data}]\n"

@@ -1,7 +1,8 @@
 """Settings files: options as TOML, written with their meaning and defaults, and read back with every key checked.
 
 Options are dataclasses whose docstrings say what each field means and in what unit; a field that is a dataclass
-itself is a table. Nothing is spelled out twice: the file is made from the classes.
+itself is a table, a tuple is a list, and a dict of dataclasses is one table a name. Nothing is spelled out twice:
+the file is made from the classes.
 """
 
 from __future__ import annotations
@@ -118,10 +119,14 @@ def _nearest(name: str, known: list[str]) -> str:
 
 
 def _kinds(cls: type[Any]) -> dict[str, Any]:
-    """The fields that a file can hold, by name, with their types: numbers, words and tables of these."""
+    """The fields that a file can hold, by name, with their types: numbers, words, lists and tables of these."""
     hints = typing.get_type_hints(cls)
     kinds = {field.name: hints[field.name] for field in fields(cls)}
-    return {name: kind for name, kind in kinds.items() if is_dataclass(kind) or _plain(kind) is not None}
+    return {name: kind for name, kind in kinds.items() if _can_be_held(kind)}
+
+
+def _can_be_held(kind: Any) -> bool:
+    return is_dataclass(kind) or _plain(kind) is not None or typing.get_origin(kind) in (tuple, dict)
 
 
 def _plain(kind: Any) -> type | None:
@@ -137,6 +142,14 @@ def _value(kind: Any, value: Any, name: str) -> Any:
         if not isinstance(value, dict):
             raise OptionError(f"{name}: expected a table, got {value!r}")
         return options_from_mapping(typing.cast("type[Any]", kind), value, name)
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            raise OptionError(f"{name}: expected a list, got {value!r}")
+        return tuple(_value(typing.get_args(kind)[0], item, name) for item in value)
+    if typing.get_origin(kind) is dict:
+        if not isinstance(value, dict):
+            raise OptionError(f"{name}: expected tables [{name}.NAME], got {value!r}")
+        return {key: _value(typing.get_args(kind)[1], item, f"{name}.{key}") for key, item in value.items()}
     if value == NONE and isinstance(kind, types.UnionType):
         return None
     plain = _plain(kind)

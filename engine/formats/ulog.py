@@ -84,7 +84,7 @@ def _topics(path: Path) -> dict[str, Columns]:
     try:
         from pyulog import ULog
     except ImportError:
-        raise TelemetryError(f"{path}: a ULog needs pyulog: pip install 'scenematch[logs]'") from None
+        raise TelemetryError(f"{path}: a ULog needs pyulog, the extra [logs]: pip install pyulog") from None
     # The parser prints what it skips, and fails in its own ways on a file that is damaged.
     quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
     with _Watched(io.FileIO(path)) as file, quiet[0], quiet[1]:

@@ -31,7 +31,7 @@ SHAPES = [
     (2, 41, 100),  # two full blocks and four places
 ]
 needs_triton = pytest.mark.skipif(
-    find_spec("triton") is None, reason="triton is not installed: pip install 'scenematch[gpu]'"
+    find_spec("triton") is None, reason="triton is not installed: pip install triton"
 )
 
 

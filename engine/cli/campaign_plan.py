@@ -1,0 +1,250 @@
+"""Plans of campaigns: the TOML file that lists flights and methods, the jobs that come of it, and their inputs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from engine.cli.arguments import check_choice
+from engine.cli.compare import Run, parse_runs
+from engine.cli.jobs import Draw, Follow, Job
+from engine.cli.simulate import Scene
+from engine.cli.track import Inputs, folder_inputs
+from engine.errors import OptionError
+from engine.formats.datasets.recording import ABOUT
+from engine.formats.settings import read_settings
+from engine.sim import CONDITIONS
+
+RUNS, FLIGHTS, WORKSHOP = "runs", "flights", "unfinished"
+"""Folders of a campaign's output folder."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedFlight:
+    """The files of a flight that was flown, in the layout of a flight folder unless told.
+
+    Attributes:
+        folder: that the others lie in, as seen from the campaign's file.
+        map: the map.
+        surface: its surface model; left out where it has the usual name and is not there, as the next three are.
+        camera: the calibration.
+        frames: a folder of pictures, a video or a bag.
+        telemetry: telemetry.csv or a log.
+        truth: truth.csv or a log.
+        map_sigma_m: how well the map lies, where it does not say so itself.
+        group: flights of one group are pooled in the table; without it those of a published data set are, and any
+            other flight is a group of its own.
+    """
+
+    folder: str = "."
+    map: str = "map.tif"
+    surface: str | None = "dsm.tif"
+    camera: str = "camera.yaml"
+    frames: str = "frames"
+    telemetry: str | None = "telemetry.csv"
+    truth: str | None = "truth.csv"
+    map_sigma_m: float | None = None
+    group: str | None = None
+
+    def inputs(self, name: str, base: Path) -> Inputs:
+        """The files as `track` takes them.
+
+        Raises:
+            OptionError: one that is needed or was named is not there.
+        """
+        usual, folder = RecordedFlight(), base / self.folder
+
+        def needed(what: str) -> Path:
+            path: Path = folder / getattr(self, what)
+            if not path.exists():
+                raise OptionError(f"flights.{name}.{what}: expected a file that is there, got {path}")
+            return path.resolve()
+
+        def optional(what: str) -> Path | None:
+            file = getattr(self, what)
+            if file is None or (file == getattr(usual, what) and not (folder / file).exists()):
+                return None
+            return needed(what)
+
+        return Inputs(
+            map=needed("map"),
+            surface=optional("surface"),
+            camera=needed("camera"),
+            frames=needed("frames"),
+            telemetry=optional("telemetry"),
+            truth=optional("truth"),
+            map_sigma_m=self.map_sigma_m,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedFlights:
+    """Simulated flights: every seed in every condition.
+
+    Attributes:
+        seeds: of town, path, sensors and camera.
+        conditions: of the frames; the map is of noon.
+        frames: of each flight; none flies to the end.
+        relief_m: height of the hills.
+    """
+
+    seeds: tuple[int, ...] = ()
+    conditions: tuple[str, ...] = ("noon",)
+    frames: int | None = None
+    relief_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        for condition in self.conditions:
+            check_choice("conditions", condition, tuple(CONDITIONS))
+        for seed in self.seeds:
+            if seed < 0:
+                raise OptionError(f"seeds: expected 0 or more, got {seed}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Campaign:
+    """What a campaign's file holds.
+
+    Attributes:
+        runs: how each flight is followed, as `compare --run` takes it: METHOD, METHOD/PROFILE or a settings file.
+        flights: those that were flown, by name.
+        simulated: those that were not.
+    """
+
+    runs: tuple[str, ...] = ()
+    flights: dict[str, RecordedFlight] = field(default_factory=dict)
+    simulated: SimulatedFlights = field(default_factory=SimulatedFlights)
+
+    def __post_init__(self) -> None:
+        for name in self.flights:
+            if not _NAME.fullmatch(name):
+                raise OptionError(f"flights: expected a name of letters, digits, '_', '.' and '-', got {name!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All the jobs of a campaign.
+
+    Attributes:
+        drawn: flights to be simulated, before the runs over them.
+        runs: a flight by a method each.
+        groups: of each run's flight, what it is pooled with.
+    """
+
+    drawn: list[Job]
+    runs: list[Job]
+    groups: dict[str, str]
+
+
+def plan_campaign(path: Path, out: Path) -> Plan:
+    """Read a campaign's file, and find every input.
+
+    Raises:
+        OptionError, OSError: it cannot be read, or asks for what is not there.
+    """
+    campaign = read_settings(path, Campaign)
+    try:
+        return _planned(campaign, path.parent, out)
+    except OptionError as error:
+        raise OptionError(f"{path}: {error}") from None
+
+
+def _planned(campaign: Campaign, base: Path, out: Path) -> Plan:
+    runs = _runs(campaign, base)
+    drawn, inputs, groups, prints = [], dict[str, Inputs](), dict[str, str](), dict[str, dict[str, str]]()
+    for name, scene in _scenes(campaign.simulated):
+        if name in campaign.flights:
+            raise OptionError(f"flights.{name}: expected another name, this is a simulated flight's")
+        job = _drawing(name, scene, campaign.simulated.frames, out)
+        drawn.append(job)
+        inputs[name], groups[name], prints[name] = (
+            folder_inputs(job.folder),
+            f"simulated {scene.condition}",
+            job.inputs,
+        )
+    for name, flight in campaign.flights.items():
+        inputs[name], groups[name] = (
+            flight.inputs(name, base),
+            flight.group or _dataset(base / flight.folder) or name,
+        )
+        prints[name] = _fingerprints(inputs[name])
+    if not inputs:
+        raise OptionError("expected flights, as [flights.NAME] or as seeds in [simulated], got none")
+    jobs = []
+    for flight_name, files in inputs.items():
+        for run in runs:
+            name, made_of = f"{flight_name}/{run.name}", prints[flight_name] | _settings_print(run)
+            jobs.append(Job(name, out / RUNS / name, out / WORKSHOP, made_of, Follow(files, run.settings)))
+    return Plan(drawn, jobs, groups)
+
+
+def _dataset(folder: Path) -> str | None:
+    """The published data set that a flight folder was made from, or None."""
+    try:
+        name = json.loads((folder / ABOUT).read_text(encoding="utf-8"))["dataset"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return name if isinstance(name, str) else None
+
+
+def _runs(campaign: Campaign, base: Path) -> list[Run]:
+    """The methods; a settings file is looked for beside the campaign's."""
+    texts = [str(base / text) if (base / text).is_file() else text for text in campaign.runs]
+    if not texts:
+        raise OptionError('runs: expected a list of METHOD, METHOD/PROFILE or settings files, such as ["ncc"]')
+    try:
+        runs = parse_runs(texts)
+    except OptionError as error:
+        raise OptionError(f"runs: {str(error).removeprefix('--run: ')}") from None
+    # Whether there is a GPU differs from machine to machine of a cluster; results must not.
+    return [
+        replace(run, settings=replace(run.settings, device="cpu")) if run.settings.device == "auto" else run
+        for run in runs
+    ]
+
+
+def _scenes(simulated: SimulatedFlights) -> Iterator[tuple[str, Scene]]:
+    for condition in simulated.conditions:
+        for seed in simulated.seeds:
+            yield f"town-{seed}-{condition}", Scene(seed=seed, condition=condition, relief_m=simulated.relief_m)
+
+
+def _drawing(name: str, scene: Scene, frames: int | None, out: Path) -> Job:
+    made_of = {"simulation": json.dumps(scene.facts() | {"frames": frames}), "engine": version("scenematch")}
+    return Job(name, out / FLIGHTS / name, out / WORKSHOP, made_of, Draw(scene, frames))
+
+
+def _settings_print(run: Run) -> dict[str, str]:
+    text = json.dumps(asdict(run.settings), sort_keys=True, default=str)
+    return {
+        "settings": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
+        "engine": version("scenematch"),
+    }
+
+
+def _fingerprints(inputs: Inputs) -> dict[str, str]:
+    """A hash of the content of each input; no stamp of a file has to be trusted."""
+    files = {name: getattr(inputs, name) for name in ("map", "surface", "camera", "frames", "telemetry", "truth")}
+    prints = {name: _fingerprint(path) for name, path in files.items() if path is not None}
+    return prints if inputs.map_sigma_m is None else prints | {"map_sigma_m": repr(inputs.map_sigma_m)}
+
+
+@cache
+def _fingerprint(path: Path) -> str:
+    """Of a file's bytes, or of all the files in a folder with their names."""
+    digest = hashlib.blake2b(digest_size=16)
+    if path.is_file():
+        with path.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    else:
+        for file in sorted(file for file in path.rglob("*") if file.is_file()):
+            digest.update(f"{file.relative_to(path).as_posix()} {_fingerprint(file)}\n".encode())
+    return digest.hexdigest()

@@ -1,0 +1,153 @@
+"""A map in pieces, laid together into one GeoTIFF strip by strip, whatever its size."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engine.errors import MapError, OptionError
+from engine.tiles import driver_of
+
+_STRIP_PX = 512
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A picture of a part of the map, north up.
+
+    Attributes:
+        path: the picture, uint8.
+        left: edge in the mosaic's coordinate system, as are the next three; the outer edges of the outer pixels.
+        top: see left.
+        right: see left.
+        bottom: see left.
+    """
+
+    path: Path
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mosaic:
+    """Pieces of one map; where two overlap, the later one counts.
+
+    Attributes:
+        pieces: at least one.
+        epsg: of their coordinates.
+    """
+
+    pieces: Sequence[Piece]
+    epsg: int
+
+
+def write_mosaic(path: Path, mosaic: Mosaic) -> None:
+    """Write the pieces as one tiled GeoTIFF with their median pixel, resampled where theirs is another.
+
+    What no piece covers is marked by a mask.
+
+    Raises:
+        MapError: a piece cannot be read, or the file cannot be written.
+        OptionError: a piece has no area, or is no picture of 8 bits.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.transform import Affine
+
+    try:
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+            step_x, step_y = np.median([_pixel(piece) for piece in mosaic.pieces], axis=0)
+            left, top = min(p.left for p in mosaic.pieces), max(p.top for p in mosaic.pieces)
+            right, bottom = max(p.right for p in mosaic.pieces), min(p.bottom for p in mosaic.pieces)
+            width, height = math.ceil((right - left) / step_x - 1e-6), math.ceil((top - bottom) / step_y - 1e-6)
+            place = Affine(step_x, 0.0, left, 0.0, -step_y, top)
+            profile: dict[str, Any] = {
+                "driver": "GTiff", "width": width, "height": height, "count": 3, "dtype": "uint8", "tiled": True,
+                "crs": rasterio.CRS.from_epsg(mosaic.epsg), "transform": place,
+                "photometric": "RGB", "BIGTIFF": "IF_SAFER", "SPARSE_OK": "TRUE",
+            }  # fmt: skip
+            with rasterio.open(path, "w", **profile) as file:
+                for piece in mosaic.pieces:
+                    corner = (round((piece.left - left) / step_x), round((top - piece.top) / step_y))
+                    size = (round((piece.right - piece.left) / step_x), round((piece.top - piece.bottom) / step_y))
+                    _paste(file, piece, corner, size)
+    except OptionError:
+        raise
+    except (RasterioError, OSError, ValueError) as error:
+        raise MapError(f"{path}: cannot be laid together: {str(error).splitlines()[0]}") from None
+
+
+def size_px(path: Path) -> tuple[int, int]:
+    """Columns and rows of a picture.
+
+    Raises:
+        MapError: it cannot be read.
+    """
+    from rasterio.errors import RasterioError
+
+    try:
+        with _open(path) as source:
+            return source.width, source.height
+    except (RasterioError, OSError) as error:
+        raise MapError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
+
+
+def own_edges(path: Path, epsg: int) -> tuple[float, float, float, float] | None:
+    """Left, top, right and bottom as the file itself has them in this system, or None."""
+    with _open(path) as source:
+        if source.crs is None or source.crs.to_epsg() != epsg:
+            return None
+        bounds = source.bounds
+        return bounds.left, bounds.top, bounds.right, bounds.bottom
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    """A picture, by what its content says that it is; a VRT could point to any file or address."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    driver = driver_of(path, "map")
+    if driver == "VRT":
+        raise MapError(f"{path}: expected a picture, got a VRT")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, driver=driver) as source:
+            yield source
+
+
+def _pixel(piece: Piece) -> tuple[float, float]:
+    """Width and height of a pixel in the mosaic's coordinates."""
+    if not (piece.left < piece.right and piece.bottom < piece.top):
+        raise OptionError(f"{piece.path}: expected left < right and bottom < top, got {piece}")
+    with _open(piece.path) as source:
+        if source.dtypes[0] != "uint8":
+            raise OptionError(f"{piece.path}: expected pixels of uint8, got {source.dtypes[0]}")
+        return (piece.right - piece.left) / source.width, (piece.top - piece.bottom) / source.height
+
+
+def _paste(file: Any, piece: Piece, corner: tuple[int, int], size: tuple[int, int]) -> None:
+    """Write one piece, a strip at a time."""
+    from rasterio.enums import Resampling
+    from rasterio.windows import Window
+
+    width, height = min(size[0], file.width - corner[0]), min(size[1], file.height - corner[1])
+    with _open(piece.path) as source:
+        bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
+        scale_x, scale_y = source.width / size[0], source.height / size[1]
+        for row in range(0, height, _STRIP_PX):
+            rows = min(_STRIP_PX, height - row)
+            window = Window(0, row * scale_y, width * scale_x, rows * scale_y)
+            data = source.read(bands, window=window, out_shape=(3, rows, width), resampling=Resampling.bilinear)
+            target = Window(corner[0], corner[1] + row, width, rows)
+            file.write(data, window=target)
+            file.write_mask(np.full((rows, width), 255, np.uint8), window=target)

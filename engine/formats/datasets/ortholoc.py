@@ -1,0 +1,80 @@
+"""OrthoLoC: single photographs with an orthophoto, a surface model and an exact pose each, in local metres.
+
+Layout (https://github.com/deepscenario/OrthoLoC): a file ``L01_R0000.npz`` a sample, of which are read
+
+    image_query    (H, W, 3)    the photograph
+    image_dop      (h, w, 3)    the orthophoto
+    dsm            (h, w, 3)    easting, northing and height of each of its pixels, NaN where unknown
+    intrinsics     (3, 3)       of the photograph
+    extrinsics     (3, 4)       from the world to the camera
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.errors import TelemetryError
+from engine.formats.datasets.singles import Array, Place, Single, picture_of, read_arrays
+from engine.geo import attitude_from_rotation
+from engine.types import Attitude
+
+_NAMES = ("image_query", "image_dop", "dsm", "intrinsics", "extrinsics")
+_OFF_GRID = 0.05  # pixels by which the places of a regular grid may be off it
+
+
+def find_ortholoc(root: Path) -> list[Path]:
+    """The samples in a folder, in the order of their names."""
+    return sorted(root.glob("L*.npz"))
+
+
+def read_ortholoc(path: Path) -> tuple[Single, Place]:
+    """Read one sample.
+
+    Raises:
+        TelemetryError: it is not of the layout.
+        CalibrationError: its intrinsics are none.
+    """
+    arrays = read_arrays(path, _NAMES)
+    image = picture_of(arrays["image_query"], path, "image_query")
+    ortho = picture_of(arrays["image_dop"], path, "image_dop")
+    world, pose = (np.asarray(arrays[name], dtype=np.float64) for name in ("dsm", "extrinsics"))
+    if world.shape != ortho.shape or pose.shape != (3, 4):
+        raise TelemetryError(
+            f"{path}: expected dsm as image_dop and extrinsics (3, 4), got {world.shape}, {pose.shape}"
+        )
+    pixel_to_m, origin = _grid(world, path)
+    rotation = pose[:, :3]
+    camera = Camera(image.shape[1], image.shape[0], np.asarray(arrays["intrinsics"], dtype=np.float64))
+    position_m = -rotation.T @ pose[:, 3]
+    attitude = attitude_from_rotation(rotation.T @ camera.mount.T)
+    single = Single(
+        name=path.stem,
+        image=image,
+        camera=camera,
+        position_m=position_m - (*origin, 0.0),
+        attitude=Attitude(*attitude),
+    )
+    heights_m = world[:, :, 2].astype(np.float32)
+    return single, Place(picture=ortho, pixel_to_m=pixel_to_m, surface_m=heights_m, surface_to_m=pixel_to_m)
+
+
+def _grid(world: Array, path: Path) -> tuple[Array, NDArray[np.float64]]:
+    """Where pixels lie about the middle of the map, and where that lies in the file's metres."""
+    known = np.isfinite(world[:, :, :2]).all(axis=2)
+    y, x = np.nonzero(known)
+    if len(x) < 3:
+        raise TelemetryError(f"{path}: dsm: expected places of its pixels, got {len(x)} that are finite")
+    origin = world[known][:, :2].mean(axis=0)
+    design = np.column_stack([x, y, np.ones(len(x))])
+    places_m = world[known][:, :2] - origin
+    matrix: Array = np.asarray(np.linalg.lstsq(design, places_m, rcond=None)[0].T, dtype=np.float64)
+    off_px = float(np.abs(design @ matrix.T - places_m).max() / np.sqrt(abs(np.linalg.det(matrix[:, :2])) or 1.0))
+    if not off_px <= _OFF_GRID:
+        raise TelemetryError(
+            f"{path}: dsm: expected places on a regular grid, got some {off_px:.2f} pixels off it"
+        )
+    return matrix, origin
