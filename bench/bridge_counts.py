@@ -35,7 +35,7 @@ class Growth:
     seen: list[tuple[int, int, int, int]] = field(default_factory=list)
 
     def look(self, messages: int, *, collect: bool = True) -> None:
-        """Look, after a collection: that holds Python's lock for 0.1 s and more, and makes a frame of real time late."""
+        """Look, after a collection, which holds Python's lock for so long that a frame of real time is late."""
         if collect:
             gc.collect()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
