@@ -296,7 +296,8 @@ def section(flown: dict[str, Any], real: dict[str, Any]) -> list[str]:
         *table(["the hour, scripted matcher, 5 Hz", ""], hour_rows(flown)),
         *paragraph(
             f"The minutes are in real time on the machine's own clock, the built-in flight forth and back with "
-            f"the real matcher (`{real['method']}`): {machine()}, one thread; what else the machine did, the load says."
+            f"the real matcher (`{real['method']}`): {machine()}, one thread. What else the machine did, the load "
+            "says."
         ),
         *table(["real time, real matcher, 5 Hz", ""], real_rows(real)),
     ]
