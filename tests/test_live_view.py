@@ -318,6 +318,7 @@ def test_the_viewer_draws_it_without_a_complaint(runs, tmp_path):
     assert not complaints
     shown = cv2.cvtColor(cv2.imread(str(picture)), cv2.COLOR_BGR2RGB).astype(int)
     world, pictures = shown[:400, :720], shown[:440, 720:]
-    assert (np.abs(world - FIX_RGB).max(axis=2) < 40).sum() > 50  # the fixes above the map
+    one_dot_px = np.pi * 3.0**2
+    assert (np.abs(world - FIX_RGB).max(axis=2) < 40).sum() > 0.9 * one_dot_px  # the fixes above the map
     assert (np.ptp(world, axis=2) < 10).mean() > 0.5  # a grey map
     assert (np.ptp(pictures, axis=2) > 40).mean() > 0.02  # a frame and a surface in colour
