@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import TelemetryError
 from engine.formats.telemetry import TelemetryRow
+from engine.formats.truth import truth_at
 from engine.geo import wrap_heading_deg
 from engine.types import Truth
 
@@ -242,16 +243,7 @@ def truth_of(log: Log, *, utc: bool) -> list[Truth]:
     names = [str(i) for i in range(len(moments))]
     rows, _ = telemetry_at(log, [int(stamp_ns) for stamp_ns in moments], names)
     return [
-        Truth(
-            timestamp_ns=row.timestamp_ns + shift_ns,
-            lat_deg=row.lat_deg,
-            lon_deg=row.lon_deg,
-            alt_amsl_m=row.alt_amsl_m,
-            height_agl_m=row.height_agl_m,
-            roll_deg=row.roll_deg,
-            pitch_deg=row.pitch_deg,
-            heading_deg=row.heading_deg,
-        )
+        truth_at(row, row.lat_deg, row.lon_deg, shift_ns)
         for row in rows
         if row.lat_deg is not None and row.lon_deg is not None
     ]

@@ -13,6 +13,7 @@ from engine.formats.telemetry import (
     HEADING,
     LONGITUDE,
     QUARTER_TURN,
+    TelemetryRow,
     cell_text,
     check_increasing,
     known_columns,
@@ -66,6 +67,20 @@ def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
     columns = known_columns(rows, _REQUIRED, tuple(_OPTIONAL))
     table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
     write_table(path, columns, table)
+
+
+def truth_at(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
+    """A row of telemetry as truth, at a place in degrees, with its stamp moved."""
+    return Truth(
+        timestamp_ns=row.timestamp_ns + shift_ns,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_amsl_m=row.alt_amsl_m,
+        height_agl_m=row.height_agl_m,
+        roll_deg=row.roll_deg,
+        pitch_deg=row.pitch_deg,
+        heading_deg=row.heading_deg,
+    )
 
 
 def interpolate_truth(rows: Sequence[Truth], timestamp_ns: int, max_gap_ns: int = MAX_GAP_NS) -> Truth | None:

@@ -18,9 +18,8 @@ from engine.errors import OptionError, TelemetryError
 from engine.formats.datasets.mosaic import Mosaic, write_mosaic
 from engine.formats.flight import camera_info
 from engine.formats.telemetry import TelemetryRow, write_telemetry
-from engine.formats.truth import write_truth
+from engine.formats.truth import truth_at, write_truth
 from engine.geo import wrap_heading_deg
-from engine.types import Truth
 
 DATUMS = ("agl", "amsl", "ellipsoid")
 """What a height is counted from: the ground below, the mean sea level, the WGS84 ellipsoid."""
@@ -151,7 +150,8 @@ def write_recording(out: Path, recording: Recording, told: Told) -> tuple[str, .
         )
     _link_frames(out / "frames", [shot.picture for shot, _ in shots])
     write_telemetry(out / "telemetry.csv", rows)
-    write_truth(out / "truth.csv", [_truth_row(row, shot) for row, (shot, _) in zip(rows, shots, strict=True)])
+    truth = [truth_at(row, shot.lat_deg, shot.lon_deg) for row, (shot, _) in zip(rows, shots, strict=True)]
+    write_truth(out / "truth.csv", truth)
     _write_camera(out / "camera.yaml", told.camera, shots[0][0].picture, recording.mount)
     _write_map(out / "map.tif", told.map or recording.map)
     if told.surface is not None:
@@ -200,19 +200,6 @@ def _telemetry_row(shot: Shot, stamp_ns: int, datum: str | None, told: Told, *, 
         lat_deg=shot.lat_deg if first else None,
         lon_deg=shot.lon_deg if first else None,
         sigma_m=START_SIGMA_M if first else None,
-    )
-
-
-def _truth_row(row: TelemetryRow, shot: Shot) -> Truth:
-    return Truth(
-        timestamp_ns=row.timestamp_ns,
-        lat_deg=shot.lat_deg,
-        lon_deg=shot.lon_deg,
-        alt_amsl_m=row.alt_amsl_m,
-        height_agl_m=row.height_agl_m,
-        roll_deg=row.roll_deg,
-        pitch_deg=row.pitch_deg,
-        heading_deg=row.heading_deg,
     )
 
 
