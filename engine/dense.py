@@ -107,23 +107,6 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class DenseFit:
-    """A refined pose.
-
-    Attributes:
-        pose: where picture and map agree best.
-        covariance: (8, 8) of the parameters.
-        correlation: of picture and map at the samples, before the last step.
-        settled: whether the last step was a small one.
-    """
-
-    pose: Pose
-    covariance: Array
-    correlation: float
-    settled: bool
-
-
-@dataclass(frozen=True, slots=True)
 class _Look:
     """All samples as a pose sees them.
 
@@ -162,6 +145,23 @@ class _Look:
             out[3 + i] = x[j] * by_places[k] - x[k] * by_places[j]
         out[6:] = -out[2] * self.offsets_m
         return out
+
+
+@dataclass(frozen=True, slots=True)
+class DenseFit:
+    """A refined pose.
+
+    Attributes:
+        pose: where picture and map agree best.
+        correlation: of picture and map at the samples, before the last step.
+        settled: whether the last step was a small one.
+        look: what was seen before the last step.
+    """
+
+    pose: Pose
+    correlation: float
+    settled: bool
+    look: _Look
 
 
 def picture_of(levels: Image, matrix: Array) -> Picture:
@@ -212,30 +212,18 @@ def refine(
         pose = _moved(pose, step)
         settled = sigmas_squared < last_step_sigmas**2
         if settled or not left:
-            covariance = _covariance(look, belief)
-            return None if covariance is None else DenseFit(pose, covariance, look.correlation, settled)
+            return DenseFit(pose, look.correlation, settled, look)
     return None
 
 
-def _step(look: _Look, pose: Pose, belief: Belief) -> tuple[Array, float] | None:
-    """The Gauss-Newton step (8,), and in standard deviations, squared."""
-    # The mean of both gradients finds its way from farther than that of the picture alone.
-    derivatives = look.derivatives(0.5 * (look.shown + look.expected))
-    weighted = derivatives * (look.weights / (_EXCESS * look.variance))
-    inverse = _inverse(weighted @ derivatives.T + belief.precision)
-    if inverse is None:
-        return None
-    gradient = -weighted @ look.differences - belief.precision @ _away(pose, belief.pose)
-    step = inverse @ gradient
-    return step, float(step @ gradient)
+def covariance_of(fit: DenseFit, belief: Belief) -> Array | None:
+    """(8, 8) of a refined pose, or None where picture and map leave it undetermined.
 
-
-def _covariance(look: _Look, belief: Belief) -> Array | None:
-    """(8, 8) of the pose: the scatter of what the samples pull, over the squared pull of what both pictures show.
-
-    Parts of the picture that the map does not show have gradients too, which say nothing of the pose: of the
-    picture's information counts the share that its gradients have in common with the map's.
+    The scatter of what the samples pull, over the squared pull of what both pictures show. Parts of the picture that
+    the map does not show have gradients too, which say nothing of the pose: of the picture's information counts the
+    share that its gradients have in common with the map's.
     """
+    look = fit.look
     shown, expected = look.derivatives(look.shown), look.derivatives(look.expected)
     weighted = shown * look.weights
     information = weighted @ shown.T
@@ -255,6 +243,19 @@ def _covariance(look: _Look, belief: Belief) -> Array | None:
         return None
     share = min(1.0, in_common**2 / (size(information) * of_map))
     return _inverse(information * (share / (_EXCESS * scatter)) + belief.precision)
+
+
+def _step(look: _Look, pose: Pose, belief: Belief) -> tuple[Array, float] | None:
+    """The Gauss-Newton step (8,), and in standard deviations, squared."""
+    # The mean of both gradients finds its way from farther than that of the picture alone.
+    derivatives = look.derivatives(0.5 * (look.shown + look.expected))
+    weighted = derivatives * (look.weights / (_EXCESS * look.variance))
+    inverse = _inverse(weighted @ derivatives.T + belief.precision)
+    if inverse is None:
+        return None
+    gradient = -weighted @ look.differences - belief.precision @ _away(pose, belief.pose)
+    step = inverse @ gradient
+    return step, float(step @ gradient)
 
 
 def _inverse(matrix: Array) -> Array | None:

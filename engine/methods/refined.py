@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.align import enhance
-from engine.dense import Belief, DenseFit, Picture, Pose, correlation_at, picture_of, refine
+from engine.dense import Belief, DenseFit, Picture, Pose, correlation_at, covariance_of, picture_of, refine
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.integrity import AssumedErrors
 from engine.methods.laid import NccOptions
@@ -49,8 +49,9 @@ def improve(query: Query, fix: Fix, samples: SampleMap, options: NccOptions) -> 
     with query.watch.stage("dense"):
         fit = _through_levels(query, belief, samples, options, _COARSER) if _told_tilt(query) else None
         fit = fit or _through_levels(query, belief, samples, options, _COARSER_YET)
-    if fit is not None:
-        covariance = fit.covariance[:3, :3] + options.errors.map_m**2 * np.eye(3)
+        pose_covariance = None if fit is None else covariance_of(fit, belief)
+    if fit is not None and pose_covariance is not None:
+        covariance = pose_covariance[:3, :3] + options.errors.map_m**2 * np.eye(3)
         covariance[2, 2] += (_HEIGHT_SHARE * (fit.pose.center_m[2] - query.site.ground_m)) ** 2
         moved = (fit.pose.center_m - belief.pose.center_m)[:2]
         allowed = fix.covariance_m2[:2, :2] + covariance[:2, :2]
