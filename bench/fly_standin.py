@@ -1,8 +1,8 @@
 """A stand-in autopilot that flies a flight folder in real time, for a bridge beside it on the bench.
 
 ``python -m bench.fly_standin FLIGHT [--port 14550] [--firmware ardupilot|px4] [--seconds S]``, before or after the
-bridge: it takes off when a bridge listens. FLIGHT holds a ``truth.csv`` with heights and attitude, as ``scenematch
-simulate`` writes it, and the map that it was flown over lies about where it was.
+bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT holds a ``telemetry.csv`` and
+a ``truth.csv`` with heights and attitude, as ``scenematch simulate`` writes them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.standin import MS, Agenda, RealClock, S, Standin, State
+from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
 from engine.geo import LocalFrame
 
@@ -27,11 +28,12 @@ _REPORT_S = 5.0
 
 
 def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]:
-    """The truth of a flight folder: where it was so many seconds after its start, about where, and how long."""
+    """The truth of a flight folder: where it was so long after its first picture, about where, and for how long."""
     rows = read_truth(flight / "truth.csv")
+    first_ns = read_telemetry(flight / "telemetry.csv")[0].timestamp_ns
     place = LocalFrame(rows[0].lat_deg, rows[0].lon_deg)
     enu = np.array([place.enu_from_geodetic(row.lat_deg, row.lon_deg) for row in rows])
-    time_s = np.array([(row.timestamp_ns - rows[0].timestamp_ns) * 1e-9 for row in rows])
+    time_s = np.array([(row.timestamp_ns - first_ns) * 1e-9 for row in rows])
     velocity = np.gradient(enu, time_s, axis=0)
     headings = np.rad2deg(np.unwrap(np.deg2rad([row.heading_deg for row in rows])))
     attitude = [[row.height_agl_m, row.roll_deg, row.pitch_deg] for row in rows]

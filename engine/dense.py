@@ -219,9 +219,9 @@ def refine(
 def covariance_of(fit: DenseFit, belief: Belief) -> Array | None:
     """(8, 8) of a refined pose, or None where picture and map leave it undetermined.
 
-    The scatter of what the samples pull, over the squared pull of what both pictures show. Parts of the picture that
-    the map does not show have gradients too, which say nothing of the pose: of the picture's information counts the
-    share that its gradients have in common with the map's.
+    The scatter of what the samples pull, over the squared pull of what both pictures show. Parts of the picture
+    that the map does not show have gradients too, which say nothing of the pose: of the picture's information
+    counts the share that its gradients have in common with the map's.
     """
     look = fit.look
     shown, expected = look.derivatives(look.shown), look.derivatives(look.expected)

@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -39,6 +40,7 @@ from engine.adapters.mavlink_out import (
 )
 from engine.adapters.packets import Decoder, Encoder, read_key, signing_time
 from engine.adapters.parameters import parameter_file
+from engine.adapters.pictures import replay
 from engine.adapters.vehicle import Origin, Series, Vehicle, north_east_m
 from engine.cli.app import run as main
 from engine.errors import OptionError
@@ -616,6 +618,20 @@ class Matched:
     def update(self, frame, prior=None, budget=None):
         self.frames.append(frame)
         return self.result or fix(timestamp_ns=frame.timestamp_ns)
+
+
+def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
+    for index in range(2):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.zeros((8, 8), np.uint8))
+    told_ns = []
+
+    def wait():
+        time.sleep(0.2)
+        told_ns.append(time.monotonic_ns())
+
+    first, second = (captured_ns for _, captured_ns in replay(tmp_path, None, rate_hz=50.0, wait=wait))
+    assert [first >= told for told in told_ns] == [True]
+    assert second - first == 20_000_000
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,16 @@ Picture = tuple[NDArray[np.uint8], int]
 """(H, W, 3) RGB, and when it was captured on ``time.monotonic_ns``."""
 
 
-def replay(frames: Path, telemetry: Path | None, *, rate_hz: float) -> Iterator[Picture]:
+def replay(
+    frames: Path, telemetry: Path | None, *, rate_hz: float, wait: Callable[[], None] | None = None
+) -> Iterator[Picture]:
     """A folder or video again, each picture when its turn has come.
 
     Args:
         frames: pictures or video.
         telemetry: telemetry.csv, whose stamps set the pace; without it ``rate_hz`` does.
         rate_hz: pictures a second where there are no stamps.
+        wait: called when the first picture is at hand; the pace begins when it returns.
 
     Raises:
         TelemetryError: it cannot be read.
@@ -33,6 +36,8 @@ def replay(frames: Path, telemetry: Path | None, *, rate_hz: float) -> Iterator[
         if stamp_ns is None:
             stamp_ns = round(index * 1e9 / rate_hz)
         if index == 0:
+            if wait is not None:
+                wait()
             begin_ns, first_ns = time.monotonic_ns(), stamp_ns
         captured_ns = begin_ns + stamp_ns - first_ns
         time.sleep(max(0.0, (captured_ns - time.monotonic_ns()) * 1e-9))

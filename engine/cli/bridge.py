@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from engine.adapters.mavlink_out import Outgoing
 
 _SAY_EVERY_S = 5.0
+_HEAR_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +54,10 @@ class Inputs:
         if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise OptionError(f"--rate-hz: expected a number above 0, got {self.rate_hz:g}")
 
-    def pictures(self) -> Iterator[Picture]:
-        """Pictures as they are captured."""
+    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[Picture]:
+        """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
         if self.frames is not None:
-            return replay(self.frames, self.telemetry, rate_hz=self.rate_hz)
+            return replay(self.frames, self.telemetry, rate_hz=self.rate_hz, wait=wait)
         assert self.source is not None  # one of the two is given
         return capture(self.source, exposure_to_grab_ms=self.exposure_to_grab_ms)
 
@@ -122,7 +123,8 @@ def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool,
         except OSError as error:
             raise BackendError(f"--connect: {wire.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
-            _follow(bridge, inputs.pictures(), camera, matching.seconds)
+            pictures = inputs.pictures(lambda: _wait_for_autopilot(bridge))
+            _follow(bridge, pictures, camera, matching.seconds)
             status = bridge.status
     console.facts(asdict(status), as_json, title=f"{options.kind} to {wire.connect}")
 
@@ -186,6 +188,15 @@ def _follow(bridge: Bridge, pictures: Iterator[Picture], camera: Camera, seconds
     if count == 0:
         raise TelemetryError("--frames: expected at least one picture, got none")
     _wait_for_answers(lambda: bridge.status.answered, count)
+
+
+def _wait_for_autopilot(bridge: Bridge) -> None:
+    """A flight that is played begins with the autopilot's: where it was earlier, nobody would have told."""
+    if not bridge.connected:
+        console.say(f"the pictures wait for the autopilot, {_HEAR_S:g} s at most")
+    until = time.monotonic() + _HEAR_S
+    while not bridge.connected and time.monotonic() < until:
+        time.sleep(0.002)
 
 
 def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
