@@ -28,7 +28,7 @@ _REPORT_S = 5.0
 
 
 def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]:
-    """The truth of a flight folder: where it was so long after its first picture, about where, and for how long."""
+    """The truth of a flight folder: where it was so long after its first picture, about where, how long."""
     rows = read_truth(flight / "truth.csv")
     first_ns = read_telemetry(flight / "telemetry.csv")[0].timestamp_ns
     place = LocalFrame(rows[0].lat_deg, rows[0].lon_deg)
