@@ -21,7 +21,6 @@ References:
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -36,9 +35,6 @@ Image = NDArray[np.float32]
 PARAMETERS = 8
 LEAST_SAMPLES = 60
 _STEPS = 12  # Gauss-Newton steps at most; three or four are usual
-_BIWEIGHT = 4.685  # of the residuals' deviation: where Tukey's biweight gives a sample no weight
-_MAD = 1.4826  # deviation of normal noise over its median absolute value
-_THINNED = 3  # every so many differences tell their median
 _EDGE_PX = 2.0  # along the picture's edge nothing is sampled
 # What the samples pull is summed over so many cells of the picture, squared: how the sums scatter says how far
 # neighbours share what the map does not show.
@@ -100,7 +96,7 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture to sample: (H, W, 3) its levels and their gradients to the right and down, and its pinhole."""
+    """What the camera saw: (H, W) grey levels, enhanced as the map is, and the (3, 3) pinhole that they obey."""
 
     levels: Image
     matrix: Array
@@ -139,12 +135,9 @@ class _Look:
 
     def derivatives(self, by_places: Array) -> Array:
         """(8, N) of the differences by the parameters, from those by the places (3, N)."""
-        out, x = np.empty((PARAMETERS, by_places.shape[1])), self.places
-        out[:3] = -self.rotation.T @ by_places
-        for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):  # x cross the derivatives
-            out[3 + i] = x[j] * by_places[k] - x[k] * by_places[j]
-        out[6:] = -out[2] * self.offsets_m
-        return out
+        from engine.kernels import dense_loops
+
+        return np.asarray(dense_loops.derivatives(by_places, self.places, self.offsets_m, self.rotation))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,18 +155,6 @@ class DenseFit:
     correlation: float
     settled: bool
     look: _Look
-
-
-def picture_of(levels: Image, matrix: Array) -> Picture:
-    """A picture (H, W) with its gradients by central differences.
-
-    Args:
-        levels: enhanced as the map is.
-        matrix: (3, 3) pinhole that it obeys.
-    """
-    across = cv2.Sobel(levels, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    down = cv2.Sobel(levels, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
-    return Picture(np.asarray(cv2.merge([levels, across, down]), np.float32), matrix)
 
 
 def correlation_at(picture: Picture, samples: Samples, pose: Pose) -> float:
@@ -276,54 +257,15 @@ def _away(pose: Pose, other: Pose) -> Array:
 
 def _look(picture: Picture, samples: Samples, offset_m: Array, pose: Pose, pivot: Pose) -> _Look | None:
     """Project the samples, which lie (3, N) metres from the slope's pivot, and compare what is seen there."""
-    away = offset_m + (pivot.center_m - pose.center_m)[:, None]
-    away[2] += pose.slope @ offset_m[:2]
-    x = pose.rotation @ away
-    near = 1.0 / np.maximum(x[2], 1e-6)
-    focal, middle = picture.matrix[:2, :2], picture.matrix[:2, 2:]
-    tangents = x[:2] * near
-    at = focal @ tangents + middle
-    low, (height, width) = _EDGE_PX, picture.levels.shape[:2]
-    high = np.array([[width], [height]]) - 1.0 - _EDGE_PX
-    seen = ((at > low) & (at < high)).all(axis=0) & (x[2] > 0)
-    weights = samples.weights * seen
-    if np.count_nonzero(weights) < LEAST_SAMPLES:
+    from engine.kernels import dense_loops  # numba takes a while to import
+
+    rotation = np.ascontiguousarray(pose.rotation)  # of one layout, for which the loops are compiled
+    levels, places, shown, expected, weights, cells, count = dense_loops.seen(
+        picture.levels, picture.matrix, rotation, pose.center_m, pose.slope,
+        offset_m, pivot.center_m, samples.gradients, samples.weights, _EDGE_PX, _CELLS,
+    )  # fmt: skip
+    if count < LEAST_SAMPLES:
         return None
-    places = np.clip(at, -1e4, 1e4).astype(np.float32)[:, None]
-    level, across, down = cv2.remap(picture.levels, *places, cv2.INTER_LINEAR)[0].T.astype(np.float64)
-    differences, weights, correlation, gain = _compare(level, samples.values, weights)
-    shown = np.empty_like(x)
-    shown[:2] = focal.T @ np.stack([across, down]) * near
-    shown[2] = -(shown[0] * tangents[0] + shown[1] * tangents[1])
-    expected = np.empty_like(x)  # by the places on the map first; along the ray nothing changes
-    expected[:2] = gain * samples.gradients.T
-    expected[2] = -(expected[0] * away[0] + expected[1] * away[1]) / np.minimum(away[2], -1e-6)
-    expected = np.asarray(pose.rotation @ expected, np.float64)
-    cells = (np.clip(at / high, 0.0, 0.999) * _CELLS).astype(np.intp)
-    cells = cells[1] * _CELLS + cells[0]
-    return _Look(differences, x, offset_m[:2], pose.rotation, shown, expected, weights, cells, correlation)
-
-
-def _compare(level: Array, value: Array, weights: Array) -> tuple[Array, Array, float, float]:
-    """Differences between picture and map up to gain and bias, robust weights, the correlation and the gain."""
-    differences, correlation, _ = _up_to_gain(level, value, weights)
-    agreement = _biweight(differences, weights)
-    differences, _, gain = _up_to_gain(level, value, agreement)  # what does not belong there sets no gain
-    return differences, _biweight(differences, weights), correlation, gain
-
-
-def _up_to_gain(level: Array, value: Array, weights: Array) -> tuple[Array, float, float]:
-    """Differences, correlation, gain."""
-    total = weights.sum()
-    level = level - weights @ level / total
-    value = value - weights @ value / total
-    weighted = weights * value
-    both, own, other = float(weighted @ level), float(weights @ (level * level)), float(weighted @ value)
-    gain = both / max(other, 1e-12)
-    return level - gain * value, both / max(math.sqrt(own * other), 1e-12), gain
-
-
-def _biweight(differences: Array, weights: Array) -> Array:
-    typical = float(np.median(np.abs(differences[weights > 0][::_THINNED])))
-    agreement = np.maximum(1.0 - (differences / (_BIWEIGHT * _MAD * max(typical, 1e-6))) ** 2, 0.0)
-    return weights * agreement * agreement
+    differences, weights, correlation, gain = dense_loops.compare(levels, samples.values, weights)
+    expected *= gain
+    return _Look(differences, places, offset_m[:2], rotation, shown, expected, weights, cells, correlation)

@@ -18,7 +18,6 @@ References:
 """
 
 import math
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,12 +124,6 @@ def sift(
 def plans_made() -> int:
     """How many sizes of image were planned for so far; a flight of one camera needs a few."""
     return make_plan.cache_info().misses
-
-
-def loops_compiled() -> int:
-    """How many loops were compiled, or loaded from where they are kept, so far."""
-    compiled = sys.modules.get("engine.kernels.compiled")
-    return 0 if compiled is None else compiled.count()
 
 
 def _fields(features: Features) -> tuple[Tensor, ...]:

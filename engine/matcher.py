@@ -14,8 +14,9 @@ from engine.budget import Budget, Deadline
 from engine.camera import Camera
 from engine.costs import Costs
 from engine.errors import OptionError
-from engine.features import loops_compiled, plans_made
+from engine.features import plans_made
 from engine.integrity import told_by_map
+from engine.kernels import loops_compiled
 from engine.landmarks import LandmarkMap
 from engine.methods import explained, ladder, paper
 from engine.methods.explained import Explanation

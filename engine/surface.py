@@ -31,7 +31,8 @@ MAX_SPAN = 6
 MAX_PATCHES = 16
 """So many patches are kept, of at most 9 MiB."""
 _Patch = tuple[int, int, int, int]  # first row and column of tiles, and the last ones
-_PLACES = 15  # a side of the lattice on which a plane is looked for
+_LATTICE = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 15)] * 2), axis=-1).reshape(-1, 2)
+"""Where heights are looked at to find a plane, as shares of the way to the sides of the square."""
 _ROUNDS = 8
 _ON_PLANE_M = 0.3  # heights closer to a plane than this lie on it
 
@@ -123,13 +124,13 @@ class Surface:
             The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None where less
             than half of the square is known.
         """
-        steps = np.linspace(-1.0, 1.0, _PLACES)
-        offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        heights_m = self.sample(map_xy + offsets * reach_px)
+        from engine.kernels.lower_plane import lower_plane  # numba takes a while to import
+
+        heights_m = self.sample(map_xy + _LATTICE * reach_px)
         known = np.isfinite(heights_m)
         if 2 * np.count_nonzero(known) < len(known):
             return None
-        plane = _lower_plane(offsets[known], heights_m[known])
+        plane = lower_plane(_LATTICE[known], heights_m[known], GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
         return float(plane[0]), plane[1:] / reach_px
 
     @property
@@ -159,18 +160,3 @@ def open_surface(source: Source, grid: Grid) -> tuple[Surface, Grid]:
         tiles = HeightTiles(source, part)
         surface = Surface(tiles, warp_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
     return surface, lies
-
-
-def _lower_plane(offsets: Array, heights_m: Array) -> Array:
-    """Level and rise per offset (3,) of the plane with a fifth of the heights (N,) at offsets (N, 2) below it.
-
-    Quantile regression (Koenker and Bassett, Econometrica 1978) by reweighted least squares.
-    """
-    terms = np.column_stack([np.ones(len(offsets)), offsets])
-    share, weights, plane = GROUND_PERCENT / 100.0, np.ones(len(offsets)), np.zeros(3)
-    for _ in range(_ROUNDS):
-        weighted = terms.T * weights
-        plane = np.linalg.solve(weighted @ terms, weighted @ heights_m).astype(np.float64)
-        above = heights_m - terms @ plane
-        weights = np.where(above > 0.0, share, 1.0 - share) / np.maximum(np.abs(above), _ON_PLANE_M)
-    return plane

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from engine import Fix, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.dense import Belief, Pose, Samples, correlation_at, covariance_of, picture_of, refine
+from engine.dense import Belief, Picture, Pose, Samples, correlation_at, covariance_of, refine
 from engine.errors import ShapeError
 from engine.geo import enu_from_body
 from engine.methods.laid import NccOptions
@@ -63,7 +63,7 @@ def believed(pose, turn_deg=(0.0, 0.0, 0.0), moved_m=(0.0, 0.0, 0.0), precision=
 def test_all_six_degrees_are_found_again_whatever_gain_and_bias(scene, camera, turn_deg, gain, bias):
     pose, samples, levels = scene
     belief = believed(pose, turn_deg, moved_m=(0.8, -0.6, 1.0))
-    picture = picture_of(gain * levels + np.float32(bias), camera.matrix)
+    picture = Picture(gain * levels + np.float32(bias), camera.matrix)
     fit = refine(picture, samples, belief.pose, belief)
     assert fit is not None
     assert np.abs(fit.pose.center_m - pose.center_m).max() < 0.1
@@ -78,7 +78,7 @@ def test_outliers_do_not_move_the_pose(scene, camera):
     wrong = rng.random(len(samples.values)) < 0.2
     values = np.where(wrong, rng.uniform(-3, 3, len(wrong)), samples.values)
     belief = believed(pose, (0.3, 0.2, -0.4), moved_m=(0.5, 0.5, -0.5))
-    fit = refine(picture_of(levels, camera.matrix), replace(samples, values=values), belief.pose, belief)
+    fit = refine(Picture(levels, camera.matrix), replace(samples, values=values), belief.pose, belief)
     assert fit is not None
     assert np.abs(fit.pose.center_m - pose.center_m).max() < 0.3
 
@@ -90,7 +90,7 @@ def test_a_slope_nobody_told_of_is_found_where_the_attitude_is_known(scene, came
     points[:, 2] -= (points[:, :2] - pose.center_m[:2]) @ slope
     known = np.diag([0.0, 0.0, 1e6, 1e10, 1e10, 1e10, 100.0, 100.0])
     belief = believed(pose, precision=known)
-    fit = refine(picture_of(levels, camera.matrix), replace(samples, points_m=points), belief.pose, belief)
+    fit = refine(Picture(levels, camera.matrix), replace(samples, points_m=points), belief.pose, belief)
     assert fit is not None
     np.testing.assert_allclose(fit.pose.slope, slope, atol=3e-3)
 
@@ -103,7 +103,7 @@ def test_the_covariance_knows_that_tilt_and_slope_look_alike(camera):
         precision = np.diag([0.0, 0.0, 1.0, *[np.radians(0.5) ** -2] * 3, slope_precision, slope_precision])
         belief = believed(pose, precision=precision)
         noisy = levels + np.random.default_rng(1).normal(0, 0.5, levels.shape).astype(np.float32)
-        fit = refine(picture_of(noisy, camera.matrix), samples, belief.pose, belief)
+        fit = refine(Picture(noisy, camera.matrix), samples, belief.pose, belief)
         assert fit is not None
         covariance = covariance_of(fit, belief)
         assert covariance is not None
@@ -121,7 +121,7 @@ def test_what_neighbours_share_widens_the_covariance(scene, camera):
     for name, radius_px in (("grain", 0.1), ("patches", 12.0)):
         noise = np.random.default_rng(1).normal(0, 1.0, levels.shape)
         noise = cv2.GaussianBlur(noise, (0, 0), radius_px)
-        picture = picture_of((levels + 0.5 * noise / noise.std()).astype(np.float32), camera.matrix)
+        picture = Picture((levels + 0.5 * noise / noise.std()).astype(np.float32), camera.matrix)
         fit = refine(picture, samples, belief.pose, belief)
         assert fit is not None
         covariance = covariance_of(fit, belief)
@@ -146,7 +146,7 @@ def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, fla
 
 def test_no_pose_from_samples_that_are_not_seen(scene, camera):
     pose, samples, levels = scene
-    picture = picture_of(levels, camera.matrix)
+    picture = Picture(levels, camera.matrix)
     away = believed(pose, moved_m=(1000.0, 0.0, 0.0))
     assert refine(picture, samples, away.pose, away) is None
     blind = replace(samples, weights=np.zeros(len(samples.weights)))

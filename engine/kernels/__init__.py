@@ -5,6 +5,7 @@ Tests compare every kernel with :mod:`engine.kernels.reference`, which is slow, 
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from importlib.util import find_spec
 
@@ -18,6 +19,7 @@ __all__ = [
     "halved",
     "integrals",
     "inverse_norm",
+    "loops_compiled",
     "masked_ncc_surface",
     "ncc_surface",
     "peak",
@@ -97,3 +99,9 @@ def _has_triton() -> bool:
 def halved(image: Tensor) -> Tensor:
     """Means of 2 x 2 pixels of (H, W) float32; an odd last row or column is left out."""
     return eager.halved(image)
+
+
+def loops_compiled() -> int:
+    """How many loops numba compiled, or loaded from where they are kept, so far; it is imported when needed."""
+    jit = sys.modules.get("engine.kernels.jit")
+    return 0 if jit is None else jit.count()

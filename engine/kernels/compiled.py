@@ -11,28 +11,15 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from engine.kernels.jit import compiled
 
 Filters = tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]
 
-_FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by nothing
 TAPS = 4
 """Taps of a filter that one pass over a row takes; filters are padded with zeros to a multiple of it."""
 _FITTED = 6  # x, y, growth, contrast, level, octave of a refined point
-
-
-def _compiled(function):
-    """Compile at the first call; the machine code is kept on disk where there is a folder for it."""
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)(function)
-    except RuntimeError:
-        return njit(nogil=True, error_model="numpy", fastmath=_FAST)(function)
-
-
-def count() -> int:
-    """How many versions of the loops were compiled or loaded so far."""
-    return sum(len(loop.signatures) for loop in (search, refine, angles, descriptors))
 
 
 @lru_cache(maxsize=128)
@@ -60,7 +47,7 @@ def filters(inputs: int, outputs: int, sigmas: tuple[float, ...], reach: tuple[i
     return weights.astype(np.float32), near, gains.astype(np.float32)
 
 
-@_compiled
+@compiled
 def search(source, across, down, buffer, place, rows, border, threshold):
     """Write the Gaussian levels of one picture's octave, and find the extrema of their differences.
 
@@ -107,12 +94,12 @@ def search(source, across, down, buffer, place, rows, border, threshold):
     return found[:count]
 
 
-@_compiled
+@compiled
 def _padding(reach):
     return reach.max() + TAPS
 
 
-@_compiled
+@compiled
 def _between_zeros(source, reach, first, end):
     """Rows that the filters of rows ``first`` to ``end`` take, zeros beyond the picture; number of the first."""
     height, width = source.shape
@@ -123,13 +110,13 @@ def _between_zeros(source, reach, first, end):
     return tall, start
 
 
-@_compiled
+@compiled
 def _taps(reach, up):
     """Taps of a filter, with the zeros behind them; of two phases the second lies one sample further on."""
     return (2 * reach + up + TAPS - 1) // TAPS * TAPS
 
 
-@_compiled
+@compiled
 def _down_rows(lines, tall, row, width, level, down, margin):
     """Filter the columns about a row of the source: a line for each phase, a margin of zeros on either side."""
     weights, reach, _ = down
@@ -142,7 +129,7 @@ def _down_rows(lines, tall, row, width, level, down, margin):
         _slide_both(first, second, tall, start, width, weights[level, 0], weights[level, 1], taps)
 
 
-@_compiled
+@compiled
 def _across_row(out, line, level, across, gain):
     """Filter a line of the source's width along itself, and make up for what lies beyond the edges."""
     weights, reach, gains = across
@@ -164,7 +151,7 @@ def _across_row(out, line, level, across, gain):
             out[x] *= gain
 
 
-@_compiled
+@compiled
 def _slide(out, values, start, stride, weights, taps):
     """out[m] = sum over k of weights[k] values[start + k stride + m]."""
     n = out.size
@@ -183,7 +170,7 @@ def _slide(out, values, start, stride, weights, taps):
                 out[m] += a * p[m] + b * q[m] + (c * r[m] + d * s[m])
 
 
-@_compiled
+@compiled
 def _slide_both(first, second, values, start, stride, even, odd, taps):
     """:func:`_slide` with two filters at once: what both take is read once."""
     n = first.size
@@ -205,7 +192,7 @@ def _slide_both(first, second, values, start, stride, even, odd, taps):
                 second[m] += e * p[m] + f * q[m] + (g * r[m] + h * s[m])
 
 
-@_compiled
+@compiled
 def _slide_double(out, values, start, even, odd, taps):
     """out[2m + p] = sum over k of the weights of phase p[k] times values[start + k + m]."""
     n = out.size // 2
@@ -230,7 +217,7 @@ def _slide_double(out, values, start, even, odd, taps):
         out[2 * n] = total
 
 
-@_compiled
+@compiled
 def _extrema_of_row(sizes, y, border, threshold, work, found, count):
     """Add to ``found`` the extrema of row y, whose |DoG| and those of its neighbours lie in ``sizes``."""
     highest, flags = work
@@ -262,7 +249,7 @@ def _extrema_of_row(sizes, y, border, threshold, work, found, count):
     return found, count
 
 
-@_compiled
+@compiled
 def refine(buffer, layout, voxels, limits, octave):
     """Fit a quadratic at voxels, move where the extremum lies in a neighbour, drop the weak and the edges.
 
@@ -316,24 +303,24 @@ def refine(buffer, layout, voxels, limits, octave):
     return kept[:count]
 
 
-@_compiled
+@compiled
 def _dog(buffer, at, per_level):
     return buffer[at + per_level] - buffer[at]
 
 
-@_compiled
+@compiled
 def _cross(buffer, at, i, j, per_level):
     """Mixed second difference of the DoG along the strides i and j."""
     same = _dog(buffer, at + i + j, per_level) + _dog(buffer, at - i - j, per_level)
     return (same - _dog(buffer, at + i - j, per_level) - _dog(buffer, at - i + j, per_level)) / 4
 
 
-@_compiled
+@compiled
 def _step(shift):
     return 1 if shift > 0.5 else (-1 if shift < -0.5 else 0)
 
 
-@_compiled
+@compiled
 def _sample(buffer, layout, x, y, cos, sin, patch):
     """Fill a square patch with bilinear samples on a grid turned and scaled by (cos, sin), edges extended."""
     height, width, base, per_row = layout
@@ -356,13 +343,13 @@ def _sample(buffer, layout, x, y, cos, sin, patch):
             patch[row, column] = upper + fy * (lower - upper)
 
 
-@_compiled
+@compiled
 def _layout(table, octave, image, level):
     height, width, offset, per_level, per_row, per_image = table[octave]
     return height, width, offset + level * per_level + image * per_image, per_row
 
 
-@_compiled
+@compiled
 def _turn(x, y):
     """Direction of a vector in turns, [0, 1], to 2e-6: Abramowitz and Stegun 4.4.49, without a branch."""
     ax, ay = abs(x), abs(y)
@@ -376,7 +363,7 @@ def _turn(x, y):
     return np.float32(1) - turn if y < 0 else turn
 
 
-@_compiled
+@compiled
 def angles(buffer, table, where, places, step, window, smooth):
     """Angle (M,) in radians of the highest peak in the histogram of gradient directions.
 
@@ -421,7 +408,7 @@ def angles(buffer, table, where, places, step, window, smooth):
     return out
 
 
-@_compiled
+@compiled
 def descriptors(buffer, table, where, places, angle, step, tent):
     """Lowe's cells of 8 orientations, (M, cells^2 * 8), not normalised.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.align import enhance
-from engine.dense import Belief, DenseFit, Picture, Pose, correlation_at, covariance_of, picture_of, refine
+from engine.dense import Belief, DenseFit, Picture, Pose, correlation_at, covariance_of, refine
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.integrity import AssumedErrors
 from engine.methods.laid import NccOptions
@@ -149,7 +149,7 @@ def _picture(query: Query, height_m: float, level: int, options: NccOptions) -> 
         matrix = np.array([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1.0]]) @ matrix
         scale /= math.sqrt(sx * sy)
     radius_px = max(1, round(options.enhance_radius_px / scale)) if options.enhance_radius_px else 0
-    return picture_of(enhance(gray, radius_px=radius_px, score=options.score), matrix)
+    return Picture(enhance(gray, radius_px=radius_px, score=options.score), matrix)
 
 
 def _refused(query: Query, fix: Fix) -> NoFix:

@@ -50,7 +50,8 @@ class SampleMap:
                     (window.x0, window.width_px, cell.x0),
                 )
             )
-            index = np.arange(shape[0] * shape[1]).reshape(shape)[rows, columns].ravel()[::step]
+            taken = np.arange(shape[0])[rows, None] * shape[1] + np.arange(shape[1])[columns]
+            index = taken.ravel()[::step]
             arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
             parts.append([array[index] for array in arrays])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))

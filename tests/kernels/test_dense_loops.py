@@ -1,0 +1,124 @@
+"""The loops of dense refinement, and of the plane under a surface, by OpenCV and difference quotients."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from engine.kernels import dense_loops
+from engine.kernels.lower_plane import lower_plane
+
+SIDE_PX, CELLS, EDGE_PX, HEIGHT_M = 120, 8, 2.0, 80.0
+MATRIX = np.array([[130.0, 0.0, 59.5], [0.0, 128.0, 58.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A smooth picture, samples below the camera and a little beyond its view, and a tilted pose."""
+    rng = np.random.default_rng(5)
+    picture = cv2.GaussianBlur(rng.normal(0, 40, (SIDE_PX, SIDE_PX)), (0, 0), 4.0).astype(np.float32)
+    offset_m = np.vstack([rng.uniform(-45, 45, (2, 500)), rng.uniform(-3, 9, (1, 500))])
+    rotation = cv2.Rodrigues(np.array([0.04, -0.03, 0.7]))[0] @ np.diag([1.0, -1.0, -1.0])
+    return picture, offset_m, rotation, np.array([3.0, -2.0, HEIGHT_M]), np.array([0.02, -0.01])
+
+
+def look(scene, *, center_m=None, rotation=None, slope=None, gradients=None):
+    picture, offset_m, turned, center, leaning = scene
+    count = offset_m.shape[1]
+    return dense_loops.seen(
+        picture, MATRIX, turned if rotation is None else rotation, center if center_m is None else center_m,
+        leaning if slope is None else slope, offset_m, np.zeros(3),
+        np.zeros((count, 2)) if gradients is None else gradients, np.ones(count), EDGE_PX, CELLS,
+    )  # fmt: skip
+
+
+def test_samples_are_seen_where_opencv_projects_them(scene):
+    picture, offset_m, rotation, center_m, slope = scene
+    levels, places, _, _, weights, cell, count = look(scene)
+    points = offset_m.copy()
+    points[2] += slope @ offset_m[:2]
+    vector = cv2.Rodrigues(rotation)[0]
+    at = cv2.projectPoints(points.T, vector, -rotation @ center_m, MATRIX, np.zeros(4))[0][:, 0]
+    inside = ((at > EDGE_PX) & (at < SIDE_PX - 1 - EDGE_PX)).all(axis=1)
+    assert 0 < count == inside.sum() < len(inside)
+    np.testing.assert_array_equal(weights, inside)
+    np.testing.assert_allclose(places, rotation @ (points - center_m[:, None]), atol=1e-9)
+    for (u, v), level, number in zip(at[inside], levels[inside], cell[inside], strict=True):
+        x, y = int(u), int(v)
+        block = picture[y : y + 2, x : x + 2].astype(float)
+        assert level == pytest.approx(np.array([1 - v + y, v - y]) @ block @ [1 - u + x, u - x], abs=1e-6)
+        assert number == int(v / (SIDE_PX - 3) * CELLS) * CELLS + int(u / (SIDE_PX - 3) * CELLS)
+
+
+@pytest.mark.parametrize("parameter", range(8))
+def test_derivatives_foretell_what_a_moved_pose_sees(scene, parameter):
+    """Central differences of the picture are its slope up to its curvature, so a small share may be missed."""
+    _, offset_m, rotation, center_m, slope = scene
+    _, places, shown, _, weights, _, _ = look(scene)
+    foretold = dense_loops.derivatives(shown, places, offset_m[:2], rotation)[parameter]
+    step = 1e-3 * np.eye(8)[parameter] / (1.0 if parameter < 3 else HEIGHT_M)
+    seen = []
+    for sign in (-1.0, 1.0):
+        turned = cv2.Rodrigues(sign * step[3:6])[0] @ rotation
+        seen.append(
+            look(scene, center_m=center_m + sign * step[:3], rotation=turned, slope=slope + sign * step[6:])
+        )
+    both = (weights > 0) & (seen[0][4] > 0) & (seen[1][4] > 0)
+    measured = (seen[1][0] - seen[0][0])[both] / (2.0 * step[parameter])
+    error = np.linalg.norm(measured - foretold[both]) / np.linalg.norm(foretold[both])
+    assert error < 0.15
+
+
+def test_the_maps_gradients_let_expect_what_a_picture_of_the_map_shows(scene):
+    """Where the camera's place on flat ground moves, level ground of a known gradient shows by how much."""
+    _, offset_m, rotation, _, _ = scene
+    gradients = np.random.default_rng(6).normal(0, 2, (offset_m.shape[1], 2))
+    _, places, _, expected, weights, _, _ = look(scene, gradients=gradients, slope=np.zeros(2))
+    moved = dense_loops.derivatives(expected, places, offset_m[:2], rotation)
+    seen = weights > 0
+    np.testing.assert_allclose(moved[:2, seen], -gradients[seen].T, atol=1e-9)
+    away = rotation.T @ places  # along its own ray a sample stays where it is in the picture
+    np.testing.assert_allclose((expected * (rotation @ away))[:, seen].sum(axis=0), 0.0, atol=1e-9)
+
+
+def test_comparing_is_a_robust_regression_of_the_picture_on_the_map():
+    rng = np.random.default_rng(7)
+    values, weights = rng.normal(0, 1, 900), rng.uniform(0, 1, 900) * (rng.random(900) < 0.8)
+    levels = 3.0 * values - 7.0 + rng.normal(0, 0.1, 900)
+    wrong = rng.random(900) < 0.05
+    levels[wrong] += rng.uniform(30, 60, wrong.sum())
+    differences, robust, correlation, gain = dense_loops.compare(levels, values, weights)
+    assert gain == pytest.approx(3.0, abs=0.15)
+    assert not robust[wrong].any()
+    assert robust[~wrong].sum() > 0.8 * weights[~wrong].sum()
+    assert np.average(differences, weights=robust + 1e-30) == pytest.approx(0.0, abs=0.2)
+    covariance = np.cov(levels, values, aweights=weights, ddof=0)
+    assert correlation == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
+    exact = dense_loops.compare(3.0 * values - 7.0, values, weights)
+    assert exact[2] == pytest.approx(1.0)
+    assert exact[3] == pytest.approx(3.0)
+    assert np.abs(exact[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.7])
+def test_a_share_of_the_heights_is_below_their_plane(share):
+    rng = np.random.default_rng(8)
+    offsets = rng.uniform(-1, 1, (225, 2))
+    heights_m = 100.0 + offsets @ [2.0, -5.0] + rng.exponential(6.0, 225)
+    plane = lower_plane(offsets, heights_m, share, 0.01, 60)
+    above = heights_m - plane[0] - offsets @ plane[1:]
+    assert np.mean(above < 0) == pytest.approx(share, abs=0.01)
+
+    def loss(terms):
+        off = heights_m - terms[0] - offsets @ terms[1:]
+        return np.where(off > 0, share, share - 1.0) @ off
+
+    # No other plane nearby has a smaller loss by more than lying on it allows: Koenker and Bassett's minimum.
+    others = plane + rng.normal(0, 0.5, (300, 3))
+    assert loss(plane) < min(map(loss, others)) + 0.01 * loss(plane)
+
+
+def test_heights_of_a_plane_have_that_plane():
+    offsets = np.random.default_rng(9).uniform(-1, 1, (40, 2))
+    np.testing.assert_allclose(lower_plane(offsets, 5.0 + offsets @ [1.0, 2.0], 0.2, 0.3, 8), [5, 1, 2], atol=1e-9)
