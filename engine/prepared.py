@@ -6,6 +6,7 @@ them, of which the least recently used are given up.
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -19,7 +20,8 @@ from engine.orthomap import OrthoMap
 from engine.types import Window
 
 CELL_PX = 256
-"""Regions begin and end on multiples of this, so that neighbouring windows share one."""
+"""Regions begin and end on multiples of this, and at least half of it beyond what is asked for: the windows that a
+flight asks for next lie within the same one."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
 MAX_REGION_PX = 6 << 20
@@ -54,7 +56,9 @@ class PreparedMap:
 
     def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
-        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()
+        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the one used last comes last
+        # Of the regions, not of their preparation: a thread that hangs in there must not stop the next one.
+        self._lock = threading.Lock()
         self.made = 0
         """Regions prepared so far."""
 
@@ -81,19 +85,29 @@ class PreparedMap:
         return Region(grown, search, valid)
 
     def _region(self, window: Window, level: int) -> Region:
+        with self._lock:
+            region = self._held(window, level)
+        if region is not None:
+            return region
         rows, columns = self._site.level_shape(level)
         if rows * columns <= WHOLE_LEVEL_PX:
             wanted = Window(0, 0, columns, rows)
         else:
             wanted = _on_grid(window, columns, rows)
-        region = self._regions.get((level, wanted))
-        if region is None:
-            region = self._prepare(wanted, level)
+        region = self._prepare(wanted, level)
+        with self._lock:
             self.made += 1
             self._regions[level, wanted] = region
             self._forget()
-        self._regions.move_to_end((level, wanted))
         return region
+
+    def _held(self, window: Window, level: int) -> Region | None:
+        """A region that holds a window, the one used last first; from now on it is that one itself."""
+        for key in reversed(self._regions):
+            if key[0] == level and _holds(key[1], window):
+                self._regions.move_to_end(key)
+                return self._regions[key]
+        return None
 
     def _forget(self) -> None:
         """Give up the regions that were used least recently; the newest and whole levels stay."""
@@ -131,9 +145,16 @@ class PreparedMap:
         return Region(window, prepare(image), valid)
 
 
+def _holds(region: Window, window: Window) -> bool:
+    right, bottom = window.x0 + window.width_px, window.y0 + window.height_px
+    across = region.x0 <= window.x0 and right <= region.x0 + region.width_px
+    return across and region.y0 <= window.y0 and bottom <= region.y0 + region.height_px
+
+
 def _on_grid(window: Window, columns: int, rows: int) -> Window:
-    """The window grown to whole cells, and cut off where the level ends."""
-    x0, y0 = window.x0 // CELL_PX * CELL_PX, window.y0 // CELL_PX * CELL_PX
-    x1 = min(columns, -(-(window.x0 + window.width_px) // CELL_PX) * CELL_PX)
-    y1 = min(rows, -(-(window.y0 + window.height_px) // CELL_PX) * CELL_PX)
+    """The window grown by half a cell to each side, then to whole cells, and cut off where the level ends."""
+    ahead = CELL_PX // 2
+    x0, y0 = (max(0, low - ahead) // CELL_PX * CELL_PX for low in (window.x0, window.y0))
+    x1 = min(columns, -(-(window.x0 + window.width_px + ahead) // CELL_PX) * CELL_PX)
+    y1 = min(rows, -(-(window.y0 + window.height_px + ahead) // CELL_PX) * CELL_PX)
     return Window(x0, y0, x1 - x0, y1 - y0)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
 
 from engine import OrthoMap, prepared
 from engine.align import enhance
-from engine.prepared import PreparedMap
+from engine.ncc_fft import prepare
+from engine.prepared import PreparedMap, Region
 from engine.types import Window
 
 RADIUS_PX = 8
@@ -142,3 +146,21 @@ def test_a_level_that_is_small_is_prepared_once_and_kept(gray, monkeypatch):
         maps.cut(Window(0, 0, 9, 9), 0).search.image.data_ptr()
         == maps.cut(Window(0, 0, 8, 8), 0).search.image.data_ptr()
     )
+
+
+def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
+    """The worker that a live flight left behind may still be at work beside the one that replaced it."""
+    monkeypatch.setattr(prepared, "MAX_REGION_PX", 128 * 128)
+    maps = PreparedMap(site_of(gray), CPU, RADIUS_PX)
+    search = prepare(torch.zeros(400, 550))
+    monkeypatch.setattr(maps, "_prepare", lambda window, level: Region(window, search, None))
+    places = np.random.default_rng(0).integers(0, 400 - 64, (4000, 2)).tolist()
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            cuts = list(pool.map(lambda place: maps.cut(Window(*place, 64, 64), 0), places))
+    finally:
+        sys.setswitchinterval(before)
+    assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))
+    assert len(maps._regions) <= 2

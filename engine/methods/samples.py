@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 
 import cv2
@@ -34,11 +35,15 @@ class SampleMap:
     def __init__(self, site: OrthoMap, prepared: PreparedMap) -> None:
         self._site, self._prepared = site, prepared
         self._cells: OrderedDict[tuple[int, Window], tuple[Samples, tuple[int, int]]] = OrderedDict()
+        self._lock = threading.Lock()  # of the cells alone, as in the prepared map
         self.made = 0
         """Cells sampled so far."""
 
     def find(self, window: Window, level: int) -> Samples:
-        """At most about :data:`MAX_SAMPLES` samples of a window in pixels of a level, inside it."""
+        """At most about :data:`MAX_SAMPLES` samples of a window in pixels of a level, inside it.
+
+        The window is at least a block wide and high.
+        """
         step = math.ceil(window.area_px / BLOCK_PX**2 / MAX_SAMPLES)
         parts = []
         for cell in self._cells_under(window, level):
@@ -60,22 +65,27 @@ class SampleMap:
         height, width = self._site.level_shape(level)
         if width * height <= WHOLE_LEVEL_PX:
             return [Window(0, 0, width, height)]
-        return [
+        cells = [
             Window(x, y, min(CELL_PX, width - x), min(CELL_PX, height - y))
             for y in range(window.y0 // CELL_PX * CELL_PX, window.y0 + window.height_px, CELL_PX)
             for x in range(window.x0 // CELL_PX * CELL_PX, window.x0 + window.width_px, CELL_PX)
         ]
+        # What a level has beyond its last whole cell may be narrower than a block: no sample is taken there.
+        return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and how many rows and columns of them there are."""
-        found = self._cells.get((level, cell))
-        if found is None:
-            found = self._sampled(cell, level)
+        with self._lock:
+            found = self._cells.pop((level, cell), None)
+            if found is not None:
+                self._cells[level, cell] = found
+                return found
+        found = self._sampled(cell, level)
+        with self._lock:
             self.made += 1
             self._cells[level, cell] = found
             if len(self._cells) > MAX_CELLS:
                 self._cells.popitem(last=False)
-        self._cells.move_to_end((level, cell))
         return found
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
