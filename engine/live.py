@@ -7,17 +7,22 @@ dies. What a worker finds after its frame was answered for is never put out.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from engine.budget import Budget
-from engine.errors import EngineError, StateError
+from engine.errors import EngineError, OptionError, StateError
 from engine.navigator import Navigator
 from engine.types import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
 
 _log = logging.getLogger("scenematch")
+
+_LEAVE_S = 5.0  # that closing waits for workers that were given up; one that hangs for good is left behind
+_LONGEST_MS = 60_000.0  # that anything may be waited for in flight
+_MAX_DOUBLINGS = 10  # of the patience with one maker of navigators after the other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +31,8 @@ class LiveOptions:
 
     Attributes:
         deadline_ms: age, counted from capture, by which a frame is answered.
-        patience_ms: beyond the deadline, after which a worker is taken to hang and is replaced.
+        patience_ms: beyond the deadline, after which a worker is taken to hang and is replaced. One that makes its
+            navigator has the same time from when it began, and twice as much after every one that hung in that.
         max_speed_mps: of the vehicle, by which a new worker's search grows while there was none.
     """
 
@@ -36,6 +42,9 @@ class LiveOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
+        for name in ("deadline_ms", "patience_ms"):
+            if getattr(self, name) > _LONGEST_MS:
+                raise OptionError(f"{name}: expected at most {_LONGEST_MS:g}, got {getattr(self, name):g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +111,11 @@ class Live:
         self._waiting: _Job | None = None
         self._working: _Job | None = None
         self._number = 0  # of the worker that counts
+        self._making_since_ns: int | None = None  # by that worker its navigator; None where it has one, or pauses
+        self._hung_makers = 0  # in a row
         self._counts = Counts()
         self._closed = False
+        self._threads: list[threading.Thread] = []
         self._start_thread(self._work, make_navigator(start), 0)
         self._start_thread(self._watch)
 
@@ -137,7 +149,7 @@ class Live:
     def close(self) -> None:
         """Take no more frames; the one in work is answered still, one that waits is dropped.
 
-        Waits for the worker too where its frame was answered without it: a process that ends while one of its
+        Waits for the workers too whose frames were answered without them: a process that ends while one of its
         threads is within compiled code is aborted.
         """
         with self._changed:
@@ -148,6 +160,10 @@ class Live:
             self._changed.notify_all()
             job, due_s = self._working, (self._options.deadline_ms + self._options.patience_ms) * 1e-3
             self._changed.wait_for(lambda: self._working is None and (job is None or job.answered), timeout=due_s)
+        until = time.monotonic() + _LEAVE_S
+        for thread in self._threads:
+            if thread is not threading.current_thread():  # a receiver may close, too
+                thread.join(max(0.0, until - time.monotonic()))
 
     def __enter__(self) -> Live:
         return self
@@ -158,13 +174,10 @@ class Live:
     def _work(self, navigator: Navigator | None, number: int) -> None:
         """The worker: takes the newest frame, matches it, and puts out what it found if it is not too late."""
         if navigator is None:
-            try:
-                navigator = self._make_navigator(self._resume())
-            except Exception:
-                _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
-                time.sleep(self._options.patience_ms * 1e-3)
-                self._replace(number)
-                return
+            navigator = self._made(number)
+        if navigator is None:
+            self._replace(number)
+            return
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting is not None or self._closed or self._number != number)
@@ -184,6 +197,21 @@ class Live:
             if not alive:
                 self._replace(number)
                 return
+
+    def _made(self, number: int) -> Navigator | None:
+        """A navigator that begins at the last fix; None, after a pause, where it cannot be made."""
+        navigator = None
+        try:
+            navigator = self._make_navigator(self._resume())
+        except Exception:
+            _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
+        with self._changed:
+            if self._number == number:  # not replaced meanwhile
+                self._making_since_ns, self._hung_makers = None, 0
+            if navigator is None:
+                pause_s = self._options.patience_ms * 1e-3
+                self._changed.wait_for(lambda: self._closed or self._number != number, timeout=pause_s)
+        return navigator
 
     def _match(self, navigator: Navigator, job: _Job) -> tuple[Result, bool]:
         """The result of one frame, and whether the navigator can be used on."""
@@ -207,24 +235,29 @@ class Live:
                     return
                 jobs = [job for job in (self._working, self._waiting) if job is not None and not job.answered]
                 due = [job for job in jobs if _age_ms(job) >= self._options.deadline_ms]
-                at_work = self._working
-                hung = at_work is not None and at_work.answered and self._left_ms(at_work) <= 0
-                number = self._number
+                hangs_in_ms, number = self._hangs_in_ms(), self._number
+                hung = hangs_in_ms <= 0
                 if self._waiting in due:
                     self._waiting = None
                 if not due and not hung:
-                    waits = [self._left_ms(job) for job in (self._working, self._waiting) if job is not None]
-                    self._changed.wait(max(min(waits), 0.0) * 1e-3 if waits else None)
+                    left_ms = min([hangs_in_ms, *(self._options.deadline_ms - _age_ms(job) for job in jobs)])
+                    self._changed.wait(max(left_ms, 0.0) * 1e-3 if math.isfinite(left_ms) else None)
                     continue
             for job in due:
                 self._answer(job, _refusal(job, Reason.LATE, "no answer by the deadline"))
             if hung:
                 self._replace(number)
 
-    def _left_ms(self, job: _Job) -> float:
-        """Time until the watchman has something to do about a job."""
-        patience_ms = self._options.patience_ms if job.answered else 0.0
-        return self._options.deadline_ms + patience_ms - _age_ms(job)
+    def _hangs_in_ms(self) -> float:
+        """Time until the worker is taken to hang, in a frame that was answered for or in making its navigator."""
+        deadline_ms, patience_ms = self._options.deadline_ms, self._options.patience_ms
+        if self._making_since_ns is not None:
+            made_for_ms = (time.monotonic_ns() - self._making_since_ns) * 1e-6
+            # A maker that is only slow would never come through if each were waited for alike.
+            return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_makers, _MAX_DOUBLINGS) - made_for_ms
+        if self._working is None or not self._working.answered:
+            return math.inf
+        return deadline_ms + patience_ms - _age_ms(self._working)
 
     def _answer(self, job: _Job, result: Result) -> None:
         """Put out one answer a frame; a fix that came too late is none."""
@@ -248,10 +281,14 @@ class Live:
         with self._changed:
             if self._number != number:
                 return
-            self._number += 1
             self._working = None
-            self._count("workers_replaced")
             self._changed.notify_all()
+            if self._closed:
+                return
+            self._hung_makers += self._making_since_ns is not None
+            self._making_since_ns = time.monotonic_ns()
+            self._number += 1
+            self._count("workers_replaced")
         self._start_thread(self._work, None, number + 1)
 
     def _resume(self) -> Prior | None:
@@ -268,7 +305,10 @@ class Live:
         self._counts = replace(self._counts, **{name: getattr(self._counts, name) + 1 for name in names})
 
     def _start_thread(self, target: Callable[..., None], *args: object) -> None:
-        threading.Thread(target=target, args=args, name=f"scenematch-{target.__name__}", daemon=True).start()
+        thread = threading.Thread(target=target, args=args, name=f"scenematch-{target.__name__}", daemon=True)
+        thread.start()
+        with self._changed:
+            self._threads = [*(other for other in self._threads if other.is_alive()), thread]
 
 
 def _age_ms(job: _Job) -> float:

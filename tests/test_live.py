@@ -62,6 +62,17 @@ def reasons(answers):
     return [a.result.reason if isinstance(a.result, NoFix) else "fix" for a in answers]
 
 
+def no_threads():
+    return not [thread for thread in threading.enumerate() if thread.name.startswith("scenematch-_")]
+
+
+def wait_until(condition, timeout_s: float = 5.0):
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "it did not come to that"
+        time.sleep(0.005)
+
+
 def test_each_frame_has_its_own_fix():
     sink, navigator = Sink(), Slow(0)
     with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=5000)) as live:
@@ -238,11 +249,7 @@ def test_after_closing_there_is_nothing_more():
     live.close()
     with pytest.raises(StateError, match="submit: expected an open pipeline"):
         live.submit(frame(0))
-    for _ in range(200):
-        if not [t for t in threading.enumerate() if t.name.startswith("scenematch-_")]:
-            return
-        time.sleep(0.01)
-    pytest.fail("threads are left")
+    wait_until(no_threads)
 
 
 def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it():
@@ -260,6 +267,101 @@ def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it():
     threading.Timer(0.1, gate.set).start()
     live.close()
     assert over
+
+
+def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
+    calls, sink = [], Sink()
+
+    def die():
+        raise ZeroDivisionError
+
+    def make(start):
+        calls.append(start)
+        if len(calls) > 1:
+            raise OSError("map is gone")
+        return Slow(0, {0: die})
+
+    live = Live(make, sink, options=LiveOptions(deadline_ms=5000, patience_ms=60))
+    live.submit(frame(0))
+    sink.wait_for(1)
+    wait_until(lambda: len(calls) > 1)
+    live.close()
+    wait_until(no_threads, timeout_s=2.0)
+    made, replaced = len(calls), live.counts.workers_replaced
+    time.sleep(0.15)
+    assert (len(calls), live.counts.workers_replaced) == (made, replaced)
+
+
+def test_closing_waits_for_a_worker_that_was_given_up():
+    """A process that ends while a thread of its is within compiled code is aborted."""
+    gate, over, sink = threading.Event(), [], Sink()
+
+    def slow():
+        gate.wait(2.0)
+        time.sleep(0.3)
+        over.append(True)
+
+    with Live(lambda _: Slow(0, {0: slow}), sink, options=LiveOptions(deadline_ms=20, patience_ms=30)) as live:
+        live.submit(frame(0))
+        sink.wait_for(1)
+        wait_until(lambda: live.counts.workers_replaced == 1)
+        assert not over
+        gate.set()
+    assert over
+
+
+@pytest.mark.parametrize("name", ["deadline_ms", "patience_ms"])
+def test_nothing_is_waited_for_longer_than_a_minute(name):
+    with pytest.raises(OptionError, match=f"{name}: expected at most 60000, got 1e\\+13"):
+        LiveOptions(**{name: 1e13})
+
+
+def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
+    monkeypatch.setattr("engine.live._LEAVE_S", 0.05)
+    gate, sink, starts = threading.Event(), Sink(), []
+
+    def make(start):
+        starts.append(start)
+        return Slow(0, {0: gate.wait})
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=20, patience_ms=60)) as live:
+        live.submit(frame(0))
+        assert reasons(sink.wait_for(1)) == [Reason.LATE]
+    time.sleep(0.1)
+    assert len(starts) == 1
+    assert live.counts.workers_replaced == 0
+    gate.set()
+    wait_until(no_threads)
+
+
+def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
+    gate, sink, calls = threading.Event(), Sink(), []
+
+    def die():
+        raise ZeroDivisionError
+
+    def make(start):
+        calls.append(time.monotonic())
+        if 1 < len(calls) < 4:
+            gate.wait()
+        return Slow(0, {0: die} if len(calls) == 1 else {})
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=100, patience_ms=10)) as live:
+        live.submit(frame(0))
+        answers, number = sink.wait_for(1), 1
+        while reasons(answers)[-1] != "fix":
+            assert number < 200, "it is waited for without end"
+            live.submit(frame(number))
+            answers, number = sink.wait_for(number + 1), number + 1
+        gate.set()  # those that hung come back, and are not heard
+        live.submit(frame(number))
+        assert reasons(sink.wait_for(number + 1))[-1] == "fix"
+    assert set(reasons(answers)[1:-1]) == {Reason.LATE}  # nothing waits for longer than its deadline
+    assert len(calls) == 4
+    assert live.counts.workers_replaced == 3
+    # A maker that is only slow comes through in the end: each is waited for twice as long as the one before.
+    assert calls[2] - calls[1] > 0.08
+    assert calls[3] - calls[2] > 0.18
 
 
 def test_options_are_checked():
