@@ -7,17 +7,16 @@ on farmland, see ``docs/audit.md``.
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from engine.audit_plan import AuditOptions, Part, Plan, fly, plan_audit
 from engine.camera import Camera
-from engine.errors import OptionError
 from engine.orthomap import OrthoMap
-from engine.self_match import AuditOptions, Evidence, Plan, measure, plan_audit
+from engine.self_match import Evidence, measure
 
 Array = NDArray[np.float64]
 
@@ -36,6 +35,7 @@ class Flag(enum.IntEnum):
     WEAK = 5
     STALE = 6
     EDGE = 7
+    OUTSIDE = 8
 
 
 # Why a place is not suitable, in this order; WEAK where none of these is met.
@@ -70,9 +70,9 @@ class Audit:
 
     Attributes:
         plan: where it was looked.
-        evidence: (rows, columns) each.
+        evidence: (rows, columns) each; NaN outside the part that was looked at, as are the probabilities.
         availability: (rows, columns) probability of a fix; NaN where the map has no data for a frame.
-        flags: (rows, columns) values of :class:`Flag`.
+        flags: (rows, columns) values of :class:`Flag`; OUTSIDE of the part that was looked at.
     """
 
     plan: Plan
@@ -82,16 +82,16 @@ class Audit:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of the places by the name of their flag."""
-        return {flag.name.lower(): float((self.flags == flag).mean()) for flag in Flag}
+        """Share of the places that were looked at by the name of their flag."""
+        seen = self.flags[self.plan.looked]
+        return {flag.name.lower(): float((seen == flag).mean()) for flag in Flag if flag is not Flag.OUTSIDE}
 
     def at(self, xy_px: ArrayLike) -> Array:
         """Probability (...,) of a fix where the middle of the frame looks at pixels (..., 2) of the map.
 
-        Bilinear between the places; nodata, and what lies off the map, counts as 0.
+        Bilinear between the places; nodata, what lies off the map and what was not looked at count as 0.
         """
-        xy = np.asarray(xy_px, np.float64)
-        cell = ((xy + 0.5) / self.plan.spacing_px - 0.5).astype(np.float32)
+        cell = self.plan.cell_from_pixel(xy_px).astype(np.float32)
         known = np.nan_to_num(self.availability, nan=0.0).astype(np.float32)
         flat = cell.reshape(-1, 2)
         low, high = np.zeros(2, np.float32), np.array(known.shape[::-1], np.float32) - 1.0
@@ -102,11 +102,11 @@ class Audit:
         u, v = x - x0, y - y0
         top, bottom = known[y0, x0] * (1 - u) + known[y0, x1] * u, known[y1, x0] * (1 - u) + known[y1, x1] * u
         off = (np.abs(flat - inside) > 0.5).any(axis=1)
-        return np.where(off, 0.0, top * (1 - v) + bottom * v).reshape(xy.shape[:-1]).astype(np.float64)
+        return np.where(off, 0.0, top * (1 - v) + bottom * v).reshape(cell.shape[:-1]).astype(np.float64)
 
     def flag_at(self, xy_px: ArrayLike) -> NDArray[np.uint8]:
         """Flags (...,) of the nearest places to pixels (..., 2) of the map; EDGE off the map."""
-        cell = np.floor((np.asarray(xy_px, np.float64) + 0.5) / self.plan.spacing_px).astype(int)
+        cell = np.floor(self.plan.cell_from_pixel(xy_px) + 0.5).astype(int)
         rows, columns = self.flags.shape
         x, y = np.moveaxis(cell, -1, 0)
         on = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
@@ -114,28 +114,33 @@ class Audit:
 
 
 def gather(plan: Plan, measured: Iterable[Evidence]) -> Audit:
-    """Judge what was measured at all places of a plan, in their order."""
+    """Judge what was measured at all places that a plan looks at, in their order."""
     rows = list(measured)
-    names = [one.name for one in fields(Evidence)]
-    evidence = Evidence(*[np.array([getattr(row, name) for row in rows]).reshape(plan.cells) for name in names])
+    found = {one.name: np.full(plan.cells, np.nan) for one in fields(Evidence)}
+    for name, grid in found.items():
+        grid[plan.looked] = [getattr(row, name) for row in rows]
+    evidence = Evidence(**found)
     own = probability(evidence.texture, evidence.score, evidence.lead)
     met = own
     if plan.other is not None:  # a real change in place of the simulated one
         later = probability(evidence.texture, evidence.other_score, evidence.other_lead)
         met = np.where(np.isnan(later), own, np.minimum(own, later))
-    held = np.array([plan.holds(place) for place in plan.places_px.reshape(-1, 2)]).reshape(plan.cells)
-    return Audit(plan, evidence, met, _flags(evidence, own, met, held))
+    held = np.zeros(plan.cells, np.bool_)
+    held[plan.looked] = [plan.holds(place) for place in plan.places_px[plan.looked]]
+    flags = np.where(plan.looked, _flags(evidence, own, met, held), Flag.OUTSIDE).astype(np.uint8)
+    return Audit(plan, evidence, met, flags)
 
 
-def audit(
+def audit_map(
     site: OrthoMap,
     camera: Camera,
     height_agl_m: float,
     options: AuditOptions | None = None,
     other: OrthoMap | None = None,
+    part: Part | None = None,
 ) -> Audit:
-    """Plan, measure and judge; arguments and errors are those of :func:`plan_audit`."""
-    plan = plan_audit(site, camera, height_agl_m, options, other)
+    """Plan, measure and judge; arguments and errors are those of :func:`engine.audit_plan.plan_audit`."""
+    plan = plan_audit(site, camera, height_agl_m, options, other, part)
     return gather(plan, measure(plan))
 
 
@@ -207,29 +212,13 @@ def predict(audit: Audit, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Route:
         OptionError: fewer than two waypoints, or all of them at one place.
     """
     site, plan = audit.plan.site, audit.plan
-    corners = np.atleast_2d(site.frame.enu_from_geodetic(np.asarray(lat_deg), np.asarray(lon_deg)))
-    legs = np.hypot(*np.diff(corners, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(legs)])
-    if along[-1] <= 0.0:
-        raise OptionError(f"route: expected two or more places that differ, got {len(corners)} without a way")
-    count = math.ceil(along[-1] / (0.5 * float(plan.spacing_px.min()) * site.gsd_m_per_px)) + 1
-    at = np.linspace(0.0, along[-1], max(count, 2))
-    en = np.stack([np.interp(at, along, corners[:, axis]) for axis in (0, 1)], axis=1)
-    leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(legs) - 1)
-    leg = np.where(legs[leg] > 0.0, leg, np.argmax(legs > 0.0))
-    ahead = np.diff(corners, axis=0)[leg]
-    seen = en + _middle_m(plan, np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1])))
-    xy = site.pixel_from_enu(seen)
+    route = np.stack([np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)], axis=-1)
+    flown = fly(site, route, 0.5 * float(plan.spacing_px.min()) * site.gsd_m_per_px, plan.ahead_m)
+    xy = site.pixel_from_enu(flown.seen_m)
     chance, flags = audit.at(xy), audit.flag_at(xy)
-    stretches = tuple(_stretches(site, at, en, chance, flags))
-    return Route(float(along[-1]), float(chance.mean()), site.pixel_from_enu(en), chance, stretches)
-
-
-def _middle_m(plan: Plan, headings_deg: Array) -> Array:
-    """(N, 2) metres east and north from a level vehicle to the middle of its frame; 0 for a nadir camera."""
-    north_m = (plan.site.enu_jacobian(plan.places_px[0, 0]) * 2.0**plan.level) @ plan.view.center_px
-    sine, cosine = np.sin(np.radians(headings_deg)), np.cos(np.radians(headings_deg))
-    return np.stack([cosine * north_m[0] + sine * north_m[1], cosine * north_m[1] - sine * north_m[0]], axis=1)
+    stretches = tuple(_stretches(site, flown.at_m, flown.en_m, chance, flags))
+    length_m = float(flown.at_m[-1])
+    return Route(length_m, float(chance.mean()), site.pixel_from_enu(flown.en_m), chance, stretches)
 
 
 def _stretches(

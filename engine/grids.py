@@ -31,8 +31,8 @@ class Warp:
     """A smooth map of the plane by polynomials that were checked against the exact function.
 
     PROJ and the way from the tangent plane to the ellipsoid take a fraction of a millisecond a call. Over one
-    map both are so smooth that polynomials of degree 5 follow them to micrometres. Points outside ``box``, and
-    all points where the fit misses ``tolerance``, take the exact function.
+    map both are so smooth that polynomials of degree 5 follow them to micrometres. Where one point of a call lies
+    outside ``box``, and everywhere if the fit misses ``tolerance``, all points take the exact function.
     """
 
     def __init__(self, exact: Function, box: Array, tolerance: float) -> None:

@@ -14,7 +14,7 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from engine.errors import MapError
 from engine.grids import Grid, Warp, apply_affine, wgs84
 from engine.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
 from engine.types import Window
+from engine.xyz import TileCache
 
 MAX_SIDE_PX = 1_000_000
 GRID_VERSION = 1
@@ -33,6 +34,8 @@ COARSEST_PX = 16384
 """A large file whose smallest overview has a longer side than this is copied."""
 LIST = "tiles.txt"
 """In the folder of a large copy: a line a tile with its name, and its SHA-256 or "-" where it holds no map."""
+Tell = Callable[[int, int], None]
+"""Told while a copy is made: how many pixels of it are there, and how many it will have."""
 _REMEMBERED_BYTES = 1 << 22  # of larger files the hash is remembered with their size and time
 _FACTORS = [2, 4, 8, 16, 32]
 
@@ -115,8 +118,23 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> It
         yield window, block
 
 
+class _Tally:
+    """Adds up what is there of a copy, and tells it."""
+
+    def __init__(self, grid: Grid, tell: Tell | None) -> None:
+        self._there_px, self._all_px, self._tell = 0, grid.width_px * grid.height_px, tell
+
+    def add(self, count_px: int, *, quietly: bool = False) -> None:
+        self._there_px += count_px
+        if self._tell is not None and not quietly:
+            self._tell(self._there_px, self._all_px)
+
+
 def open_metric_copy(
-    source: Source, reader: GrayReader | None, cache_dir: str | os.PathLike[str] | None
+    source: Source,
+    reader: GrayReader | None,
+    cache_dir: str | os.PathLike[str] | None,
+    tell: Tell | None = None,
 ) -> Source:
     """The source on its metric grid, from the cache where it was made before.
 
@@ -128,6 +146,7 @@ def open_metric_copy(
         source: the map.
         reader: of its pixels, None to make one if it is needed.
         cache_dir: where copies are kept; None for the user's cache.
+        tell: called while a copy is made, and not where there is one already.
     """
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
     default = os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenematch")
@@ -135,11 +154,11 @@ def open_metric_copy(
     name = _key(source, cache)
     make, name = (_tiled, name) if is_large(grid) else (_single, f"{name}.tif")
     try:
-        return make(cache / name, source, reader, grid)
+        return make(cache / name, source, reader, grid, tell)
     except OSError:
         folder = tempfile.mkdtemp(prefix="scenematch-")
     with map_errors("map", source.path):
-        copy = make(Path(folder) / name, source, reader, grid)
+        copy = make(Path(folder) / name, source, reader, grid, tell)
     weakref.finalize(copy, shutil.rmtree, folder, ignore_errors=True)
     return copy
 
@@ -147,6 +166,9 @@ def open_metric_copy(
 def _key(source: Source, cache: Path) -> str:
     digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
     digest.update(source.grid.pixel_to_crs.tobytes())
+    if isinstance(source.dataset, TileCache):  # too many files to read them all only to name the copy
+        digest.update(source.dataset.fingerprint())
+        return digest.hexdigest()
     if source.dataset.driver == "VRT":
         digest.update(source.dataset.name.encode())  # its text: which tile lies where
     for name in source.dataset.files:
@@ -170,7 +192,7 @@ def _file_hash(path: Path, cache: Path) -> str:
     return digest
 
 
-def _single(target: Path, source: Source, reader: GrayReader | None, grid: Grid) -> Source:
+def _single(target: Path, source: Source, reader: GrayReader | None, grid: Grid, tell: Tell | None) -> Source:
     """A copy in one file.
 
     Raises:
@@ -180,31 +202,33 @@ def _single(target: Path, source: Source, reader: GrayReader | None, grid: Grid)
     if cached is not None:
         return cached
     target.parent.mkdir(parents=True, exist_ok=True)
-    whole = Window(0, 0, grid.width_px, grid.height_px)
-    _write(target, reader or GrayReader(source), source.grid, grid, whole)
+    whole, tally = Window(0, 0, grid.width_px, grid.height_px), _Tally(grid, tell)
+    _write(target, reader or GrayReader(source), source.grid, grid, whole, tally)
     copy = _cached(target, grid)
     if copy is None:
         raise OSError(f"{target} could not be read back")
     return copy
 
 
-def _tiled(folder: Path, source: Source, reader: GrayReader | None, grid: Grid) -> Source:
+def _tiled(folder: Path, source: Source, reader: GrayReader | None, grid: Grid, tell: Tell | None) -> Source:
     """A large copy: the tiles that are missing or not what the list says are made, the others stay.
 
     Raises:
         OSError: a tile cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    listed = _read_list(folder / LIST)
+    listed, tally = _read_list(folder / LIST), _Tally(grid, tell)
     tiles = list(_blocks(Window(0, 0, grid.width_px, grid.height_px), TILE_PX))
     for tile in tiles:
         target = folder / f"{tile.y0 // TILE_PX:04d}-{tile.x0 // TILE_PX:04d}.tif"
         told = listed.get(target.name)
         if told == ("-" if not target.exists() else _file_hash(target, folder.parent)):
+            tally.add(tile.area_px, quietly=True)
             continue
+        tally.add(0)  # what comes next may take a while before it has made anything
         reader = reader or GrayReader(source)
         corner = tile in (tiles[0], tiles[-1])  # the grid ends where they do
-        holds_map = _write(target, reader, source.grid, grid, tile, even_empty=corner)
+        holds_map = _write(target, reader, source.grid, grid, tile, tally, even_empty=corner)
         told = _file_hash(target, folder.parent) if holds_map else "-"
         with (folder / LIST).open("a", encoding="ascii") as stream:
             stream.write(f"{target.name} {told}\n")
@@ -236,7 +260,14 @@ def _cached(path: Path, grid: Grid) -> Source | None:
 
 
 def _write(
-    target: Path, reader: GrayReader, source: Grid, grid: Grid, part: Window, *, even_empty: bool = True
+    target: Path,
+    reader: GrayReader,
+    source: Grid,
+    grid: Grid,
+    part: Window,
+    tally: _Tally,
+    *,
+    even_empty: bool = True,
 ) -> bool:
     """Write a part of the copy beside its place and move it there in one step; whether it holds any map.
 
@@ -263,6 +294,7 @@ def _write(
                 place = (window.x0 - part.x0, window.y0 - part.y0)
                 dataset.write(block, window=RasterWindow(*place, window.width_px, window.height_px))
                 holds_map = holds_map or bool(block[1].any())
+                tally.add(window.area_px)
             if is_tile:
                 dataset.build_overviews(_FACTORS, Resampling.average)
         if holds_map or even_empty:

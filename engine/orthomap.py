@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from engine.errors import DtypeError, MapError, ShapeError
 from engine.geo import LocalFrame
 from engine.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
-from engine.metric_copy import is_large, needs_copy, open_metric_copy
+from engine.metric_copy import Tell, is_large, needs_copy, open_metric_copy
 from engine.pyramid import Arrays, Pyramid, Reader
 from engine.rasters import (
     GEOREFERENCE_TAG,
@@ -100,6 +100,7 @@ class OrthoMap:
         cache_dir: str | os.PathLike[str] | None = None,
         georeference_sigma_m: float | None = None,
         slope_sigma_deg: float | None = None,
+        on_copy: Tell | None = None,
     ) -> OrthoMap:
         """Open a GeoTIFF, or a picture whose place is given, with an optional surface model.
 
@@ -115,6 +116,8 @@ class OrthoMap:
             georeference_sigma_m: how well the map lies; None takes what the file says, see
                 :data:`engine.rasters.GEOREFERENCE_TAG`.
             slope_sigma_deg: how well the surface leans; None takes what its file says.
+            on_copy: called while a copy is made for the cache, with the pixels that it has and those that it will
+                have.
 
         Raises:
             MapError: a file cannot be read or placed on the Earth, or the surface lies elsewhere.
@@ -125,7 +128,7 @@ class OrthoMap:
         reader = None if copied and is_large(original.grid) else GrayReader(original)
         share = None if reader is None else reader.invalid_share
         if copied:
-            used = open_metric_copy(original, reader, cache_dir)
+            used = open_metric_copy(original, reader, cache_dir, on_copy)
             reader = GrayReader(used, find_collar=False)
         assert reader is not None  # of the file or of its copy
         facts = {
@@ -353,6 +356,11 @@ class OrthoMap:
         """Pixels (..., 2) of WGS84 latitude and longitude in degrees."""
         lat, lon = np.broadcast_arrays(np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64))
         return self._from_geodetic(np.stack([lon, lat], axis=-1))
+
+    @property
+    def from_file(self) -> bool:
+        """Whether the map was opened from a file; one of arrays in memory was not."""
+        return "path" in self._facts
 
     def info(self) -> dict[str, Any]:
         """Facts about the map that JSON can hold; ``convergence_deg`` is the true heading of the map's up."""

@@ -131,7 +131,7 @@ class Pyramid:
         return 1.0 - float(self._level(self._base)[1].mean())
 
     def valid_at(self, xy_px: Array) -> Mask:
-        """Validity (...,) of the nearest pixel at the finest level in memory."""
+        """Validity (...,) at places (..., 2) of level 0, cut to whole pixels of the finest level in memory."""
         height, width = self.shape(self._base)
         x, y = np.moveaxis(xy_px.astype(np.intp) >> self._base, -1, 0)
         return np.asarray(self._level(self._base)[1][np.minimum(y, height - 1), np.minimum(x, width - 1)])

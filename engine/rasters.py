@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.grids import Array, Grid, apply_affine, earth_crs, overlap, wgs84
+from engine.motion import WIDEST_M
 from engine.tiles import local_path, openable
 from engine.types import Window
+from engine.xyz import TileCache, is_tile_cache, open_tile_cache
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -68,13 +70,13 @@ def stated_sigma(given: float | None, source: Source | None, tag: str, argument:
     """The accuracy that was given, else the one that a file says of itself, else None.
 
     Raises:
-        OptionError: what was given is not a finite number above 0.
+        OptionError: what was given is not a number above 0, or wider than any map.
         MapError: what the file says is not one.
     """
     text = None if source is None else source.dataset.tags().get(tag)
     if given is not None:
-        if not 0.0 < given < math.inf:
-            raise OptionError(f"{argument}: expected a number above 0, got {given}")
+        if not 0.0 < given <= WIDEST_M:
+            raise OptionError(f"{argument}: expected a number above 0 and at most {WIDEST_M:g}, got {given}")
         return float(given)
     if source is None or text is None:
         return None
@@ -82,8 +84,8 @@ def stated_sigma(given: float | None, source: Source | None, tag: str, argument:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0.0 < value < math.inf:
-        raise MapError(f"{source.path}: expected a number above 0 as {tag}, got {text!r}")
+    if not 0.0 < value <= WIDEST_M:
+        raise MapError(f"{source.path}: expected a number above 0 and at most {WIDEST_M:g} as {tag}, got {text!r}")
     return value
 
 
@@ -113,7 +115,8 @@ def open_source(
     """Open a local raster and find where it lies.
 
     Args:
-        path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a VRT, or a folder of tiles.
+        path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a VRT, a folder of georeferenced
+            tiles, or one of tiles by their names, z/x/y.png.
         argument: what a message calls the file.
         bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
             and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).
@@ -126,8 +129,11 @@ def open_source(
 
     file = local_path(path, argument)
     with map_errors(argument, file):
-        what, driver = openable(file, argument)
-        dataset = rasterio.open(what, driver=driver)
+        if file.is_dir() and is_tile_cache(file):
+            dataset: Any = open_tile_cache(file, argument)
+        else:
+            what, driver = openable(file, argument)
+            dataset = rasterio.open(what, driver=driver)
         transform, own_crs = dataset.transform, dataset.crs
     width, height = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
@@ -344,6 +350,8 @@ def surface_part(source: Source, grid: Grid) -> Window:
         MapError: it holds no heights, or lies elsewhere.
     """
     dtype = source.dataset.dtypes[0]
+    if isinstance(source.dataset, TileCache):
+        raise MapError(f"surface: expected heights, got a folder of pictures, {source.path}")
     if np.dtype(dtype).kind not in "iuf":
         raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
     low, high = overlap(grid, source.grid)

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import View, enhance, rectify, view_of
-from engine.camera import Camera
-from engine.errors import OptionError
+from engine.align import enhance
+from engine.audit_plan import Plan
 from engine.integrity import score_sigma
 from engine.methods.laid import NccOptions
 from engine.methods.query import level_for
@@ -26,8 +24,8 @@ from engine.ncc_fft import surface
 from engine.orthomap import OrthoMap
 from engine.peaks import fit_summit
 from engine.prepared import PreparedMap
-from engine.types import Attitude, Window, check_positive
-from engine.window import place_window, window_size_px
+from engine.types import Window
+from engine.window import SPREAD_SIGMAS, place_window, window_size_px
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -39,30 +37,7 @@ _TURN_DEG, _GROWTH, _SHIFT_PX = 1.0, 1.01, 0.4  # what telemetry and level leave
 _NOISE_SD = 3.0  # grey levels, of the sensor
 _CHANGE, _CHANGE_PX = 1.0, 2.0  # other ground: deviations of the enhanced picture, and its size
 _SHAKE_PX, _SHAKE_BLUR_PX = 2.0, 1.0  # how far the edges move, and a blur: a change that only fine texture minds
-# Larger templates cost time and change the answer little: the audit then takes a coarser level.
-_MAX_TEMPLATE_PX = 320
-_SLACK_SIGMAS = 3.0  # as Query.window
 _NEAR_PX = 3  # the changed patch is at its place if it is within so many pixels
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AuditOptions:
-    """What is assumed of the flights that the audit is for.
-
-    Attributes:
-        prior_sigma_m: how well the position is known before a match.
-        spacing: of the places, as a share of the frame's footprint.
-        max_cells: a large map gets wider spacing, so that there are no more places than this.
-        ncc: settings of the NCC method.
-    """
-
-    prior_sigma_m: float = 10.0
-    spacing: float = 0.25
-    max_cells: int = 4000
-    ncc: NccOptions = field(default_factory=NccOptions)
-
-    def __post_init__(self) -> None:
-        check_positive(self, "prior_sigma_m", "spacing", "max_cells")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,125 +65,16 @@ class Evidence:
     other_lead: Array
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Where an audit looks, and at what.
-
-    Attributes:
-        site: the map.
-        camera: what the map will be seen by.
-        height_agl_m: from where.
-        options: settings.
-        level: of the map's pyramid.
-        view: of a level camera that looks north, in pixels of the level.
-        shape: (h, w) of a template.
-        cells: (rows, columns) of places.
-        other: the same ground at another date, or None.
-    """
-
-    site: OrthoMap
-    camera: Camera
-    height_agl_m: float
-    options: AuditOptions
-    level: int
-    view: View
-    shape: tuple[int, int]
-    cells: tuple[int, int]
-    other: OrthoMap | None = None
-
-    def __len__(self) -> int:
-        return self.cells[0] * self.cells[1]
-
-    @cached_property
-    def spacing_px(self) -> Array:
-        """(2,) between places along x and y, in pixels of the map."""
-        return np.array([self.site.width_px / self.cells[1], self.site.height_px / self.cells[0]])
-
-    @property
-    def exclusion_px(self) -> float:
-        """Rivals nearer than this are the peak itself, in pixels of the level."""
-        return self.options.ncc.rule.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
-
-    @cached_property
-    def places_px(self) -> Array:
-        """(rows, columns, 2) where the middle of the frame looks, in pixels of the map."""
-        j, i = np.mgrid[: self.cells[0], : self.cells[1]]
-        return np.stack([i + 0.5, j + 0.5], axis=-1) * self.spacing_px - 0.5
-
-    def corner_px(self, place_px: Array) -> tuple[int, int]:
-        """The top-left pixel of the level on which a template lies whose middle is at a place."""
-        x, y = self.site.level_from_full(place_px, self.level)
-        return round(float(x) - (self.shape[1] - 1) / 2.0), round(float(y) - (self.shape[0] - 1) / 2.0)
-
-    def holds(self, place_px: Array) -> bool:
-        """Whether a template at a place lies inside the map."""
-        (rows, columns), (x, y) = self.site.level_shape(self.level), self.corner_px(place_px)
-        return 0 <= x <= columns - self.shape[1] and 0 <= y <= rows - self.shape[0]
-
-
-def plan_audit(
-    site: OrthoMap,
-    camera: Camera,
-    height_agl_m: float,
-    options: AuditOptions | None = None,
-    other: OrthoMap | None = None,
-) -> Plan:
-    """Lay places over a map.
-
-    Args:
-        site: the map.
-        camera: what it will be seen by.
-        height_agl_m: from where, above 0.
-        options: settings; the defaults serve.
-        other: the same ground at another date, by which stale places are found.
-
-    Raises:
-        OptionError: the height is no height, the camera looks at the horizon, or a frame covers more than the
-            map or next to nothing of it.
-    """
-    options = options or AuditOptions()
-    if not (math.isfinite(height_agl_m) and height_agl_m > 0):
-        raise OptionError(f"height_agl_m: expected metres above 0, got {height_agl_m:g}")
-    middle = np.array([site.width_px - 1, site.height_px - 1]) / 2.0
-    level = level_for(site.gsd_m_per_px, height_agl_m / camera.focal_px, site.levels)
-    blank = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    while True:
-        jacobian = site.enu_jacobian(middle) * 2.0**level
-        view = view_of(camera, Attitude(0.0, 0.0, 0.0), height_agl_m, jacobian)
-        if view is None:
-            raise OptionError("camera: expected one that looks down, got a mount that looks at the horizon")
-        rows, columns = site.level_shape(level)
-        if max(view.footprint_px) > max(rows, columns):
-            size = " x ".join(f"{n * 2**level * site.gsd_m_per_px:.0f}" for n in view.footprint_px)
-            extent = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
-            raise OptionError(
-                f"height_agl_m: expected a frame within the map's {extent} m, got {size} m from {height_agl_m:g} m"
-            )
-        patch = rectify(blank, camera, view, fraction=options.ncc.fraction)
-        if patch is None:
-            raise OptionError(
-                f"height_agl_m: expected a frame of 8 x 8 map pixels or more, got less from {height_agl_m:g} m"
-            )
-        if max(patch.gray.shape) <= _MAX_TEMPLATE_PX or level == site.levels - 1:
-            break
-        level += 1
-    shape = (patch.gray.shape[0], patch.gray.shape[1])
-    step = options.spacing * math.sqrt(view.area_px) * 2.0**level
-    step = max(step, math.sqrt(site.width_px * site.height_px / options.max_cells))
-    cells = (math.ceil(site.height_px / step), math.ceil(site.width_px / step))
-    return Plan(site, camera, height_agl_m, options, level, view, shape, cells, other)
-
-
 # ------------------------------------------------------------------------------------------------- measuring
 
 
 def measure(plan: Plan) -> Iterator[Evidence]:
-    """The evidence at each place, row by row; the map is read as the places need it."""
+    """The evidence at each place that is looked at, row by row; the map is read as the places need it."""
     options = plan.options.ncc
     prepared = PreparedMap(plan.site, torch.device("cpu"), options.enhance_radius_px, options.score)
     noise = _noise(plan.shape)
     with torch.inference_mode():
-        for place in plan.places_px.reshape(-1, 2):
+        for place in plan.places_px[plan.looked]:
             yield _measure(plan, prepared, noise, place)
 
 
@@ -259,7 +125,7 @@ def _window(plan: Plan, middle_px: Array) -> Window:
     """The adaptive window about a place (eq. 4, 5) with the slack that the prior asks for; pixels of the level."""
     site, level, (height, width) = plan.site, plan.level, plan.shape
     rows, columns = site.level_shape(level)
-    slack = 2.0 * _SLACK_SIGMAS * plan.options.prior_sigma_m / (site.gsd_m_per_px * 2.0**level)
+    slack = 2.0 * SPREAD_SIGMAS * plan.options.prior_sigma_m / (site.gsd_m_per_px * 2.0**level)
     size = window_size_px(plan.view.footprint_px, (0.0, 0.0), margin=plan.options.ncc.margin)
     size = (max(size[0], width + 4 + slack), max(size[1], height + 4 + slack))
     window = place_window((float(middle_px[0]), float(middle_px[1])), size, (columns, rows))

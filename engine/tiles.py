@@ -116,7 +116,9 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
     """
     tiles = [_read_tile(file, driver, argument) for file, driver in _rasters_in(folder)]
     if not tiles:
-        raise MapError(f"{argument}: expected raster files in the folder {folder}, found none")
+        raise MapError(
+            f"{argument}: expected raster files in the folder {folder}, or tiles as z/x/y.png below it, found none"
+        )
     first = tiles[0]
     for tile in tiles[1:]:
         _check_beside(first, tile, argument)

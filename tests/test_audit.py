@@ -11,12 +11,13 @@ from pyproj import Transformer
 
 from bench.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
-from engine.audit import Flag, audit, predict, probability
+from engine.audit import Flag, audit_map, predict, probability
+from engine.audit_plan import AuditOptions, plan_audit
 from engine.cli.app import run
 from engine.errors import OptionError, TelemetryError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
-from engine.self_match import AuditOptions, measure, plan_audit
+from engine.self_match import measure
 from engine.sim import build_town
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
@@ -52,7 +53,7 @@ def site(patchwork):
 
 @pytest.fixture(scope="module")
 def found(site):
-    return audit(site, CAMERA, HEIGHT_M)
+    return audit_map(site, CAMERA, HEIGHT_M)
 
 
 def well_inside(found, x0, y0):
@@ -112,8 +113,8 @@ def test_another_date_finds_what_changed(town_gray):
     later = town_gray.copy()
     later[:, HALF:] = town_gray[::-1, ::-1][:, HALF:]
     sites = [OrthoMap.from_arrays(gray, GRID, "EPSG:32614") for gray in (town_gray, later)]
-    found = audit(sites[0], CAMERA, HEIGHT_M, other=sites[1])
-    alone = audit(sites[0], CAMERA, HEIGHT_M)
+    found = audit_map(sites[0], CAMERA, HEIGHT_M, other=sites[1])
+    alone = audit_map(sites[0], CAMERA, HEIGHT_M)
     x = found.plan.places_px[..., 0]
     known = ~np.isnan(found.availability)
     reach = found.plan.view.footprint_px[0]
@@ -126,7 +127,7 @@ def test_another_date_finds_what_changed(town_gray):
 
 
 def test_the_same_map_gives_the_same_audit(site, found):
-    again = audit(site, CAMERA, HEIGHT_M)
+    again = audit_map(site, CAMERA, HEIGHT_M)
     assert np.array_equal(again.availability, found.availability, equal_nan=True)
 
 
@@ -180,7 +181,7 @@ def test_where_a_forward_camera_looks_counts_not_where_it_is(site):
     """A camera that is mounted 20 degrees ahead sees the water before it is over it, whichever way it flies."""
     turn = cv2.Rodrigues(np.array([0.0, np.radians(20.0), 0.0]))[0]
     ahead = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
-    found = audit(site, ahead, HEIGHT_M)
+    found = audit_map(site, ahead, HEIGHT_M)
     east = predict(found, *lat_lon(site, [[HALF, 250], [HALF + 20, 250]]))
     west = predict(found, *lat_lon(site, [[HALF + 20, 250], [HALF, 250]]))
     assert abs(east.availability - west.availability) > 0.1
@@ -346,10 +347,10 @@ def test_a_folder_that_exists_is_kept_unless_forced(map_file, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "code", "words"),
     [
-        (["--height-agl=0"], 2, "height_agl_m"),
-        (["--height-agl=nan"], 2, "height_agl_m"),
-        (["--height-agl=9000"], 2, "height_agl_m"),
-        (["--sigma-m=-1"], 2, "prior_sigma_m"),
+        (["--height-agl=0"], 2, "--height-agl: expected"),
+        (["--height-agl=nan"], 2, "--height-agl: expected"),
+        (["--height-agl=9000"], 2, "--height-agl: expected"),
+        (["--sigma-m=-1"], 2, "--sigma-m: expected"),
         (["--route=nowhere.plan"], 1, "nowhere.plan"),
         (["--camera=nowhere.yaml"], 1, "nowhere.yaml"),
         (["--surface=nowhere.tif"], 1, "nowhere.tif"),

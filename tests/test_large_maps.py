@@ -1,5 +1,6 @@
 """Large maps: matched as a small one is, in bounded memory; copies that are carried on; searches refused."""
 
+import io
 import tracemalloc
 
 import cv2
@@ -9,8 +10,11 @@ import rasterio
 from affine import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
+from rich.console import Console
 
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher, metric_copy
+from engine.cli import console
+from engine.cli.app import run
 from engine.cli.checks import check_start
 from engine.rasters import GrayReader
 from engine.types import Window
@@ -267,6 +271,54 @@ def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limit
     count = len(made)
     same(OrthoMap.open(picture, cache_dir=cache), site)
     assert len(made) == count
+
+
+@pytest.mark.parametrize("picture", ["metric", "in degrees"], indirect=True)
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(picture, tmp_path, request, size):
+    if size == "large":
+        request.getfixturevalue("tiny_limits")
+    told = []
+
+    def opened():
+        return OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: told.append(pixels))
+
+    site = opened()
+    if size == "small" and not site.info()["resampled"]:
+        assert told == []  # nothing to copy
+        return
+    area_px, done = site.width_px * site.height_px, [pixels for pixels, _ in told]
+    assert told[-1] == (area_px, area_px)
+    assert done == sorted(done)
+    assert {total for _, total in told} == {area_px}
+    if size == "large":
+        assert done[0] == 0  # before anything is read
+        assert len(told) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
+    count = len(told)
+    opened()
+    assert len(told) == count
+
+
+def test_a_copy_that_is_carried_on_begins_where_it_was(picture, tmp_path, tiny_limits):
+    OrthoMap.open(picture, cache_dir=tmp_path / "cache")
+    (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.name != "hashes")
+    (folder / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
+    told = []
+    OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: told.append(pixels))
+    assert told == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tiny_limits, monkeypatch, terminal):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    stream = io.StringIO()
+    monkeypatch.setattr(console, "_errors", Console(file=stream, force_terminal=terminal, width=100))
+    assert run(["map", "info", str(picture)]) == 0
+    assert ("copying the map into the cache" in stream.getvalue()) == terminal
+    assert stream.getvalue() == "" or terminal
+    shown = stream.getvalue()
+    assert run(["map", "info", str(picture)]) == 0
+    assert stream.getvalue() == shown  # the copy is there
 
 
 @pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "list cut off", "no list"])

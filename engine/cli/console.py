@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rich import box
 from rich.console import Console
+from rich.progress import Progress
 from rich.progress import track as rich_track
 from rich.table import Table
 from rich.text import Text
@@ -29,6 +31,25 @@ def progress(items: Iterable[T], total: int, description: str) -> Iterator[T]:
     """The same items, with a bar on a terminal and nothing in a pipe."""
     shown = _errors.is_terminal
     yield from rich_track(items, description, total, console=_errors, disable=not shown, transient=True)
+
+
+@contextmanager
+def told_progress(description: str) -> Iterator[Callable[[int, int], None]]:
+    """A function to be told how much is done and how much there is: a bar on a terminal from then on.
+
+    So what turns out to take no time shows nothing, as everything does in a pipe.
+    """
+    shown = Progress(console=_errors, disable=not _errors.is_terminal, transient=True)
+    task = shown.add_task(description)
+
+    def tell(done: int, total: int) -> None:
+        shown.start()  # once is as good as often
+        shown.update(task, completed=done, total=total)
+
+    try:
+        yield tell
+    finally:
+        shown.stop()
 
 
 def print_json(value: Any) -> None:

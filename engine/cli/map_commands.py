@@ -24,9 +24,9 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Size, ground sample distance, CRS, bounds."""
-    from engine.orthomap import OrthoMap
+    from engine.cli.arguments import open_map
 
-    console.facts(OrthoMap.open(map_path, surface=surface).info(), as_json, title=str(map_path))
+    console.facts(open_map(map_path, surface).info(), as_json, title=str(map_path))
 
 
 def audit(
@@ -44,6 +44,14 @@ def audit(
         Path | None,
         typer.Option("--route", metavar="FILE", help="GeoJSON LineString, or a QGroundControl .plan."),
     ] = None,
+    around: Annotated[
+        str | None,
+        typer.Option("--around", metavar="LAT,LON,RADIUS_M", help="Only what lies so near to a place."),
+    ] = None,
+    corridor: Annotated[
+        float | None,
+        typer.Option("--corridor-m", metavar="M", help="Only what lies so near to the route."),
+    ] = None,
     other: Annotated[
         Path | None,
         typer.Option("--other", metavar="FILE", help="The same ground at another date; finds what is stale."),
@@ -58,10 +66,11 @@ def audit(
     """Where frames can be matched, and where not.
 
     Writes matchability.tif (probability of a fix by NCC), audit.png and summary.json. With --route the
-    availability along it is predicted, and its poor stretches are listed.
+    availability along it is predicted, and its poor stretches are listed. A huge map is audited in part: around a
+    place, along the route, or both.
     """
     from engine.cli.audit import Inputs, run_audit
 
     use_threads(threads)
-    inputs = Inputs(map_path, surface, camera, route, other, height_agl)
+    inputs = Inputs(map_path, surface, camera, route, other, height_agl, around, corridor)
     run_audit(inputs, out, sigma_m=sigma, force=force, as_json=as_json)

@@ -40,13 +40,14 @@ def draw_audit(path: str | Path, audit: Audit, route: Route | None = None, *, ti
     """
     from matplotlib.figure import Figure
 
-    site = audit.plan.site
+    site, part = audit.plan.site, audit.plan.window
     scale = site.gsd_m_per_px
-    extent = (0.0, site.width_px * scale, site.height_px * scale, 0.0)
-    height_in = float(np.clip((_WIDTH_IN - 2.0) * site.height_px / site.width_px, 3.0, _LONGEST_IN))
+    right, bottom = part.x0 + part.width_px, part.y0 + part.height_px
+    extent = (part.x0 * scale, right * scale, bottom * scale, part.y0 * scale)
+    height_in = float(np.clip((_WIDTH_IN - 2.0) * part.height_px / part.width_px, 3.0, _LONGEST_IN))
     figure = Figure(figsize=(_WIDTH_IN, height_in + 1.6), layout="constrained")
     ax = figure.subplots()
-    ax.imshow(_background(site), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
+    ax.imshow(_background(site, part), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
     shown = ax.imshow(
         np.ma.masked_invalid(audit.availability),
         cmap="viridis",
@@ -72,15 +73,17 @@ def draw_audit(path: str | Path, audit: Audit, route: Route | None = None, *, ti
     return path
 
 
-def _background(site: OrthoMap) -> Any:
-    """The map in grey at the coarsest level that still shows; white where it has no data."""
+def _background(site: OrthoMap, part: Window) -> Any:
+    """A part of the map in grey at the coarsest level that still shows; white where it has no data."""
     level = 0
-    while level + 1 < site.levels and max(site.level_shape(level)) > _MAP_PX:
+    while level + 1 < site.levels and max(part.width_px, part.height_px) >> level > _MAP_PX:
         level += 1
     rows, columns = site.level_shape(level)
-    whole = Window(0, 0, columns, rows)
-    gray = site.gray(whole, level)
-    gray[~site.valid(whole, level)] = 255
+    x0, y0 = min(part.x0 >> level, columns - 1), min(part.y0 >> level, rows - 1)
+    width, height = max(1, part.width_px >> level), max(1, part.height_px >> level)
+    shown = Window(x0, y0, min(width, columns - x0), min(height, rows - y0))
+    gray = site.gray(shown, level)
+    gray[~site.valid(shown, level)] = 255
     return gray
 
 
