@@ -20,11 +20,10 @@ References:
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from engine.descriptors import describe, dominant_angle, normalise
+from engine.descriptors import describe, dominant_angle
 from engine.device import in_parallel
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.keypoints import Points, allowed, detect, rank, strongest
@@ -130,48 +129,10 @@ def _fields(features: Features) -> tuple[Tensor, ...]:
     return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid
 
 
-def opencv_sift(
-    images: np.ndarray, *, max_keypoints: int = 300, contrast_threshold: float = 0.04, root: bool = False
-) -> Features:
-    """Detect and describe with ``cv2.SIFT``, the plain recipe's detector.
-
-    Positions carry OpenCV's bias of +0.25 px in x and y that comes from its upsampling.
-
-    Args:
-        images: (H, W) or (B, H, W) uint8.
-        max_keypoints: Number of slots N. OpenCV counts each orientation of a place as a keypoint.
-        contrast_threshold: As in :func:`sift`.
-        root: Return RootSIFT instead of the L2-normalised descriptor.
-
-    Returns:
-        Features on the CPU.
-    """
-    import cv2
-
-    if images.ndim not in (2, 3):
-        raise ShapeError(f"images: expected (H, W) or (B, H, W), got {images.shape}")
-    if images.dtype != np.uint8:
-        raise DtypeError(f"images: expected uint8, got {images.dtype}")
-    _check_options(max_keypoints, 2, contrast_threshold, 1)
-    batch = images if images.ndim == 3 else images[None]
-    detector = cv2.SIFT_create(nfeatures=max_keypoints, contrastThreshold=contrast_threshold)
-    slots = np.zeros((len(batch), max_keypoints, 4 + 128), np.float32)
-    valid = np.zeros((len(batch), max_keypoints), bool)
-    for b, image in enumerate(batch):
-        keypoints, descriptors = detector.detectAndCompute(image, None)
-        count = min(len(keypoints), max_keypoints)
-        if count:
-            slots[b, :count, :4] = [(*k.pt, k.size / 2, k.angle % 360) for k in keypoints[:count]]
-            slots[b, :count, 4:] = descriptors[:count]
-            valid[b, :count] = True
-    values = torch.from_numpy(slots)
-    described = normalise(values[..., 4:], root=root)
-    return Features(values[..., :2], values[..., 2], values[..., 3], described, torch.from_numpy(valid))
-
-
 _TRAIN_CHUNK = 4096  # train slots that are compared at a time, so that a whole map's never lie in memory at once
 _FAR = 1e30
 _FORBIDDEN = -2.0  # below every cosine
+_ROUNDING = 2e-3  # distance that float32 may leave between a descriptor and itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +142,8 @@ class Matches:
     Attributes:
         train_index: (B, N) int64.
         distance: (B, N) Euclidean distance of the descriptors, in [0, 2]; infinite where none was allowed.
-        ratio: (B, N) distance over the second nearest's, in [0, 1]; 0 where there is no second.
+        ratio: (B, N) distance over the second nearest's, in [0, 1]; 0 where there is no second, 1 where both are
+            0.
         valid: (B, N) bool.
     """
 
@@ -233,7 +195,8 @@ def match(
             found.append(_two_nearest(cosine, begin))
         first, index, second, is_back = found[0] if len(found) == 1 else _merged(found)
         nearest, next_nearest = _distance(first), _distance(second)
-        quotient = (nearest / next_nearest.clamp_min(1e-6)).nan_to_num(1.0)
+        # Of two alike neither wins, also where rounding puts one of them at 0.
+        quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
         valid = nearest.isfinite() & (quotient <= ratio)
         if mutual:
             valid &= is_back

@@ -34,7 +34,10 @@ MAX_PER_CELL = 96
 PREPARED_PX = 16 << 20
 """Levels are prepared at once, and searched as a whole, up to this many pixels."""
 MAX_LANDMARKS = 1 << 19
-"""Landmarks kept in memory, besides those of the window that was asked for last; one takes 300 bytes."""
+"""Landmarks kept in memory, besides those of the window that was asked for last; one takes 300 bytes.
+
+Where more were prepared before the flight as many as that are kept, up to 236 MB of them.
+"""
 _SLOTS = 8192  # more than the detector finds in a tile
 _STORED: Kinds = {
     "xy_px": (np.float32, (2,)),  # in pixels of the level
@@ -72,6 +75,7 @@ class LandmarkMap:
     def __init__(self, site: OrthoMap, device: torch.device) -> None:
         self._site, self._device = site, device
         self._tiles: dict[_Key, Arrays] = {}  # the one used last comes last
+        self._most = MAX_LANDMARKS
         self.made = 0
         """Tiles described so far."""
 
@@ -107,9 +111,11 @@ class LandmarkMap:
         for level in reversed(range(self._site.levels)) if levels is None else levels:
             pixels += math.prod(self._site.level_shape(level))
             if pixels > PREPARED_PX:
-                return
+                break
             for upright in (True, False):
                 self._prepare(level, upright)
+        # Memory for what is there, and no more: a large map, of which little is prepared, keeps to its bound.
+        self._most = max(self._most, sum(len(tile["rank"]) for tile in self._tiles.values()))
 
     def _prepare(self, level: int, upright: bool) -> None:
         rows, columns = self._site.level_shape(level)
@@ -117,7 +123,7 @@ class LandmarkMap:
         keys = _keys(whole, level, upright)
         if all(key in self._tiles for key in keys):
             return
-        if "path" not in self._site.info():
+        if not self._site.from_file:
             for key in keys:
                 self._tile(key)
             return
@@ -148,7 +154,7 @@ class LandmarkMap:
         tiles = list(self._tiles.items())
         used = sum(len(tile["rank"]) for _, tile in tiles)
         for key, tile in tiles[: len(tiles) - keep]:
-            if used <= MAX_LANDMARKS:
+            if used <= self._most:
                 break
             used -= len(tile["rank"])
             self._tiles.pop(key, None)

@@ -207,7 +207,7 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
             found = _coarse_to_fine(search, template, exclusion_px)
             if found is not None:
                 return found
-        return find_peak(surface(search, template[None]), exclusion_px=exclusion_px)
+        return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)
 
 
 def _peak_on_device(search: Search, template: Tensor, exclusion_px: float) -> Peak:

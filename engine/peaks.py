@@ -14,26 +14,26 @@ _TILED_PX = 1 << 18
 _TILE_PX = 16
 
 
-def best_places(scores: Tensor, separation: int, count: int) -> list[tuple[int, int, float]]:
-    """The ``count`` highest places (x, y, score) of (H, W) that are more than ``separation`` apart.
+def best_places(scores: Tensor, separation_px: int, count: int) -> list[tuple[int, int, float]]:
+    """The ``count`` highest places (x, y, score) of (H, W) that are more than ``separation_px`` apart.
 
     Of every tile of a large surface only the highest place is a candidate.
     """
     values = scores.cpu().numpy()
     if values.size > _TILED_PX:
-        return _best_of_tiles(values, separation, count)
-    left, places = values.copy(), []
+        return _best_of_tiles(values, separation_px, count)
+    left, places, r = values.copy(), [], separation_px
     for _ in range(count):
         y, x = divmod(int(left.argmax()), left.shape[1])
         score = float(left[y, x])
         if score <= -1.0:
             break
         places.append((x, y, score))
-        left[max(0, y - separation) : y + separation + 1, max(0, x - separation) : x + separation + 1] = -1.0
+        left[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
     return places
 
 
-def _best_of_tiles(values: NDArray[np.float32], separation: int, count: int) -> list[tuple[int, int, float]]:
+def _best_of_tiles(values: NDArray[np.float32], separation_px: int, count: int) -> list[tuple[int, int, float]]:
     height, width = (-(-n // _TILE_PX) for n in values.shape)
     padded = np.full((height * _TILE_PX, width * _TILE_PX), -1.0, np.float32)
     padded[: values.shape[0], : values.shape[1]] = values
@@ -46,7 +46,7 @@ def _best_of_tiles(values: NDArray[np.float32], separation: int, count: int) -> 
         tile = padded[j * _TILE_PX : (j + 1) * _TILE_PX, i * _TILE_PX : (i + 1) * _TILE_PX]
         y, x = divmod(int(tile.argmax()), _TILE_PX)
         y, x, score = y + j * _TILE_PX, x + i * _TILE_PX, float(tile[y, x])
-        if score > -1.0 and all(max(abs(x - u), abs(y - v)) > separation for u, v, _ in places):
+        if score > -1.0 and all(max(abs(x - u), abs(y - v)) > separation_px for u, v, _ in places):
             places.append((x, y, score))
         if len(places) == count:
             break
@@ -54,36 +54,36 @@ def _best_of_tiles(values: NDArray[np.float32], separation: int, count: int) -> 
 
 
 def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
-    """The highest place of one surface (T, H', W'), refined below the pixel, with its best rival.
+    """The highest place of one surface (H', W'), refined below the pixel, with its best rival.
 
     Args:
-        scores: of T hypotheses; the peak is the highest over all of them.
-        exclusion_px: rivals nearer than this to the peak, under any hypothesis, are the peak itself.
+        scores: of one template, at least one place.
+        exclusion_px: rivals nearer than this to the peak are the peak itself.
 
     Returns:
         Peak: (x, y) by :func:`fit_summit`, never further than half a pixel from the best whole pixel;
         unrefined on the border of the surface.
     """
-    if scores.ndim != 3 or 0 in scores.shape:
-        raise ShapeError(f"scores: expected (T, H, W) with no empty axis, got {tuple(scores.shape)}")
+    if scores.ndim != 2 or 0 in scores.shape:
+        raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
     values = scores.cpu().numpy()
-    t, y, x = (int(v) for v in np.unravel_index(int(values.argmax()), values.shape))
+    y, x = divmod(int(values.argmax()), values.shape[1])
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
-    r = min(2, x, y, values.shape[2] - 1 - x, values.shape[1] - 1 - y)
+    r = min(2, x, y, values.shape[1] - 1 - x, values.shape[0] - 1 - y)
     if r > 0:
-        dx, dy, curvature = fit_summit(values[t, y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))
+        dx, dy, curvature = fit_summit(values[y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))
     second = _second_score(values, x, y, exclusion_px)
-    return Peak(x + dx, y + dy, float(values[t, y, x]), second, curvature, t)
+    return Peak(x + dx, y + dy, float(values[y, x]), second, curvature)
 
 
 def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: float) -> float:
-    """The best of (T, H, W) outside a disc about the peak: the strips around the disc's box, then its corners."""
-    height, width = scores.shape[1:]
+    """The best of (H, W) outside a disc about the peak: the strips around the disc's box, then its corners."""
+    height, width = scores.shape
     r = int(exclusion_px)
     x0, x1, y0, y1 = max(0, x - r), min(width, x + r + 1), max(0, y - r), min(height, y + r + 1)
     rows, columns = np.ogrid[y0 - y : y1 - y, x0 - x : x1 - x]
-    outside = [scores[:, :y0], scores[:, y1:], scores[:, y0:y1, :x0], scores[:, y0:y1, x1:]]
-    outside.append(scores[:, y0:y1, x0:x1][:, rows * rows + columns * columns > exclusion_px * exclusion_px])
+    outside = [scores[:y0], scores[y1:], scores[y0:y1, :x0], scores[y0:y1, x1:]]
+    outside.append(scores[y0:y1, x0:x1][rows * rows + columns * columns > exclusion_px * exclusion_px])
     return max((float(part.max()) for part in outside if part.size), default=-1.0)
 
 

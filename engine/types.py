@@ -39,6 +39,10 @@ class Attitude:
     heading_deg: float
 
 
+# What is a finite number in every frame, or unknown.
+_FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One picture and what the vehicle knew when it was taken.
@@ -74,9 +78,7 @@ class Frame:
             raise ShapeError(f"image: expected (H, W) or (H, W, 3) with at least one pixel, got {shape}")
         if str(self.image.dtype).removeprefix("torch.") != "uint8":
             raise DtypeError(f"image: expected uint8, got {self.image.dtype}")
-        for name in ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg"):
-            _check_finite(name, getattr(self, name))
-        for name in ("east_velocity_mps", "north_velocity_mps"):
+        for name in _FINITE:
             _check_finite(name, getattr(self, name))
         if self.height_agl_m is not None and self.height_agl_m <= 0:
             raise TelemetryError(f"height_agl_m: expected a height above 0 m, got {self.height_agl_m}")
@@ -156,7 +158,6 @@ class Peak:
         score: NCC at the best whole pixel, in [-1, 1].
         second_score: the highest NCC outside the peak's exclusion zone, or -1 where nothing lies outside.
         curvature: (2, 2) second derivatives of the score at the peak, per square pixel (negative definite).
-        hypothesis: index of the winning template.
     """
 
     x: float
@@ -164,7 +165,6 @@ class Peak:
     score: float
     second_score: float
     curvature: NDArray[np.float64]
-    hypothesis: int = 0
 
 
 class Reason(enum.Enum):
@@ -212,7 +212,8 @@ class Fix:
             None where the method does not measure height.
         covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None its up entry is that of the height
             that the frame came with.
-        attitude: what the method measured, or None where it does not measure attitude.
+        attitude: what the method measured, or None where it measures none. Where NCC's peak was searched for over
+            headings or heights and not refined, only the heading is; roll and pitch are the frame's, or 0.
         score: NCC in [-1, 1], or for SIFT the share of matches that agree with the pose.
         method: "ncc" or "sift".
         window: the crop of the map that was searched.

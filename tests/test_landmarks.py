@@ -261,3 +261,16 @@ def test_levels_are_prepared_from_the_coarsest_as_far_as_the_bound_goes(site, mo
     marks = LandmarkMap(site, CPU)
     marks.prepare()
     assert {level for level, *_ in marks._tiles} == set(range(1, site.levels))
+
+
+def test_what_was_prepared_is_not_given_up_in_flight(site, monkeypatch):
+    monkeypatch.setattr(landmarks, "MAX_LANDMARKS", 300)
+    marks = LandmarkMap(site, CPU)
+    marks.prepare()
+    made = marks.made
+    for level in reversed(range(site.levels)):
+        for upright in (False, True):
+            for window in (Window(0, 0, 60, 60), whole(site, level)):
+                marks.find(window, level, upright=upright)
+    assert sum(len(tile["rank"]) for tile in marks._tiles.values()) > 300
+    assert marks.made == made

@@ -215,13 +215,13 @@ def test_errors_name_the_argument_what_was_expected_and_what_came(search, templa
 def paraboloid(x0, y0, size=(15, 19), bend=((-0.05, 0.01), (0.01, -0.03)), top=0.8):
     y, x = np.mgrid[: size[0], : size[1]]
     d = np.stack([x - x0, y - y0], axis=-1)
-    return torch.from_numpy(top + 0.5 * np.einsum("...i,ij,...j", d, np.array(bend), d))[None]
+    return torch.from_numpy(top + 0.5 * np.einsum("...i,ij,...j", d, np.array(bend), d))
 
 
 @given(x0=st.floats(2.0, 16.0), y0=st.floats(2.0, 12.0))
 def test_the_peak_of_a_paraboloid_is_found_exactly(x0, y0):
     surface = paraboloid(x0, y0)
-    y, x = divmod(int(surface.argmax()), surface.shape[2])
+    y, x = divmod(int(surface.argmax()), surface.shape[1])
     assume(abs(x0 - x) <= 0.5)  # on a slanting ridge the best whole pixel need not be the nearest
     assume(abs(y0 - y) <= 0.5)
     peak = find_peak(surface, exclusion_px=3.0)
@@ -240,7 +240,7 @@ def test_the_peak_of_a_shifted_picture_is_found_below_the_pixel(dx, dy):
     picture = gaussian_filter(np.random.default_rng(8).normal(size=(90, 90)), 2.0)
     # The content moves by (dx, dy), so that the template lies at (30 - dx, 25 - dy) of the picture.
     template = shift(picture, (dy, dx), order=5, mode="mirror")[25:65, 30:70]
-    surface = ncc(torch.from_numpy(picture)[None], torch.from_numpy(template)[None, None])[0]
+    surface = ncc(torch.from_numpy(picture)[None], torch.from_numpy(template)[None, None])[0, 0]
     peak = find_peak(surface, exclusion_px=6.0)
     assert (peak.x, peak.y) == (pytest.approx(30 - dx, abs=0.03), pytest.approx(25 - dy, abs=0.03))
     assert peak.score > 0.95
@@ -249,19 +249,18 @@ def test_the_peak_of_a_shifted_picture_is_found_below_the_pixel(dx, dy):
 
 @given(
     seed=st.integers(0, 2**32 - 1),
-    size=st.tuples(st.integers(1, 3), st.integers(1, 14), st.integers(1, 14)),
+    size=st.tuples(st.integers(1, 14), st.integers(1, 14)),
     radius=st.one_of(st.floats(0.0, 20.0), st.integers(0, 15).map(float), st.just(np.sqrt(2.0)), st.just(5.0)),
 )
-def test_the_rival_is_the_best_score_outside_the_disc_under_any_hypothesis(seed, size, radius):
+def test_the_rival_is_the_best_score_outside_the_disc(seed, size, radius):
     surface = np.random.default_rng(seed).uniform(-0.9, 0.9, size).astype(np.float32)
     peak = find_peak(torch.from_numpy(surface), exclusion_px=radius)
-    t, y, x = np.unravel_index(surface.argmax(), size)
-    rows, columns = np.ogrid[: size[1], : size[2]]
+    y, x = np.unravel_index(surface.argmax(), size)
+    rows, columns = np.ogrid[: size[0], : size[1]]
     outside = (rows - y) ** 2 + (columns - x) ** 2 > radius * radius
-    expected = surface[:, outside].max() if outside.any() else -1.0
-    assert peak.score == surface[t, y, x]
+    expected = surface[outside].max() if outside.any() else -1.0
+    assert peak.score == surface[y, x]
     assert peak.second_score == pytest.approx(float(expected), abs=0)
-    assert peak.hypothesis == t
     assert abs(peak.x - x) <= 0.5
     assert abs(peak.y - y) <= 0.5
 
@@ -269,24 +268,24 @@ def test_the_rival_is_the_best_score_outside_the_disc_under_any_hypothesis(seed,
 @pytest.mark.parametrize("place", [(0, 0), (0, 9), (6, 0), (6, 9), (0, 4), (3, 0), (6, 5), (2, 9)])
 def test_a_peak_on_the_border_is_not_refined(place):
     y, x = place
-    surface = torch.rand(1, 7, 10, generator=torch.Generator().manual_seed(3)) * 0.5
-    surface[0, y, x] = 0.9
+    surface = torch.rand(7, 10, generator=torch.Generator().manual_seed(3)) * 0.5
+    surface[y, x] = 0.9
     peak = find_peak(surface, exclusion_px=1.0)
     assert (peak.x, peak.y) == (x, y)
     assert not peak.curvature.any()
 
 
-@pytest.mark.parametrize("size", [(1, 1, 1), (1, 3, 3), (2, 1, 8), (1, 12, 10)])
+@pytest.mark.parametrize("size", [(1, 1), (3, 3), (1, 8), (12, 10)])
 def test_a_surface_of_one_level_has_a_finite_peak(size):
     peak = find_peak(torch.full(size, 0.25), exclusion_px=2.0)
     assert peak.score == 0.25
     assert np.isfinite([peak.x, peak.y, peak.second_score]).all()
-    assert 0 <= peak.x < size[2]
-    assert 0 <= peak.y < size[1]
+    assert 0 <= peak.x < size[1]
+    assert 0 <= peak.y < size[0]
 
 
-@pytest.mark.parametrize("size", [(4, 4), (1, 0, 4), (1, 1, 4, 4)])
+@pytest.mark.parametrize("size", [(4,), (0, 4), (1, 4, 4)])
 def test_a_peak_needs_a_surface(size):
-    with pytest.raises(ShapeError, match=r"^\w+: expected \(T, H, W\) with no empty axis, got ") as caught:
+    with pytest.raises(ShapeError, match=r"^\w+: expected \(H, W\) with no empty axis, got ") as caught:
         find_peak(torch.zeros(size), exclusion_px=1.0)
     assert str(caught.value).split(":")[0] == next(iter(inspect.signature(find_peak).parameters))

@@ -1,6 +1,10 @@
-"""The only door to fast code: each function picks its kernel with plain ifs.
+"""Fast code, and the only door to NCC's: each function picks its kernel with plain ifs.
 
-Tests compare every kernel with :mod:`engine.kernels.reference`, which is slow, float64 and obvious.
+Tests compare every kernel of NCC with :mod:`engine.kernels.reference`, which is slow, float64 and obvious.
+
+The loops that numba compiles (of SIFT, of dense refinement, of the plane under a surface) have no door: who needs
+one imports it where it is called, since numba takes a while to import. Tests compare SIFT's with the tensor ops
+that they stand for, the others with OpenCV and difference quotients.
 """
 
 from __future__ import annotations
@@ -61,21 +65,19 @@ def products(image: Tensor, templates: Tensor) -> Tensor:
     return eager.products(image, templates)
 
 
-def peak(products: Tensor, inverse_norms: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
     """Best score (T,) of every template's numerators and its flat place (T,) in (H', W'), the lowest of equals.
 
-    Where ``valid`` (H', W') is False a place scores -1. Nothing leaves the device.
+    Nothing leaves the device.
     """
     if _by_triton(products):
         from engine.kernels import triton_peak
 
-        return triton_peak.peak(products, inverse_norms, valid)
-    return eager.peak(products, inverse_norms, valid)
+        return triton_peak.peak(products, inverse_norms)
+    return eager.peak(products, inverse_norms)
 
 
-def rival(
-    products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int, valid: Tensor | None = None
-) -> Tensor:
+def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
     """Best score (T,) of every template's numerators outside a disc about a flat place; -1 where nothing is.
 
     Places whose squared distance from ``winner`` (one int64) is at most ``radius_squared`` lie inside.
@@ -83,8 +85,8 @@ def rival(
     if _by_triton(products):
         from engine.kernels import triton_peak
 
-        return triton_peak.rival(products, inverse_norms, valid, winner, radius_squared)
-    return eager.rival(products, inverse_norms, valid, winner, radius_squared)
+        return triton_peak.rival(products, inverse_norms, winner, radius_squared)
+    return eager.rival(products, inverse_norms, winner, radius_squared)
 
 
 def _by_triton(tensor: Tensor) -> bool:

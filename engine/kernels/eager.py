@@ -85,27 +85,24 @@ def products(image: Tensor, templates: Tensor) -> Tensor:
     return correlate(image, templates / norm)
 
 
-def peak(products: Tensor, inverse_norms: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Best score (T,) of every template and its flat place (T,), the lowest of equals; invalid places score -1."""
-    scores = _scores(products, inverse_norms, valid).flatten(1)
+def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
+    """Best score (T,) of every template and its flat place (T,), the lowest of equals."""
+    scores = _scores(products, inverse_norms).flatten(1)
     places = scores.argmax(dim=1, keepdim=True)
     return scores.gather(1, places)[:, 0], places[:, 0]
 
 
-def rival(
-    products: Tensor, inverse_norms: Tensor, valid: Tensor | None, winner: Tensor, radius_squared: int
-) -> Tensor:
+def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
     """Best score (T,) of every template further than a radius from a flat place; -1 where nothing is."""
     height, width = inverse_norms.shape
     dy = torch.arange(height, device=winner.device)[:, None] - winner // width
     dx = torch.arange(width, device=winner.device) - winner % width
-    scores = _scores(products, inverse_norms, valid)
+    scores = _scores(products, inverse_norms)
     return scores.masked_fill_(dy * dy + dx * dx <= radius_squared, -1.0).amax(dim=(1, 2))
 
 
-def _scores(products: Tensor, inverse_norms: Tensor, valid: Tensor | None) -> Tensor:
-    scores = (products * inverse_norms).clamp_(-1.0, 1.0)
-    return scores if valid is None else scores.masked_fill_(~valid, -1.0)
+def _scores(products: Tensor, inverse_norms: Tensor) -> Tensor:
+    return (products * inverse_norms).clamp_(-1.0, 1.0)
 
 
 def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Normalise, mask and find the peak in one pass by Triton: the normalised surface is never written.
+"""Normalise and find the peak in one pass by Triton: the normalised surface is never written.
 
 Every program reduces one block of one surface to its best score and place; torch reduces what the blocks left. The
 plain torch twins of the same names are in :mod:`engine.kernels.eager`, and agree bit for bit.
@@ -13,15 +13,14 @@ from torch import Tensor
 
 _BLOCK = 2048
 # Sizes, strides and where views begin change with the window; specialising on them would compile in flight.
-_SIZES = ("count", "width", "template_stride", "row_stride", "norm_stride", "valid_stride", "radius_squared")
-_VIEWS = ("products", "inverse_norms", "valid", "winner")
+_SIZES = ("count", "width", "template_stride", "row_stride", "norm_stride", "radius_squared")
+_VIEWS = ("products", "inverse_norms", "winner")
 
 
 @triton.jit(do_not_specialize=_SIZES, do_not_specialize_on_alignment=_VIEWS)
 def _block_peaks(
     products,
     inverse_norms,
-    valid,  # or None: all
     winner,  # or None: no disc is left out
     best,
     places,
@@ -30,7 +29,6 @@ def _block_peaks(
     template_stride: tl.int64,
     row_stride: tl.int64,
     norm_stride: tl.int64,
-    valid_stride: tl.int64,
     radius_squared: tl.int64,
     BLOCK: tl.constexpr,
 ):
@@ -45,8 +43,6 @@ def _block_peaks(
     product = tl.load(products + template * template_stride + y * row_stride + x, mask=inside, other=0.0)
     score = product * tl.load(inverse_norms + y * norm_stride + x, mask=inside, other=0.0)
     score = tl.minimum(tl.maximum(score, -1.0), 1.0)
-    if valid is not None:
-        score = tl.where(tl.load(valid + y * valid_stride + x, mask=inside, other=1) != 0, score, -1.0)
     if winner is not None:
         middle = tl.load(winner)
         dy, dx = y - middle // width, x - middle % width
@@ -58,49 +54,43 @@ def _block_peaks(
     tl.store(places + out, first + lane)
 
 
-def peak(products: Tensor, inverse_norms: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
+def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
     """Best score (T,) of every template and its flat place (T,) int64, the lowest of equals.
 
     Args:
         products: (T, H', W') float32 numerators.
         inverse_norms: (H', W') float32.
-        valid: (H', W') bool, or None: all. Invalid places score -1.
     """
-    best, places = _launch(products, inverse_norms, valid, None, 0)
+    best, places = _launch(products, inverse_norms, None, 0)
     block = best.argmax(dim=1, keepdim=True)  # the first of equals, and blocks are in the order of places
     return best.gather(1, block)[:, 0], places.gather(1, block)[:, 0]
 
 
-def rival(
-    products: Tensor, inverse_norms: Tensor, valid: Tensor | None, winner: Tensor, radius_squared: int
-) -> Tensor:
+def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
     """Best score (T,) of every template outside a disc about a flat place; -1 where nothing lies outside.
 
     Args:
         products: (T, H', W') float32 numerators.
         inverse_norms: (H', W') float32.
-        valid: (H', W') bool, or None: all. Invalid places score -1.
         winner: int64, one number, which stays on the device.
         radius_squared: places of at most this squared distance lie inside.
     """
-    return _launch(products, inverse_norms, valid, winner, radius_squared)[0].amax(dim=1)
+    return _launch(products, inverse_norms, winner, radius_squared)[0].amax(dim=1)
 
 
 def _launch(
-    products: Tensor, inverse_norms: Tensor, valid: Tensor | None, winner: Tensor | None, radius_squared: int
+    products: Tensor, inverse_norms: Tensor, winner: Tensor | None, radius_squared: int
 ) -> tuple[Tensor, Tensor]:
     """Best scores and their flat places, (T, blocks) each."""
     templates, height, width = products.shape
     count = height * width
     products, inverse_norms = _with_dense_rows(products), _with_dense_rows(inverse_norms)
-    mask = None if valid is None else _with_dense_rows(valid).view(torch.uint8)
     blocks = triton.cdiv(count, _BLOCK)
     best = torch.empty((templates, blocks), dtype=torch.float32, device=products.device)
     places = torch.empty((templates, blocks), dtype=torch.int64, device=products.device)
     _block_peaks[(blocks, templates)](
         products,
         inverse_norms,
-        mask,
         winner,
         best,
         places,
@@ -109,7 +99,6 @@ def _launch(
         products.stride(0),
         products.stride(1),
         inverse_norms.stride(0),
-        0 if mask is None else mask.stride(0),
         radius_squared,
         BLOCK=_BLOCK,
         enable_fp_fusion=False,  # every rounding is torch's own

@@ -71,7 +71,7 @@ def fused(name, *args):
         return getattr(triton_peak, name)(*args)
 
 
-def draw(device, shape, masked):
+def draw(device, shape):
     """Views into larger buffers of NaN, as a transform's are, with many equal scores and some beyond 1."""
     rng = torch.Generator().manual_seed(sum(shape))
     t, height, width = shape
@@ -79,20 +79,15 @@ def draw(device, shape, masked):
     products.copy_(torch.randint(-40, 41, shape, generator=rng) / 32.0)
     norms = torch.full((height, width + 3), math.nan)[:, :width]
     norms.copy_(torch.randint(0, 5, (height, width), generator=rng) / 4.0)
-    valid = None
-    if masked:
-        valid = (torch.rand(height + 1, width + 1, generator=rng) < 0.6)[1:, 1:].to(device)
-        products[:, ~valid.cpu()] = math.nan  # what is invalid is not looked at
-    return products.to(device), norms.to(device), valid
+    return products.to(device), norms.to(device)
 
 
-def scores_of(products, norms, valid):
-    scores = np.clip(products.cpu().numpy() * norms.cpu().numpy(), -1.0, 1.0)
-    return scores if valid is None else np.where(valid.cpu().numpy(), scores, np.float32(-1.0))
+def scores_of(products, norms):
+    return np.clip(products.cpu().numpy() * norms.cpu().numpy(), -1.0, 1.0)
 
 
-def check_peak(device, shape, masked):
-    given = draw(device, shape, masked)
+def check_peak(device, shape):
+    given = draw(device, shape)
     best, places = fused("peak", *given)
     assert (best.dtype, places.dtype) == (torch.float32, torch.int64)
     flat = scores_of(*given).reshape(shape[0], -1)
@@ -102,8 +97,8 @@ def check_peak(device, shape, masked):
         torch.testing.assert_close(mine, twin, rtol=0, atol=0)
 
 
-def check_rival(device, shape, masked):
-    given = draw(device, shape, masked)
+def check_rival(device, shape):
+    given = draw(device, shape)
     scores = scores_of(*given)
     height, width = shape[1:]
     rows, columns = np.ogrid[:height, :width]
@@ -123,18 +118,15 @@ def check_ties(device):
     products[0, 50, 7] = products[0, 50, 8] = products[0, 69, 89] = 0.5
     products[1] = 7.0  # all of them 1 once they are cut off
     products[2] = -7.0
-    best, places = fused("peak", products, norms, None)
+    best, places = fused("peak", products, norms)
     assert best.tolist() == [0.5, 1.0, -1.0]
     assert places.tolist() == [50 * 90 + 7, 0, 0]
-    nowhere = torch.zeros(70, 90, dtype=torch.bool, device=device)
-    best, places = fused("peak", products, norms, nowhere)
-    assert (best.tolist(), places.tolist()) == ([-1.0] * 3, [0] * 3)
-    assert fused("rival", products, norms, nowhere, places[:1], 4).tolist() == [-1.0] * 3
+    assert fused("rival", products, norms, places[:1], 10**10).tolist() == [-1.0] * 3
 
 
 def check_match(device, size, model):
     search, template = picture(size, model, device)
-    expected = find_peak(surface(search, template[None]), exclusion_px=5.0)
+    expected = find_peak(surface(search, template[None])[0], exclusion_px=5.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "_by_triton", lambda tensor: True)
         assert_same(_peak_on_device(search, template, 5.0), expected)
@@ -143,17 +135,15 @@ def check_match(device, size, model):
 
 
 @needs_triton
-@pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_the_peak_is_that_of_plain_torch(on, shape, masked):
-    on(check_peak, shape, masked)
+def test_the_peak_is_that_of_plain_torch(on, shape):
+    on(check_peak, shape)
 
 
 @needs_triton
-@pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 77), (2, 63, 50)], ids=str)
-def test_the_rival_is_that_of_plain_torch(on, shape, masked):
-    on(check_rival, shape, masked)
+def test_the_rival_is_that_of_plain_torch(on, shape):
+    on(check_rival, shape)
 
 
 @needs_triton
@@ -168,7 +158,7 @@ def test_a_match_by_the_fused_kernel_is_that_of_the_whole_surface(on, size, mode
 
 
 def compile_for(capability):
-    """Sizes of the machine code of the launches with and without mask and winner."""
+    """Sizes of the machine code of the launches with and without winner."""
     import triton
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
@@ -176,7 +166,7 @@ def compile_for(capability):
     from engine.kernels import triton_peak
 
     pointers = {"products": "*fp32", "inverse_norms": "*fp32", "best": "*fp32", "places": "*i64"}
-    optional = {"valid": "*u8", "winner": "*i64"}
+    optional = {"winner": "*i64"}
     sizes = dict.fromkeys(triton_peak._SIZES, "i64") | {"width": "i32"}
     found = []
     for given in ({}, optional):
@@ -228,7 +218,7 @@ def test_the_peak_on_a_device_is_that_of_the_whole_surface(size, model, exclusio
     """On the CPU, by the plain torch twins."""
     search, template = picture(size, model)
     found = _peak_on_device(search, template, exclusion_px)
-    assert_same(found, find_peak(surface(search, template[None]), exclusion_px=exclusion_px))
+    assert_same(found, find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px))
 
 
 def test_the_peak_of_a_window_without_texture_is_finite():
@@ -248,13 +238,10 @@ def test_a_template_larger_than_the_window_is_refused():
         _peak_on_device(prepare(torch.rand(20, 20)), torch.rand(21, 5), 3.0)
 
 
-def test_the_plain_twins_take_the_first_of_equals_and_refuse_what_is_invalid():
+def test_the_plain_twins_take_the_first_of_equals():
     products, norms = torch.zeros(2, 5, 6), torch.ones(5, 6)
     products[0, 2, 3] = products[0, 4, 1] = 0.5
-    valid = torch.ones(5, 6, dtype=torch.bool)
-    assert [part.tolist() for part in kernels.peak(products, norms)] == [[0.5, 0.0], [15, 0]]
-    valid[2, 3] = valid[0, 0] = False
-    best, places = kernels.peak(products, norms, valid)
-    assert (best.tolist(), places.tolist()) == ([0.5, 0.0], [25, 1])
-    assert kernels.rival(products, norms, places[:1], 0, valid).tolist() == [0.0, 0.0]
-    assert kernels.rival(products, norms, places[:1], 99, valid).tolist() == [-1.0, -1.0]
+    best, places = kernels.peak(products, norms)
+    assert (best.tolist(), places.tolist()) == ([0.5, 0.0], [15, 0])
+    assert kernels.rival(products, norms, places[:1], 0).tolist() == [0.5, 0.0]
+    assert kernels.rival(products, norms, places[:1], 99).tolist() == [-1.0, -1.0]
