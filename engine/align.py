@@ -222,7 +222,7 @@ def rectify(gray: NDArray[np.uint8], camera: Camera, view: View, *, fraction: fl
     offset = np.round(view.center_px - (np.array([width, height]) - 1) / 2.0)
     shift = np.array([[1.0, 0, offset[0]], [0, 1.0, offset[1]], [0, 0, 1.0]])
     scale = float(np.sqrt(view.area_px / (gray.shape[0] * gray.shape[1])))
-    picture, picture_from_image = _shrink(gray, scale)
+    picture, picture_from_image = shrink(gray, scale)
     patch = cv2.warpPerspective(
         picture,
         picture_from_image @ view.image_from_map @ shift,
@@ -233,8 +233,16 @@ def rectify(gray: NDArray[np.uint8], camera: Camera, view: View, *, fraction: fl
     return Patch(np.asarray(patch, dtype=np.uint8), offset)
 
 
-def _shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Array]:
-    """The picture averaged down to ``scale`` where it is much finer than the map, and its homography."""
+def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Array]:
+    """The picture averaged down where it is much finer than the map, or else as it is.
+
+    Args:
+        gray: (H, W).
+        scale: pixel of the picture over pixel of the map, on the ground.
+
+    Returns:
+        The picture, and the homography (3, 3) that takes pixels of ``gray`` to its own.
+    """
     if scale >= _MAX_SHRINK:
         return gray, np.eye(3)
     height, width = (max(8, round(n * scale)) for n in gray.shape)

@@ -14,6 +14,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.geo import chi_square
 from engine.types import Fix, Peak
 
 _FEWEST_ALARMS = 60.0  # powers of ten; beyond them nothing is surer
@@ -56,7 +57,8 @@ class PoseEvidence:
     Attributes:
         log10_nfa: log10 of how many poses chance would support as well.
         off_prior: chi-square of two degrees of freedom of the place against the prior; None where there is none.
-        off_height: chi-square of one of the height against the telemetry's; None where that tells or proves none.
+        off_height: chi-square of one of the height against the telemetry's; None where the height is
+            unknown or doubted.
     """
 
     log10_nfa: float
@@ -114,8 +116,7 @@ def expected_of(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> Expec
     """How a fix lies to a prior (2,) east and north with one standard deviation per axis."""
     apart = np.array([fix.east_m, fix.north_m]) - prior_m
     allowed = fix.covariance_m2[:2, :2] + sigma_m**2 * np.eye(2)
-    chi_square = float(apart @ np.linalg.solve(allowed, apart))
-    return Expected(chi_square, float(np.linalg.det(allowed)) ** 0.25)
+    return Expected(chi_square(apart, allowed), float(np.linalg.det(allowed)) ** 0.25)
 
 
 def terms(evidence: Evidence | PoseEvidence) -> NDArray[np.float64]:
@@ -132,9 +133,9 @@ def terms(evidence: Evidence | PoseEvidence) -> NDArray[np.float64]:
     return np.array([1.0, math.sqrt(alarms), *known[0], *known[1]])
 
 
-def _known(chi_square: float | None) -> tuple[float, float]:
+def _known(off: float | None) -> tuple[float, float]:
     """What a chi-square says, and what it says that there is none."""
-    return (0.0, 1.0) if chi_square is None else (min(chi_square, _FARTHEST), 0.0)
+    return (0.0, 1.0) if off is None else (min(off, _FARTHEST), 0.0)
 
 
 def probability(evidence: Evidence | PoseEvidence, model: Logistic | PoseLogistic | None = None) -> float:

@@ -84,6 +84,18 @@ class LocalFrame:
         offset = ecef_from_geodetic(lat_deg, lon_deg) - self._origin_ecef_m
         return (offset @ self.enu_from_ecef.T)[..., :2]
 
+    def convergence_deg(self, lat_deg: float, lon_deg: float) -> float:
+        """Direction of true north at a place in this frame's axes: clockwise from its north, in [-180, 180].
+
+        A heading in these axes is the true heading plus this. It is 0 at the origin; at a place to the east of it
+        about the sine of latitude times the difference of longitude, to the west (negative) in the north.
+        """
+        lat, lon = math.radians(lat_deg), math.radians(lon_deg - self.lon_deg)
+        origin_lat = math.radians(self.lat_deg)
+        east = -math.sin(lat) * math.sin(lon)
+        north = math.sin(origin_lat) * math.sin(lat) * math.cos(lon) + math.cos(origin_lat) * math.cos(lat)
+        return math.degrees(math.atan2(east, north))
+
     def geodetic_from_enu(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[Array, Array]:
         """Latitude and longitude in degrees of the points on the ellipsoid above (east, north)."""
         east, north = np.broadcast_arrays(np.asarray(east_m, float), np.asarray(north_m, float))
@@ -130,6 +142,11 @@ def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
 def wrap_heading_deg(heading_deg: float) -> float:
     """The same direction in [0, 360); the first remainder of a tiny negative angle rounds to 360 itself."""
     return heading_deg % 360.0 % 360.0
+
+
+def chi_square(apart: Array, covariance: Array) -> float:
+    """Squared length of a difference (N,) in units of its covariance (N, N): N degrees of freedom."""
+    return float(apart @ np.linalg.solve(covariance, apart))
 
 
 def transport_covariance(jacobian: Array, covariance: Array) -> Array:

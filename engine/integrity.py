@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.evidence import Evidence, probability
+from engine.evidence import Evidence, PoseEvidence, probability
 from engine.geo import transport_covariance
+from engine.motion import WIDEST_M
 from engine.orthomap import OrthoMap
 from engine.types import Frame, Peak, Reason, check_positive
 
 Array = NDArray[np.float64]
+
+SAME_PLACE = 13.8
+"""Chi-square of two places, by the errors of both, that chance exceeds once in a thousand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +51,18 @@ class AssumedErrors:
 
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
+        for name in self.__dataclass_fields__:
+            if getattr(self, name) > WIDEST_M:
+                raise OptionError(f"{name}: expected at most {WIDEST_M:g}, got {getattr(self, name):g}")
+
+    def height_sigma_m(self, height_m: float) -> float:
+        """Of a height."""
+        return math.hypot(self.height_m, self.height_share * height_m)
+
+    def tilts_deg(self, frame: Frame) -> tuple[float, float]:
+        """Of a frame's roll and of its pitch, each by whether the frame came with it."""
+        unknown, told = self.unknown_tilt_deg, self.tilt_deg
+        return (unknown if frame.roll_deg is None else told, unknown if frame.pitch_deg is None else told)
 
 
 def told_by_map(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
@@ -90,7 +106,7 @@ class PeakRule:
             another town, turned until they fit, look like these.
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
         min_confidence: probability of :func:`engine.evidence.probability` below which a peak is not believed.
-        sure: the same above which it need not be held against the patch upside down.
+        sure: above this the peak is not compared with the patch upside down; 1 always compares.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
@@ -108,6 +124,10 @@ class PeakRule:
 
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
+        if not self.min_confidence < 1.0:
+            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
+        if not self.sure <= 1.0:
+            raise OptionError(f"sure: expected a probability of at most 1, got {self.sure}")
 
 
 def judge_peak(
@@ -136,17 +156,25 @@ def judge_peak(
     return None
 
 
-def judge_evidence(evidence: Evidence, rule: PeakRule) -> tuple[Reason, str] | None:
-    """The reason to refuse a peak that is not probable enough, with its figures, or None where it is believed."""
+def judge_evidence(evidence: Evidence | PoseEvidence, min_confidence: float) -> tuple[Reason, str] | None:
+    """The reason to refuse a peak or a pose that is not probable enough, with its figures; None if it is believed.
+
+    Args:
+        evidence: of either.
+        min_confidence: probability of :func:`engine.evidence.probability` that is asked for.
+    """
     confidence = probability(evidence)
-    if confidence >= rule.min_confidence:
+    if confidence >= min_confidence:
         return None
-    figures = (
-        f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}, "
-        f"chi-square {evidence.expected.off_prior:.1f}"
-    )
-    asked = f"{rule.min_confidence:g} is asked for"
-    return Reason.AMBIGUOUS, f"right with a probability of {confidence:.3f}, {asked} ({figures} from the prior)"
+    if isinstance(evidence, PoseEvidence):
+        reason, off_prior = Reason.BAD_POSE, evidence.off_prior
+        figures = f"log10 of false alarms {evidence.log10_nfa:.1f}"
+    else:
+        reason, off_prior = Reason.AMBIGUOUS, evidence.expected.off_prior
+        figures = f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}"
+    off = "unknown" if off_prior is None else f"{off_prior:.1f}"
+    asked = f"{min_confidence:g} is asked for ({figures}, chi-square {off} from the prior)"
+    return reason, f"right with a probability of {confidence:.3f}, {asked}"
 
 
 def peak_covariance_px(peak: Peak, pixels: int) -> Array:
@@ -197,12 +225,8 @@ def ncc_covariance_m2(
     if attitude is None or height is None:
         raise OptionError("frame: expected a height and a heading for a fix by correlation")
     values = np.array([height, attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg])
-    tilts = [
-        errors.unknown_tilt_deg if angle is None else errors.tilt_deg
-        for angle in (frame.roll_deg, frame.pitch_deg)
-    ]
-    height_sigma = math.hypot(errors.height_m, errors.height_share * height)
-    sigmas = np.array([height_sigma, *tilts, errors.heading_deg])
+    height_sigma = errors.height_sigma_m(height)
+    sigmas = np.array([height_sigma, *errors.tilts_deg(frame), errors.heading_deg])
     aims = _aim_m(camera, np.concatenate([values + np.diag(sigmas), values - np.diag(sigmas)]))
     spread = (aims[:4] - aims[4:]).T / 2.0  # each column is already scaled by its sigma
     horizontal = spread @ spread.T + transport_covariance(enu_jacobian, peak_px2) + errors.map_m**2 * np.eye(2)

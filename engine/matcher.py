@@ -1,4 +1,4 @@
-"""SceneMatcher: one frame, one prior, one budget in; a Fix or a NoFix out. It remembers nothing between frames."""
+"""SceneMatcher: one frame, one prior, one budget in; a Fix or a NoFix out. Of a frame it keeps only its cost."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from engine.camera import Camera
 from engine.costs import Costs
 from engine.errors import OptionError
 from engine.features import plans_made
+from engine.geo import wrap_heading_deg
 from engine.integrity import told_by_map
 from engine.kernels import loops_compiled
 from engine.landmarks import LandmarkMap
@@ -24,6 +25,7 @@ from engine.methods.laid import NccOptions
 from engine.methods.query import Query, Stopwatch, level_crop, level_for
 from engine.methods.samples import SampleMap
 from engine.methods.sift import SiftOptions
+from engine.motion import WIDEST_M
 from engine.orthomap import OrthoMap
 from engine.prepared import PreparedMap
 from engine.types import Fix, Frame, NoFix, Prior, Reason, Window
@@ -61,6 +63,15 @@ def _told_by_map(site: OrthoMap, options: MatcherOptions) -> MatcherOptions:
         ncc=replace(ncc, errors=told_by_map(site, ncc.errors)),
         sift=replace(sift, errors=told_by_map(site, sift.errors)),
     )
+
+
+def _bounded(prior: Prior) -> Prior:
+    """The prior no vaguer, and moved no farther, than any map is wide."""
+    moved = (prior.moved_east_m, prior.moved_north_m)
+    if prior.sigma_m <= WIDEST_M and max(map(abs, moved)) <= WIDEST_M:
+        return prior
+    east, north = (min(max(v, -WIDEST_M), WIDEST_M) for v in moved)
+    return replace(prior, sigma_m=min(prior.sigma_m, WIDEST_M), moved_east_m=east, moved_north_m=north)
 
 
 class SceneMatcher:
@@ -168,6 +179,8 @@ class SceneMatcher:
         """
         deadline = Deadline(budget or Budget(), whole_map=prior is None)
         query = self._query(frame, prior, deadline)
+        if query.prior_px is not None and not np.isfinite(query.prior_px).all():
+            return query.refuse_outside(self.method)  # nowhere in the map's coordinate system
         if prior is None and not self.site.is_searchable:
             detail = f"the map of {self.site.size_km} is not searched as a whole; a position to begin at is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
@@ -176,7 +189,7 @@ class SceneMatcher:
             return query.refuse(
                 Reason.LATE, "the answer came after the budget", result.method, window=result.window
             )
-        return replace(result, timings=query.watch.timings)
+        return replace(self._to_true_north(result), timings=query.watch.timings)
 
     def explain(self, frame: Frame, window: Window, method: str | None = None) -> Explanation:
         """What the match of a frame in a window looks like: its surface or its matches, for reports.
@@ -186,7 +199,7 @@ class SceneMatcher:
             window: that was searched, in map pixels.
             method: "ncc" or "sift"; None takes the matcher's own, and NCC of "auto".
         """
-        middle_px = np.array([window.x0, window.y0]) + np.array([window.width_px, window.height_px]) / 2.0
+        middle_px = np.array([window.x0, window.y0]) + np.array([window.width_px - 1, window.height_px - 1]) / 2.0
         east, north = self.site.enu_from_pixel(middle_px)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=0.0)
         query = self._query(frame, prior, Deadline(Budget()))
@@ -201,7 +214,26 @@ class SceneMatcher:
         watch = Stopwatch(deadline, self.device, self._costs)
         with watch.stage("grey"):
             gray = self.camera.undistort(to_gray(frame))
-        return Query(frame, gray, self._pinhole, self.site, prior, self.device, watch)
+        prior = None if prior is None else _bounded(prior)
+        return self._from_true_north(Query(frame, gray, self._pinhole, self.site, prior, self.device, watch))
+
+    def _from_true_north(self, query: Query) -> Query:
+        """The query with its frame's heading turned from true north, at the prior's place, to the plane's."""
+        heading_deg, place = query.frame.heading_deg, query.prior_px
+        if heading_deg is None or place is None or not np.isfinite(place).all():
+            return query  # without a place it is taken at the middle of the map, where the two are one
+        lat, lon = self.site.geodetic_from_pixel(place)
+        turn_deg = self.site.frame.convergence_deg(float(lat), float(lon))
+        heading_deg = wrap_heading_deg(heading_deg + turn_deg)
+        return query.with_frame(replace(query.frame, heading_deg=heading_deg))
+
+    def _to_true_north(self, result: Fix | NoFix) -> Fix | NoFix:
+        """The result with its attitude's heading turned from the plane's north to true north at the fix."""
+        if isinstance(result, NoFix) or result.attitude is None:
+            return result
+        turn_deg = self.site.frame.convergence_deg(result.lat_deg, result.lon_deg)
+        heading_deg = wrap_heading_deg(result.attitude.heading_deg - turn_deg)
+        return replace(result, attitude=replace(result.attitude, heading_deg=heading_deg))
 
     def _dispatch(self, query: Query) -> Fix | NoFix:
         if self.options.profile == "paper":

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
+from engine.geo import chi_square
 from engine.types import Fix, Frame, Prior
 
 Array = NDArray[np.float64]
@@ -175,9 +176,7 @@ class Place:
 
     def chi_square(self, fix: Fix) -> float:
         """Squared distance of a fix in units of both covariances: two degrees of freedom."""
-        apart_m = en_m(fix) - self.en_m
-        spread_m2 = fix.covariance_m2[:2, :2] + self.sigma_m**2 * np.eye(2)
-        return float(apart_m @ np.linalg.solve(spread_m2, apart_m))
+        return chi_square(en_m(fix) - self.en_m, fix.covariance_m2[:2, :2] + self.sigma_m**2 * np.eye(2))
 
     def prior(self, widened: float = 1.0, moved_m: Array | None = None) -> Prior:
         """The same as a matcher is told it, ``widened`` times as uncertain; no wider than any map."""

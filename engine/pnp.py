@@ -42,7 +42,7 @@ class Problem:
         K: (3, 3) pinhole intrinsics.
         weights: (N,) relative inverse variances of the pixels.
         attitude: (3, 3) rotation known from elsewhere, or None.
-        precision: (3,) inverse variances of its angles about the camera's axes in 1/rad^2, 0 without one.
+        precision: (3, 3) inverse covariance of its angles about the camera's axes in 1/rad^2, 0 without one.
         tolerance_px: A match agrees if it reprojects at most this far off.
         noise_floor_px: Lower bound on the standard deviation of a pixel.
         min_inliers: Fewest matches that carry a pose.
@@ -193,7 +193,7 @@ def refine(problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, sl
         covariance = _inverse(problem, normal)
         if covariance is None:
             return None
-        gradient[3:] -= problem.precision * turn_from_attitude(problem, R)
+        gradient[3:] -= problem.precision @ turn_from_attitude(problem, R)
         delta = covariance @ gradient
         center = center + R.T @ delta[:3]
         R = cv2.Rodrigues(delta[3:])[0] @ R
@@ -228,7 +228,7 @@ def _normal_equations(problem: Problem, view: View, agreement: Array) -> tuple[A
 def _inverse(problem: Problem, information: Array) -> Array | None:
     """Return the covariance (6, 6) of matches and known attitude, or None where they leave the pose open."""
     total = information.copy()
-    total[[3, 4, 5], [3, 4, 5]] += problem.precision
+    total[3:, 3:] += problem.precision
     found, covariance = cv2.invert(total, flags=cv2.DECOMP_CHOLESKY)
     return np.asarray(covariance) if found else None
 

@@ -15,7 +15,7 @@ References:
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,17 +97,26 @@ class AttitudePrior:
 
     Attributes:
         rotation: (3, 3) of cam_from_map.
-        sigma_deg: Standard deviation of the angle about each camera axis: one number, or (x, y, z).
+        sigma_deg: Standard deviation of the angle about each axis: one number, or (x, y, z).
+        axes: (3, 3) rotation from the camera to the axes that are meant, such as a mount for those of the body;
+            the default is the camera's own.
     """
 
     rotation: Array
     sigma_deg: float | tuple[float, float, float]
+    axes: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        if np.shape(self.rotation) != (3, 3):
-            raise ShapeError(f"rotation: expected (3, 3), got {np.shape(self.rotation)}")
+        for name in ("rotation", "axes"):
+            if np.shape(getattr(self, name)) != (3, 3):
+                raise ShapeError(f"{name}: expected (3, 3), got {np.shape(getattr(self, name))}")
         if np.shape(self.sigma_deg) not in ((), (3,)) or not np.all(np.asarray(self.sigma_deg) > 0):
             raise OptionError(f"sigma_deg: expected one or three positive numbers, got {self.sigma_deg}")
+
+    @property
+    def precision(self) -> Array:
+        """(3, 3) inverse covariance in 1/rad^2 of the angles about the camera's axes."""
+        return np.asarray(self.axes.T * (np.deg2rad(self.sigma_deg) ** -2.0 * np.ones(3)) @ self.axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +186,7 @@ def solve_pose(
         K=K,
         weights=weights[known],
         attitude=None if prior is None else prior.rotation,
-        precision=np.zeros(3) if prior is None else np.deg2rad(prior.sigma_deg) ** -2.0 * np.ones(3),
+        precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
         noise_floor_px=options.noise_floor_px,
         min_inliers=options.min_inliers,
@@ -314,4 +323,5 @@ def _same(R: Array, other: Array) -> bool:
 def _cost(problem: Problem, R: Array, view: View, variance: float, options: PoseOptions) -> float:
     """Return chi-square of all matches, each bounded at the threshold, and of the prior."""
     cost = float(problem.weights @ np.minimum(view.squared, options.reprojection_px**2)) / variance
-    return cost + float(problem.precision @ turn_from_attitude(problem, R) ** 2)
+    turn = turn_from_attitude(problem, R)
+    return cost + float(turn @ problem.precision @ turn)

@@ -7,6 +7,9 @@ import math
 from engine.errors import OptionError
 from engine.types import Window
 
+SPREAD_SIGMAS = 3.0
+"""Of the prior: a window holds what is matched at every place this near to the middle."""
+
 
 def window_size_px(
     footprint_px: tuple[float, float], moved_px: tuple[float, float], *, margin: float = 1.3

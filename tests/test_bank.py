@@ -58,9 +58,9 @@ def laid_heights(monkeypatch):
     """The heights by which fixes were laid; a fix does not say them."""
     heights, real = [], ncc_method._fix
 
-    def noting(query, aligned, *rest):
+    def noting(query, aligned, *rest, **named):
         heights.append(aligned.frame.height_agl_m)
-        return real(query, aligned, *rest)
+        return real(query, aligned, *rest, **named)
 
     monkeypatch.setattr(ncc_method, "_fix", noting)
     return heights
@@ -92,6 +92,18 @@ def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site,
             assert error_m(site, result, truth) < 2.0
             assert turn_between(result.attitude.heading_deg, truth.heading_deg) < 0.3
     assert fixes >= len(PLACES) - 1
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matcher, flight, known):
+    """Where the heading was told and is trusted, a search of the whole map measures no attitude either."""
+    frame, truth = flight.frames[PLACES[0]], flight.truth[PLACES[0]]
+    fix = matcher().locate(frame, near(truth) if known else None)
+    assert isinstance(fix, Fix)
+    assert fix.stage == "refined" or fix.attitude is None
+    unrefined = matcher(refine=False).locate(frame, near(truth) if known else None)
+    assert isinstance(unrefined, Fix)
+    assert unrefined.attitude is None
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])

@@ -93,12 +93,23 @@ def test_every_pose_has_a_probability(log10_nfa, off_prior, off_height):
 
 
 def test_a_refusal_tells_its_figures():
-    verdict = judge_evidence(replace(MIDDLING, ratio=0.9), PeakRule())
+    asked = PeakRule().min_confidence
+    verdict = judge_evidence(replace(MIDDLING, ratio=0.9), asked)
     assert verdict is not None
     assert verdict[0] is Reason.AMBIGUOUS
     for figure in ("0.98", "10.0 sigmas", "90%", "4.0"):
         assert figure in verdict[1]
-    assert judge_evidence(Evidence(sigmas=20.0, ratio=0.2, expected=Expected(1.0, 8.0)), PeakRule()) is None
+    assert judge_evidence(Evidence(sigmas=20.0, ratio=0.2, expected=Expected(1.0, 8.0)), asked) is None
+
+
+def test_a_refusal_of_a_pose_tells_its_figures():
+    verdict = judge_evidence(PoseEvidence(-1.5, None, None), 0.995)
+    assert verdict is not None
+    assert verdict[0] is Reason.BAD_POSE
+    for figure in ("0.995", "-1.5", "chi-square unknown"):
+        assert figure in verdict[1]
+    assert "chi-square 3.2" in judge_evidence(PoseEvidence(-1.5, 3.2, None), 0.995)[1]
+    assert judge_evidence(PoseEvidence(-40.0, 1.0, 1.0), 0.97) is None
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(1e-3, 1), st.floats(0, 1e9))

@@ -11,6 +11,7 @@ from pyproj import Transformer
 from engine.geo import (
     LocalFrame,
     attitude_from_rotation,
+    chi_square,
     ecef_from_geodetic,
     enu_from_body,
     geodetic_from_ecef,
@@ -96,6 +97,35 @@ def test_enu_takes_arrays_of_any_shape():
     np.testing.assert_allclose(frame.enu_from_geodetic(lat, lon), np.stack([east, north], axis=-1), atol=1e-7)
 
 
+@given(st.floats(-89.9, 89.9), LONGITUDES, st.floats(-0.5, 0.5), st.floats(-1.0, 1.0))
+@settings(max_examples=150, deadline=None)
+def test_true_north_is_where_a_step_of_latitude_leads(lat_deg, lon_deg, away_lat_deg, away_lon_deg):
+    frame, lat, lon = (
+        LocalFrame(lat_deg, lon_deg),
+        max(-89.9, min(lat_deg + away_lat_deg, 89.9)),
+        lon_deg + away_lon_deg,
+    )
+    step_deg = 1e-4
+    south, north = frame.enu_from_geodetic(np.array([lat - step_deg, lat + step_deg]), lon)
+    expected = math.degrees(math.atan2(*(north - south)))
+    assert abs(math.remainder(frame.convergence_deg(lat, lon) - expected, 360.0)) < 1e-5
+
+
+@pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
+def test_true_north_is_the_planes_at_its_origin(lat_deg, lon_deg):
+    assert LocalFrame(lat_deg, lon_deg).convergence_deg(lat_deg, lon_deg) == 0.0
+
+
+def test_true_north_of_places_to_the_east_leans_to_the_west_in_the_north_of_the_earth():
+    # 30 km east of the origin, as docs/large-maps.md has it; 0.4 degrees of longitude.
+    assert LocalFrame(48.0, 15.0).convergence_deg(48.0, 15.4) == pytest.approx(-0.297, abs=1e-3)
+    assert LocalFrame(-48.0, 15.0).convergence_deg(-48.0, 15.4) == pytest.approx(0.297, abs=1e-3)
+    assert LocalFrame(0.0, 15.0).convergence_deg(0.0, 15.4) == 0.0
+    assert LocalFrame(60.0, 179.9).convergence_deg(60.0, -179.9) == pytest.approx(
+        -0.2 * math.sin(math.radians(60)), abs=1e-6
+    )
+
+
 FORWARD, RIGHT, DOWN = np.eye(3)
 
 
@@ -150,6 +180,10 @@ def test_heading_of_a_rotation_a_hair_west_of_north_is_below_360():
     rotation = enu_from_body(0.0, 0.0, 0.0)
     rotation[0, 0] = -1e-20
     assert attitude_from_rotation(rotation)[2] == 0.0
+
+
+def test_chi_square_counts_in_standard_deviations():
+    assert chi_square(np.array([3.0, 8.0]), np.diag([9.0, 16.0])) == pytest.approx(5.0)
 
 
 def test_covariance_transport_is_first_order_and_symmetric():

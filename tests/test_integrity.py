@@ -94,6 +94,21 @@ def test_options_are_positive_keyword_only_and_refused_by_name(options):
         setattr(options(), name, 0.5)
 
 
+@pytest.mark.parametrize("name", ["min_confidence", "sure"])
+def test_a_probability_of_98_is_refused(name):
+    with pytest.raises(OptionError, match=rf"^{name}: expected a probability .* 1, got 98"):
+        PeakRule(**{name: 98.0})
+    PeakRule(sure=1.0)  # always holds the peak against the patch upside down
+
+
+def test_what_is_assumed_of_telemetry_is_said_in_one_place():
+    errors = AssumedErrors(height_m=3.0, height_share=0.04, tilt_deg=0.5, unknown_tilt_deg=4.0)
+    assert errors.height_sigma_m(100.0) == pytest.approx(5.0)
+    told = {(None, None): (4.0, 4.0), (1.0, None): (0.5, 4.0), (None, 1.0): (4.0, 0.5), (0.0, 0.0): (0.5, 0.5)}
+    for (roll, pitch), sigmas in told.items():
+        assert errors.tilts_deg(Frame(BLANK, 0, 100.0, 0.0, roll, pitch)) == sigmas
+
+
 @given(
     score=st.floats(-1.0, 1.0),
     values=st.tuples(st.floats(-2.0, 0.5), st.floats(-2.0, 0.5)),
@@ -136,7 +151,7 @@ def test_the_covariance_of_a_peak_is_what_white_noise_does():
     places, claimed = [], []
     for _ in range(150):
         noisy = picture[16:56, 16:56] + 2.0 * torch.from_numpy(rng.normal(size=(40, 40)))
-        found = find_peak(ncc(picture[None], noisy[None, None])[0], exclusion_px=6.0)
+        found = find_peak(ncc(picture[None], noisy[None, None])[0, 0], exclusion_px=6.0)
         places.append((found.x, found.y))
         claimed.append(np.trace(peak_covariance_px(found, 25 * 1600)))
     spread = np.sum((np.array(places) - 16.0) ** 2, axis=1).mean()

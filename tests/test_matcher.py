@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -28,8 +29,9 @@ from engine import (
     Prior,
     Reason,
     SceneMatcher,
+    Window,
 )
-from engine.integrity import PeakRule
+from engine.integrity import AssumedErrors, PeakRule
 from engine.methods import sift
 from engine.methods.ncc import NccOptions
 from engine.methods.sift import SiftOptions
@@ -342,6 +344,19 @@ def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_nor
                 assert distance_px(turned.locate(given, ground.prior(NADIR))) < 0.5
 
 
+@pytest.mark.parametrize("mounted_deg", [0.0, 30.0, 60.0])
+def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, mounted_deg):
+    """Of roll, pitch and heading by turns; of the two tilts each by whether it was told."""
+    lifted = cv2.Rodrigues(np.radians([0.0, mounted_deg, 0.0]))[0] @ camera.mount  # about the body's right
+    frame = Frame(np.zeros((8, 8), np.uint8), 0, 100.0, 40.0, None, 3.0)
+    query = SimpleNamespace(frame=frame, camera=replace(camera, mount=lifted))
+    errors = AssumedErrors(tilt_deg=0.4, unknown_tilt_deg=5.0)
+    prior = sift._attitude_prior(query, 40.0, 1.5, errors)
+    for about_body_deg in np.diag([5.0, 0.4, 1.5]):
+        about_camera = lifted.T @ np.radians(about_body_deg)
+        assert about_camera @ prior.precision @ about_camera == pytest.approx(1.0)
+
+
 def test_a_matcher_of_ones_own_takes_the_place_of_features(ground, camera, frame, prior):
     shapes = []
 
@@ -397,6 +412,44 @@ def test_a_frame_of_one_grey_level_has_no_texture(matchers, prior, method, level
 )
 def test_a_prior_outside_the_map_is_refused(matchers, frame, method, where):
     assert_refused(matchers[method].locate(frame, Prior(**where, sigma_m=5.0)), Reason.OUTSIDE_MAP)
+
+
+@pytest.mark.parametrize("profile", ["engine", "paper"])
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize("lon_deg", [0.0, 183.0, -177.0])
+def test_a_prior_that_the_maps_crs_cannot_show_is_refused(camera, frame, method, profile, lon_deg):
+    """Null island, as a receiver without a fix reports it, and its opposite have no place in UTM's zone 46."""
+    if (method, profile) == ("auto", "paper"):
+        return
+    site = OrthoMap.from_arrays(
+        np.random.default_rng(0).integers(0, 256, (400, 400), np.uint8),
+        [[0.5, 0.0, 500_000.0], [0.0, -0.5, 3_600_000.0]],
+        "EPSG:32646",
+    )
+    matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(profile=profile))
+    nowhere = Prior(lat_deg=0.0, lon_deg=lon_deg, sigma_m=10.0)
+    assert_refused(matcher.locate(frame, nowhere), Reason.OUTSIDE_MAP)
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize("vague", [{"sigma_m": 1e308}, {"sigma_m": 8.0, "moved_east_m": 1e308}])
+def test_a_prior_wider_than_any_map_is_a_search_of_all_of_it(matchers, ground, frame, method, vague):
+    east, north = ground.enu_from_pixel(NADIR)
+    result = matchers[method].locate(frame, Prior(east_m=east, north_m=north, **vague))
+    assert result.window.width_px == ground.site.width_px
+    assert isinstance(result, NoFix) or distance_px(result) < 1.0
+
+
+def test_an_explanation_asks_about_the_middle_of_its_window(matchers, ground, frame, monkeypatch):
+    seen, real = [], SceneMatcher._query
+    monkeypatch.setattr(
+        SceneMatcher,
+        "_query",
+        lambda self, frame, prior, clock: seen.append(prior) or real(self, frame, prior, clock),
+    )
+    matchers["ncc"].explain(frame, Window(100, 80, 400, 401))
+    middle = ground.site.pixel_from_enu([seen[0].east_m, seen[0].north_m])
+    np.testing.assert_allclose(middle, [299.5, 280.0], atol=1e-3)
 
 
 def test_ncc_needs_the_height(matchers, frame, prior):
@@ -508,8 +561,28 @@ def test_options_are_refused_by_name(ground, camera):
     ):  # fmt: skip
         with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got '?{value}"):
             SiftOptions(**{name: value})
-    with pytest.raises(OptionError, match=r"^max_keypoints: expected 4 or more, got 3"):
-        SiftOptions(max_keypoints=3)
+    for name, value in (("max_keypoints", 3), ("max_map_keypoints", 0)):
+        with pytest.raises(OptionError, match=rf"^{name}: expected 4 or more, got {value}"):
+            SiftOptions(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "value", "text"),
+    [
+        (SiftOptions, "min_confidence", 97, "0 or more and below 1"),
+        (SiftOptions, "min_confidence", float("nan"), "0 or more and below 1"),
+        (SiftOptions, "max_tilt_deg", -1, "above 0"),
+        (SiftOptions, "min_deviation", float("nan"), "0 or more"),
+        (SiftOptions, "max_height_m", float("inf"), "a finite number"),
+        (SiftOptions, "height_factor", float("inf"), "a finite number"),
+        (SiftOptions, "margin", float("inf"), "a finite number"),
+        (NccOptions, "margin", float("inf"), "a finite number"),
+        (NccOptions, "margin", float("nan"), "1 or more"),
+    ],
+)
+def test_options_by_which_every_frame_would_fail_are_refused(options, name, value, text):
+    with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got {value}"):
+        options(**{name: value})
 
 
 # The paper's profile

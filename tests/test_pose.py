@@ -280,6 +280,30 @@ def test_a_weak_prior_changes_nothing_and_axes_have_their_own_sigma():
     np.testing.assert_allclose(only_heading.center_m, free.center_m, atol=0.02)
 
 
+def test_errors_about_the_bodys_axes_are_those_of_the_camera_however_it_is_mounted():
+    """A heading that nobody knows leaves the pose alone; the same error in the pitch does not."""
+    s = scene(np.random.default_rng(12), noise_px=0.5)
+    mount = cv2.Rodrigues(np.deg2rad([0.0, 30.0, 0.0]))[0] @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    free = solved(s)
+
+    def off_m(error_deg):
+        """How far a prior moves the pose whose body is turned by this about its forward, right and down axes."""
+        measured = cv2.Rodrigues(mount.T @ np.deg2rad(error_deg))[0] @ s.rotation
+        prior = AttitudePrior(rotation=measured, sigma_deg=(0.05, 0.05, 1e4), axes=mount)
+        return np.linalg.norm(solved(s, prior=prior).center_m - free.center_m)
+
+    assert off_m([0.0, 0.0, 5.0]) < 0.5
+    assert off_m([0.0, 0.5, 0.0]) > 0.5
+
+
+def test_the_precision_of_a_prior_is_its_covariance_inverted():
+    mount = cv2.Rodrigues(np.deg2rad([3.0, 30.0, -20.0]))[0]
+    prior = AttitudePrior(np.eye(3), (0.3, 0.6, 2.0), axes=mount)
+    about_body = np.diag(np.deg2rad([0.3, 0.6, 2.0]) ** 2)
+    np.testing.assert_allclose(np.linalg.inv(prior.precision), mount.T @ about_body @ mount, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(AttitudePrior(np.eye(3), 0.3).precision, np.eye(3) / np.deg2rad(0.3) ** 2)
+
+
 # Refused.
 
 
@@ -416,5 +440,7 @@ def test_wrong_arrays_are_named():
         solve_pose(points, pixels.astype(complex), K)
     with pytest.raises(ShapeError, match="rotation"):
         AttitudePrior(rotation=np.eye(2), sigma_deg=1)
+    with pytest.raises(ShapeError, match=r"axes: expected \(3, 3\), got \(3,\)"):
+        AttitudePrior(rotation=np.eye(3), sigma_deg=1, axes=np.zeros(3))
     with pytest.raises(OptionError, match="sigma_deg"):
         AttitudePrior(rotation=np.eye(3), sigma_deg=0)

@@ -12,7 +12,7 @@ from engine.align import Patch, rectify, view_of
 from engine.landmarks import LandmarkMap
 from engine.methods import laid, paper, sift
 from engine.methods.laid import Aligned, NccOptions
-from engine.methods.query import Query, level_for
+from engine.methods.query import Query
 from engine.methods.sift import SiftOptions
 from engine.pose import PoseStats
 from engine.prepared import PreparedMap
@@ -86,7 +86,7 @@ def by_ncc(query: Query, prepared: PreparedMap, window: Window, options: NccOpti
     frame, site = query.frame, query.site
     if frame.height_agl_m is None or frame.heading_deg is None:
         return Explanation(query.gray)
-    level = level_for(site.gsd_m_per_px, frame.height_agl_m / query.camera.focal_px, site.levels)
+    level = query.level_of(frame.height_agl_m)
     while window.area_px >> 2 * level > _MOST_PX and level < site.levels - 1:
         level += 1
     aligned = laid.align(query, frame, level, options)
@@ -122,7 +122,7 @@ def by_paper(query: Query, method: str, window: Window) -> Explanation:
     corner = np.array([window.x0, window.y0], np.float64)
     if method == "ncc":
         known = frame.height_agl_m is not None and frame.heading_deg is not None
-        template = paper.laid(query, window) if known else None
+        template = paper.template_of(query, window) if known else None
         if template is None:
             return Explanation(query.gray)
         middle = _rectangle(corner, template).mean(axis=0)
@@ -149,11 +149,11 @@ def _rectangle(corner_px: Array, patch: Gray) -> Array:
 
 def _patch(query: Query) -> Patch | None:
     """The frame in the map's pixels by its telemetry, on the level that suits it."""
-    frame, site = query.frame, query.site
+    frame = query.frame
     if frame.attitude is None or frame.height_agl_m is None:
         return None
-    level = level_for(site.gsd_m_per_px, frame.height_agl_m / query.camera.focal_px, site.levels)
-    view = view_of(query.camera, frame.attitude, frame.height_agl_m, query.jacobian * 2.0**level)
+    jacobian = query.jacobian * 2.0 ** query.level_of(frame.height_agl_m)
+    view = view_of(query.camera, frame.attitude, frame.height_agl_m, jacobian)
     return None if view is None else rectify(query.gray, query.camera, view)
 
 

@@ -10,20 +10,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from engine.geo import chi_square
+from engine.integrity import SAME_PLACE
 from engine.landmarks import LandmarkMap
 from engine.methods import laid, ncc, refined, sift
 from engine.methods.bank import is_trusted
 from engine.methods.laid import NccOptions
-from engine.methods.query import Query, level_for
+from engine.methods.query import Query
 from engine.methods.samples import SampleMap
 from engine.methods.sift import SiftOptions
 from engine.prepared import PreparedMap
 from engine.types import Fix, NoFix, Reason, Result
+from engine.window import SPREAD_SIGMAS
 
 _COARSER = (0, 1, 2)  # levels above the frame's own that NCC may fall back to
 _LEAST_SIDE_PX = 24  # of what is correlated there
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which SIFT looks at the frame
-_SAME_PLACE = 13.8  # chi-square of two degrees of freedom that chance exceeds once in a thousand
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +48,9 @@ def refine(query: Query, tools: Tools, result: Result) -> Result:
     """The fix of a fine peak with its pose refined, where that is wanted, can be done and is affordable."""
     if not isinstance(result, Fix) or result.stage != "fine" or not tools.ncc.refine:
         return result
+    # A height that was searched for is not the frame's, and a slope nobody knows would be taken for a tilt.
     if not is_trusted(query.frame, tools.ncc) or not query.site.has_surface:
-        return (
-            result  # the height that was found is not the frame's; a slope nobody knows would be taken for a tilt
-        )
+        return result
     work_px = float(query.gray.size)
     if not query.watch.affords("dense", work_px):
         query.watch.give_up("dense", price=False)
@@ -106,13 +107,13 @@ def by_both(query: Query, tools: Tools) -> Result:
         return by_sift(query, tools)
     first = _by_peak(query, tools)
     second = by_sift(query, tools, second=isinstance(first, Fix))
-    if isinstance(second, NoFix):
-        return refine(query, tools, first) if isinstance(first, Fix) or _was_late(second) else second
     if isinstance(first, NoFix):
-        return second
+        return first if _was_late(second) else second
+    if isinstance(second, NoFix):
+        return refine(query, tools, first)
     apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
     spread_m2 = (first.covariance_m2 + second.covariance_m2)[:2, :2]
-    if float(apart_m @ np.linalg.solve(spread_m2, apart_m)) > _SAME_PLACE:
+    if chi_square(apart_m, spread_m2) > SAME_PLACE:
         detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
         return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
     first = refine(query, tools, first)
@@ -140,14 +141,14 @@ def _window_px(query: Query, options: NccOptions) -> dict[int, float]:
     site, camera, height_m = query.site, query.camera, query.frame.height_agl_m
     assert height_m is not None  # asked for before
     assert query.prior is not None
-    own = level_for(site.gsd_m_per_px, height_m / camera.focal_px, site.levels)
+    own = query.level_of(height_m)
     out = {}
     for coarser in _COARSER:
         gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
         per_px = height_m / (camera.focal_px * gsd_m)
         least = options.fraction * min(camera.width_px, camera.height_px) * per_px
         if coarser == 0 or (own + coarser < site.levels and least >= _LEAST_SIDE_PX):
-            slack_px = 6.0 * query.prior.sigma_m / gsd_m
+            slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
             width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
             out[coarser] = width * height
     return out

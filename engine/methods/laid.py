@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,6 +57,8 @@ class NccOptions:
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
+        if math.isinf(self.margin):
+            raise OptionError(f"margin: expected a finite number, got {self.margin}")
         if not self.margin >= 1.0:
             raise OptionError(f"margin: expected 1 or more, got {self.margin}")
         for name in ("fraction", "min_valid_share"):
@@ -112,8 +115,7 @@ def align(
         if slope.any():
             view = view_of(query.camera, attitude, height, jacobian, slope) or view
     if view is None:
-        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
-        return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", METHOD)
+        return query.refuse_tilted(attitude, METHOD)
     rows, columns = query.site.level_shape(level)
     if (MIN_SHRINK * options.fraction) ** 2 * view.area_px > rows * columns:
         return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
@@ -168,9 +170,9 @@ def search(
             scores = masked_scores(region, aligned.template[None], options)
             if not bool((scores > -1.0).any()):
                 return None
-            peak = find_peak(scores, exclusion_px=exclusion_px)
+            peak = find_peak(scores[0], exclusion_px=exclusion_px)
     x, y = peak.x + region.window.x0, peak.y + region.window.y0
-    return Peak(x, y, peak.score, peak.second_score, peak.curvature, peak.hypothesis)
+    return Peak(x, y, peak.score, peak.second_score, peak.curvature)
 
 
 def surface(

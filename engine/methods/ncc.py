@@ -18,7 +18,7 @@ from engine.integrity import (
 )
 from engine.methods import bank
 from engine.methods.laid import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
-from engine.methods.query import Query, level_for
+from engine.methods.query import Query
 from engine.prepared import PreparedMap
 from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
 
@@ -57,17 +57,15 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     flat = query.refuse_flat(METHOD, options.rule.min_deviation)
     if flat is not None:
         return flat
-    level = level_for(query.site.gsd_m_per_px, frame.height_agl_m / query.camera.focal_px, query.site.levels)
-    level = min(level + coarser, query.site.levels - 1)
+    level = min(query.level_of(frame.height_agl_m) + coarser, query.site.levels - 1)
     with query.watch.stage("align"):
-        aligned = align(
-            query, frame if frame.heading_deg is not None else replace(frame, heading_deg=0.0), level, options
-        )
+        first = frame if frame.heading_deg is not None else replace(frame, heading_deg=0.0)
+        aligned = align(query, first, level, options)
     if isinstance(aligned, NoFix):
         return aligned
     window = window_about(query, aligned, options)
     if window is None:
-        return query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", METHOD)
+        return query.refuse_outside(METHOD)
     trusted = bank.is_trusted(frame, options)
     wide = query.site.is_large and window.area_px >> 2 * aligned.level > WIDE_PX
     if wide and bank.coarse_px(query, aligned, window, options) > WIDE_PX:
@@ -82,8 +80,9 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
         return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
     if query.watch.deadline.remaining_ms < 0:
         return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
-    fix = _fix(query, aligned, peak, window, options)
-    expected, evidence = None if wide else _expected(query, fix), None
+    fix = _fix(query, aligned, peak, window, options, trusted=trusted)
+    expected = None if wide else _expected(query, fix)
+    evidence = None
     if trusted and expected is not None:
         sigma = score_sigma(aligned.template.numel())
         evidence = evidence_of(peak, sigma, expected)
@@ -126,7 +125,7 @@ def judge(query: Query, found: Found, rule: PeakRule) -> Fix | NoFix:
     unexpected = found.expected is None or found.expected.off_prior > rule.max_prior_chi_square
     refusal = judge_peak(found.peak, pixels, rule, whole_map=unexpected, searched=not found.trusted)
     if refusal is None and evidence is not None:
-        refusal = judge_evidence(evidence, rule)
+        refusal = judge_evidence(evidence, rule.min_confidence)
     if refusal is not None:
         return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
     return found.fix if evidence is None else replace(found.fix, confidence=probability(evidence))
@@ -138,8 +137,8 @@ def _expected(query: Query, fix: Fix) -> Expected | None:
     return expected_of(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
 
 
-def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions) -> Fix:
-    """The camera's nadir and its covariance."""
+def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions, *, trusted: bool) -> Fix:
+    """The camera's nadir and its covariance; the heading too where it was not ``trusted`` but searched for."""
     site, frame = query.site, aligned.frame
     nadir = nadir_px(query, peak, aligned)
     east, north = site.enu_from_pixel(nadir)
@@ -149,7 +148,6 @@ def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: Nc
     peak_px2 = peak_covariance_px(peak, rows * columns)
     peak_px2 = peak_px2 + pull_px2(peak, (rows, columns), frame.height_agl_m, options.errors)
     covariance = ncc_covariance_m2(peak_px2, frame, query.camera, aligned.jacobian, options.errors)
-    searched = frame is not query.frame
     attitude = Attitude(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)
     return Fix(
         timestamp_ns=frame.timestamp_ns,
@@ -159,7 +157,7 @@ def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: Nc
         north_m=float(north),
         up_m=None,
         covariance_m2=covariance,
-        attitude=attitude if searched else None,
+        attitude=None if trusted else attitude,
         score=peak.score,
         method=METHOD,
         window=window,

@@ -42,7 +42,7 @@ def locate(query: Query, method: str) -> Fix | NoFix:
     center = np.zeros(2) if nadir is None else nadir
     window = query.window(center, extent, (1.0, 1.0), margin=MARGIN)
     if window is None:
-        return query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
+        return query.refuse_outside(method)
     return (_locate_sift if method == "sift" else _locate_ncc)(query, window, query.site.gray(window))
 
 
@@ -52,7 +52,7 @@ def _scale(query: Query) -> float:
     return query.frame.height_agl_m / (query.camera.focal_px * query.site.gsd_m_per_px)
 
 
-def laid(query: Query, window: Window) -> Gray | None:
+def template_of(query: Query, window: Window) -> Gray | None:
     """The frame equalised, scaled (eq. 2) and turned (eq. 3), square; None where it does not fit the window."""
     assert query.frame.heading_deg is not None  # refused before
     height, width = query.gray.shape
@@ -74,7 +74,7 @@ def surface(template: Gray, search: Gray) -> Surface:
 
 def _locate_ncc(query: Query, window: Window, search: Gray) -> Fix | NoFix:
     with query.watch.stage("align"):
-        template = laid(query, window)
+        template = template_of(query, window)
     if template is None:
         return query.refuse(Reason.OUTSIDE_MAP, "the frame does not fit the window", "ncc", window=window)
     with query.watch.stage("match"):

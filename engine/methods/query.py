@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -18,8 +19,8 @@ from engine.camera import Camera
 from engine.costs import Costs
 from engine.device import synchronise
 from engine.orthomap import OrthoMap
-from engine.types import Frame, NoFix, Prior, Reason, Timings, Window
-from engine.window import place_window, window_size_px
+from engine.types import Attitude, Frame, NoFix, Prior, Reason, Timings, Window
+from engine.window import SPREAD_SIGMAS, place_window, window_size_px
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ class Query:
     """One frame on its way to a fix.
 
     Attributes:
-        frame: as it came.
+        frame: as it came, but for its heading, which counts from the north of the map's plane.
         gray: (H, W) its undistorted grey picture.
         camera: the pinhole that the undistorted picture obeys.
         site: the map.
@@ -92,15 +93,26 @@ class Query:
 
     @cached_property
     def prior_px(self) -> Array | None:
-        """The prior's position in map pixels (x, y), or None where there is none."""
+        """The prior's position in map pixels (x, y); None without one, not finite where the CRS does not reach."""
         prior = self.prior
         if prior is None:
             return None
-        if prior.east_m is not None and prior.north_m is not None:
-            return self.site.pixel_from_enu(np.array([prior.east_m, prior.north_m]))
-        assert prior.lat_deg is not None  # a Prior has one of the two
-        assert prior.lon_deg is not None
-        return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+        with np.errstate(invalid="ignore"):
+            if prior.east_m is not None and prior.north_m is not None:
+                return self.site.pixel_from_enu(np.array([prior.east_m, prior.north_m]))
+            assert prior.lat_deg is not None  # a Prior has one of the two
+            assert prior.lon_deg is not None
+            return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+
+    def with_frame(self, frame: Frame) -> Query:
+        """The same asked of another frame; what is known of the prior by now stays."""
+        other = copy(self)
+        object.__setattr__(other, "frame", frame)
+        return other
+
+    def level_of(self, height_m: float) -> int:
+        """The pyramid level whose pixels are like the frame's, taken from this high above the ground."""
+        return level_for(self.site.gsd_m_per_px, height_m / self.camera.focal_px, self.site.levels)
 
     @cached_property
     def jacobian(self) -> Array:
@@ -117,7 +129,6 @@ class Query:
         least_px: tuple[float, float],
         *,
         margin: float,
-        spread_sigmas: float = 3.0,
     ) -> Window | None:
         """The adaptive window in map pixels (eq. 4, 5), or None where it lies outside the map.
 
@@ -125,9 +136,8 @@ class Query:
             center_px: where the middle of the footprint should lie.
             footprint_px: extent of the whole frame on the map.
             least_px: extent of what will be matched. The window holds it at every place within
-                ``spread_sigmas`` of the prior, also where equations 4 and 5 would be smaller.
+                :data:`engine.window.SPREAD_SIGMAS` of the prior, also where equations 4 and 5 would be smaller.
             margin: the paper's 1.3.
-            spread_sigmas: see above.
         """
         prior = self.prior
         if prior is None:
@@ -135,7 +145,7 @@ class Query:
         moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
         moved_px = np.abs(np.linalg.solve(self.jacobian, moved_m))
         size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
-        slack = 2.0 * spread_sigmas * prior.sigma_m / self.site.gsd_m_per_px
+        slack = 2.0 * SPREAD_SIGMAS * prior.sigma_m / self.site.gsd_m_per_px
         width, height = (max(a, b + slack) for a, b in zip(size, least_px, strict=True))
         shape = (self.site.width_px, self.site.height_px)
         return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
@@ -167,6 +177,15 @@ class Query:
             return None
         figure = f"the frame's grey levels deviate by {deviation:.1f}"
         return self.refuse(Reason.NO_TEXTURE, f"{figure}; {min_deviation:g} is asked for", method)
+
+    def refuse_tilted(self, attitude: Attitude, method: str) -> NoFix:
+        """The refusal of a frame of which some part sees the horizon, or nearly so."""
+        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
+        return self.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", method)
+
+    def refuse_outside(self, method: str) -> NoFix:
+        """The refusal of a frame whose window has nothing in common with the map."""
+        return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
 
 
 def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) -> Window:

@@ -10,27 +10,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.align import enhance
+from engine.align import enhance, shrink
 from engine.dense import Belief, DenseFit, Picture, Pose, correlation_at, covariance_of, refine
-from engine.geo import attitude_from_rotation, enu_from_body
-from engine.integrity import AssumedErrors
+from engine.geo import attitude_from_rotation, chi_square, enu_from_body
+from engine.integrity import SAME_PLACE, AssumedErrors
 from engine.methods.laid import NccOptions
-from engine.methods.query import Query, level_for
+from engine.methods.query import Query
 from engine.methods.samples import BLOCK_PX, SampleMap
+from engine.pose import AttitudePrior
 from engine.types import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
-_MAX_SHRINK = 0.75  # a frame finer than the map by more than this is averaged down first
-# Levels above the frame's own on which refinement begins; where nobody told roll and pitch, or it did not find its
-# way from the former, the latter, where a few pixels reach farther.
+# Refinement begins this many levels above the frame's own: one where the tilt was told; two where it was not, or
+# the first try failed.
 _COARSER, _COARSER_YET = 1, 2
 _TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # from which it begins there, about both axes
 _LEAST_UNTOLD = 0.45  # correlation asked for there: over simulated towns true poses reached 0.53, wrong ones 0.32
 _LEAST = 0.2  # the same where they were told: over a town in snow true poses reached 0.29
 _HEIGHT_SHARE = 2e-4  # of the height that walls, and the ground that they hide, pull it: 3 cm at 150 m
 _LAST_STEP, _LAST_STEP_COARSE = 0.2, 0.5  # in standard deviations: a coarser level only has to come near
-_SAME_PLACE = 13.8  # chi-square of two degrees of freedom that chance exceeds once in a thousand
 
 
 def improve(query: Query, fix: Fix, samples: SampleMap, options: NccOptions) -> Fix | NoFix:
@@ -54,8 +53,7 @@ def improve(query: Query, fix: Fix, samples: SampleMap, options: NccOptions) -> 
         covariance = pose_covariance[:3, :3] + options.errors.map_m**2 * np.eye(3)
         covariance[2, 2] += (_HEIGHT_SHARE * (fit.pose.center_m[2] - query.site.ground_m)) ** 2
         moved = (fit.pose.center_m - belief.pose.center_m)[:2]
-        allowed = fix.covariance_m2[:2, :2] + covariance[:2, :2]
-        if float(moved @ np.linalg.solve(allowed, moved)) <= _SAME_PLACE:
+        if chi_square(moved, fix.covariance_m2[:2, :2] + covariance[:2, :2]) <= SAME_PLACE:
             return _improved(query, fix, fit, covariance)
     return fix if _told_tilt(query) else _refused(query, fix)
 
@@ -70,7 +68,7 @@ def _through_levels(
     """Refine on levels coarser than the frame's first, where a few pixels reach farther, then on its own."""
     site, height_m = query.site, query.frame.height_agl_m
     assert height_m is not None  # a fix by correlation had one
-    own = level_for(site.gsd_m_per_px, height_m / query.camera.focal_px, site.levels)
+    own = query.level_of(height_m)
     told = _told_tilt(query)
     pose, fit, before = belief.pose, None, 0.0
     for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
@@ -112,13 +110,9 @@ def _belief(query: Query, fix: Fix, errors: AssumedErrors) -> Belief:
     mount = query.camera.mount
     rotation = (enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ mount).T
     precision = np.zeros((8, 8))
-    precision[2, 2] = 1.0 / (errors.height_m**2 + (errors.height_share * height_m) ** 2)
-    tilts = [
-        errors.tilt_deg if known is not None else errors.unknown_tilt_deg
-        for known in (frame.roll_deg, frame.pitch_deg)
-    ]
-    about_body = np.radians([*tilts, errors.heading_deg]) ** -2.0
-    precision[3:6, 3:6] = (mount.T * about_body) @ mount
+    precision[2, 2] = errors.height_sigma_m(height_m) ** -2.0
+    known = AttitudePrior(rotation, (*errors.tilts_deg(frame), errors.heading_deg), axes=mount)
+    precision[3:6, 3:6] = known.precision
     precision[[6, 7], [6, 7]] = math.tan(math.radians(errors.surface_slope_deg)) ** -2.0
     ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
     center = np.array([fix.east_m, fix.north_m, ground_m + height_m])
@@ -140,16 +134,11 @@ def _footprint(query: Query, pose: Pose, height_m: float, level: int) -> Window 
 
 def _picture(query: Query, height_m: float, level: int, options: NccOptions) -> Picture:
     """The frame at the resolution of a level, enhanced as the map is."""
-    gray, matrix = query.gray, query.camera.matrix
     scale = height_m / query.camera.focal_px / (query.site.gsd_m_per_px * 2.0**level)
-    if scale < _MAX_SHRINK:
-        height, width = (max(8, round(n * scale)) for n in gray.shape)
-        sx, sy = width / gray.shape[1], height / gray.shape[0]
-        gray = np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        matrix = np.array([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1.0]]) @ matrix
-        scale /= math.sqrt(sx * sy)
+    gray, smaller = shrink(query.gray, scale)
+    scale /= math.sqrt(smaller[0, 0] * smaller[1, 1])
     radius_px = max(1, round(options.enhance_radius_px / scale)) if options.enhance_radius_px else 0
-    return Picture(enhance(gray, radius_px=radius_px, score=options.score), matrix)
+    return Picture(enhance(gray, radius_px=radius_px, score=options.score), smaller @ query.camera.matrix)
 
 
 def _refused(query: Query, fix: Fix) -> NoFix:

@@ -15,11 +15,11 @@ from engine.errors import OptionError
 from engine.evidence import PoseEvidence, expected_of, probability
 from engine.features import match, sift
 from engine.geo import attitude_from_rotation, enu_from_body
-from engine.integrity import AssumedErrors
+from engine.integrity import AssumedErrors, judge_evidence
 from engine.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.learned import PairMatcher
 from engine.methods.query import Query
-from engine.methods.views import LOWEST_M, Belief, View, turn_deg, view_in, views_of
+from engine.methods.views import LOWEST_M, Belief, MapView, turn_deg, view_in, views_of
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
 from engine.types import Attitude, Fix, NoFix, Reason, Window
@@ -86,13 +86,22 @@ class SiftOptions:
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
+        for name in ("margin", "height_factor", "max_height_m", "min_deviation"):
+            if math.isinf(getattr(self, name)):
+                raise OptionError(f"{name}: expected a finite number, got {getattr(self, name)}")
         for name in ("margin", "height_factor"):
             if not getattr(self, name) >= 1.0:
                 raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+        if not self.min_deviation >= 0.0:
+            raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
+        if not 0.0 <= self.min_confidence < 1.0:
+            raise OptionError(f"min_confidence: expected 0 or more and below 1, got {self.min_confidence}")
         for name in ("scale", "ratio"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
-        for name, least in (("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", LOWEST_M)):
+        for name, least in (
+            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", LOWEST_M), ("max_tilt_deg", 0.0)
+        ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > least:
                 raise OptionError(f"{name}: expected above {least:g}, got {value}")
@@ -100,8 +109,9 @@ class SiftOptions:
             raise OptionError(
                 f"map_features: expected one of {', '.join(MAP_FEATURES)}, got {self.map_features!r}"
             )
-        if self.max_keypoints < 4:
-            raise OptionError(f"max_keypoints: expected 4 or more, got {self.max_keypoints}")
+        for name in ("max_keypoints", "max_map_keypoints"):
+            if not getattr(self, name) >= 4:
+                raise OptionError(f"{name}: expected 4 or more, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +125,7 @@ class _Matched:
         weights: (M,) relative inverse variances of the pixels.
     """
 
-    view: View
+    view: MapView
     points_px: Array
     points_m: Array
     weights: Array
@@ -176,19 +186,15 @@ def find(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Found | 
 
 def doubtful(found: Found, options: SiftOptions) -> bool:
     """Whether a pose is not probable enough."""
-    return (found.fix.confidence or 0.0) < options.min_confidence
+    return judge_evidence(found.evidence, options.min_confidence) is not None
 
 
 def judge(query: Query, found: Found, options: SiftOptions) -> Fix | NoFix:
     """The fix where its pose is believed, else a refusal."""
-    fix, evidence = found.fix, found.evidence
-    if not doubtful(found, options):
-        return fix
-    off = "unknown" if evidence.off_prior is None else f"{evidence.off_prior:.1f}"
-    figures = f"log10 of false alarms {evidence.log10_nfa:.1f}, chi-square {off} from the prior"
-    asked = f"{options.min_confidence:g} is asked for ({figures})"
-    detail = f"right with a probability of {fix.confidence:.3f}, {asked}"
-    return query.refuse(Reason.BAD_POSE, detail, METHOD, score=fix.score, window=fix.window)
+    refusal = judge_evidence(found.evidence, options.min_confidence)
+    if refusal is None:
+        return found.fix
+    return query.refuse(*refusal, METHOD, score=found.fix.score, window=found.fix.window)
 
 
 def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOptions) -> Found | NoFix:
@@ -240,7 +246,7 @@ def matches_in(
 
 
 def _by_features(
-    query: Query, views: list[View], landmarks: LandmarkMap, belief: Belief, options: SiftOptions
+    query: Query, views: list[MapView], landmarks: LandmarkMap, belief: Belief, options: SiftOptions
 ) -> list[_Matched]:
     """Features of the frame among those of the map, view by view."""
     turn = belief.turn_deg
@@ -259,7 +265,7 @@ def _by_features(
                 ratio=options.ratio,
                 rotation_deg=-(turn or 0.0),
                 max_angle_diff_deg=None if upright or turn is None else options.max_turn_deg,
-                scale=1.0 / view.coarser,
+                scale=1.0 / view.pixel_ratio,
                 max_scale_factor=None if belief.height_m is None else options.max_scale_factor,
             )
             pairs = found.pairs().cpu().numpy()
@@ -271,7 +277,7 @@ def _by_features(
     return matched
 
 
-def _by_matcher(query: Query, views: list[View], matcher: PairMatcher, options: SiftOptions) -> list[_Matched]:
+def _by_matcher(query: Query, views: list[MapView], matcher: PairMatcher, options: SiftOptions) -> list[_Matched]:
     """What the user's own matcher finds, view by view."""
     reduced = _reduced(query, options.scale)
     matched = []
@@ -293,12 +299,12 @@ def _reduced(query: Query, scale: float) -> _Reduced:
 
 
 def _map_features(
-    query: Query, view: View, landmarks: LandmarkMap, upright: bool, options: SiftOptions
+    query: Query, view: MapView, landmarks: LandmarkMap, upright: bool, options: SiftOptions
 ) -> Landmarks:
     """Landmarks of a view, as dense as the features of the reduced frame; denser where its pixels are coarser."""
     reduced_px = query.gray.size * options.scale**2
     if options.map_features == "prepared":
-        per_px = options.max_keypoints / reduced_px * max(1.0, view.coarser) ** 2
+        per_px = options.max_keypoints / reduced_px * max(1.0, view.pixel_ratio) ** 2
         return landmarks.find(view.crop, view.level, upright=upright, per_px=per_px)
     site, crop = query.site, view.crop
     count = np.clip(
@@ -352,12 +358,10 @@ def _pose(query: Query, found: _Matched, belief: Belief, options: SiftOptions) -
 
 
 def _attitude_prior(query: Query, heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
-    """The frame's attitude with its assumed error about the camera's axes; what is not told is level."""
-    roll_deg, pitch_deg = query.frame.roll_deg, query.frame.pitch_deg
-    told = roll_deg is not None and pitch_deg is not None
-    tilt_deg = errors.tilt_deg if told else errors.unknown_tilt_deg
-    enu_from_camera = enu_from_body(roll_deg or 0.0, pitch_deg or 0.0, heading_deg) @ query.camera.mount
-    return AttitudePrior(enu_from_camera.T, (tilt_deg, tilt_deg, sigma_deg))
+    """The frame's attitude with its assumed errors about the body's axes; what is not told is level."""
+    frame, mount = query.frame, query.camera.mount
+    enu_from_camera = enu_from_body(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, heading_deg) @ mount
+    return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(frame), sigma_deg), axes=mount)
 
 
 def _weighed(query: Query, fix: Fix, stats: PoseStats, belief: Belief, options: SiftOptions) -> Found:
@@ -366,7 +370,7 @@ def _weighed(query: Query, fix: Fix, stats: PoseStats, belief: Belief, options: 
     off_height = None
     if height_m is not None and belief.height_m == height_m:
         assert fix.up_m is not None
-        variance = errors.height_m**2 + (errors.height_share * height_m) ** 2 + float(fix.covariance_m2[2, 2])
+        variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2])
         ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
         off_height = (fix.up_m - ground_m - height_m) ** 2 / variance
     off_prior = None

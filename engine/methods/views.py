@@ -12,7 +12,7 @@ from engine.align import view_of
 from engine.geo import enu_from_body
 from engine.landmarks import PREPARED_PX
 from engine.methods.query import Query, level_crop, level_for
-from engine.types import Attitude, NoFix, Reason, Window
+from engine.types import Attitude, NoFix, Window
 
 LOWEST_M = 1.0
 """The lowest height that is looked for where the height is unknown."""
@@ -39,20 +39,20 @@ class Belief:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class MapView:
     """A part of one level of the map that the frame may show.
 
     Attributes:
         window: in pixels of the full map.
         level: of the pyramid.
         crop: the window in pixels of the level.
-        coarser: pixel of the level over pixel of the reduced frame, on the ground; at the lowest height.
+        pixel_ratio: pixel of the level over pixel of the reduced frame, on the ground; at the lowest height.
     """
 
     window: Window
     level: int
     crop: Window
-    coarser: float
+    pixel_ratio: float
 
     @property
     def corner_px(self) -> NDArray[np.float64]:
@@ -72,7 +72,7 @@ def turn_deg(query: Query) -> float | None:
     return math.degrees(math.atan2(y, x))
 
 
-def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale: float) -> list[View] | NoFix:
+def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale: float) -> list[MapView] | NoFix:
     """The windows to look at, one a level; a level that is too large to be searched gives way to a coarser one.
 
     Args:
@@ -85,7 +85,7 @@ def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale:
     site, heights_m = query.site, belief.heights_m
     per_height = 1.0 / (query.camera.focal_px * scale * site.gsd_m_per_px)
     first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
-    views: dict[int, View] = {}
+    views: dict[int, MapView] = {}
     for level in range(first, last + 1):
         served_m = heights_m[1] if level == last else 2 ** (level + _LEVEL_ENDS) / per_height
         window = _window(query, served_m, belief.turn_deg is not None, method, margin)
@@ -96,18 +96,18 @@ def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale:
     return list(views.values())
 
 
-def view_in(query: Query, window: Window, height_m: float, scale: float) -> View:
+def view_in(query: Query, window: Window, height_m: float, scale: float) -> MapView:
     """The view of a window that is known, at one height; see :func:`views_of`."""
     per_px = height_m / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
     return _view(query, window, level_for(1.0, per_px, query.site.levels), per_px)
 
 
-def _view(query: Query, window: Window, level: int, per_px: float) -> View:
+def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
     """A window on a level, or where it is too large a coarser one; ``per_px`` map pixels are one of the frame."""
     site = query.site
     while window.area_px >> 2 * level > PREPARED_PX and level < site.levels - 1:
         level += 1
-    return View(window, level, level_crop(site, window, level, step_px=_CROP_STEP_PX), 2**level / per_px)
+    return MapView(window, level, level_crop(site, window, level, step_px=_CROP_STEP_PX), 2**level / per_px)
 
 
 def _window(query: Query, height_m: float, known_turn: bool, method: str, margin: float) -> Window | NoFix:
@@ -118,10 +118,9 @@ def _window(query: Query, height_m: float, known_turn: bool, method: str, margin
     attitude = query.frame.attitude or Attitude(0.0, 0.0, 0.0)
     view = view_of(query.camera, attitude, height_m, query.jacobian)
     if view is None:
-        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
-        return query.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", method)
+        return query.refuse_tilted(attitude, method)
     width, height = view.footprint_px
     if not known_turn:  # at any heading the footprint fits the square of its diagonal
         width = height = math.hypot(width, height)
     window = query.window(nadir + view.center_px, (width, height), (width, height), margin=margin)
-    return window or query.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
+    return window or query.refuse_outside(method)

@@ -1,0 +1,89 @@
+"""Headings count from true north at the place, wherever on the map: near a pole it turns within a street."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import Fix, MatcherOptions, SceneMatcher, Window
+from engine.methods.ncc import NccOptions
+
+HEIGHT_M = 80.0
+PLANE_DEG = 25.0  # the heading in the plane's axes, by which the pictures are drawn
+NADIR = np.array([500.0, 300.0])
+
+
+@pytest.fixture(scope="module")
+def polar(make_ground):
+    """3.3 km from the pole: 90 m east of the map's middle north has turned by a degree and a half."""
+    return make_ground(epsg=32661, lat_deg=89.97, lon_deg=15.0)
+
+
+@pytest.fixture(scope="module")
+def north_deg(polar):
+    """Where true north is at the place of the pictures, by two places on its meridian."""
+    lat, lon = (float(v) for v in polar.site.geodetic_from_pixel(NADIR))
+    south, north = polar.site.frame.enu_from_geodetic(np.array([lat - 1e-5, lat + 1e-5]), lon)
+    turn = math.degrees(math.atan2(*(north - south)))
+    assert -1.6 < turn < -1.4
+    return turn
+
+
+@pytest.fixture(scope="module")
+def frame(polar, camera, north_deg):
+    drawn = polar.frame(camera, NADIR, HEIGHT_M, heading_deg=PLANE_DEG)
+    return replace(drawn, heading_deg=PLANE_DEG - north_deg)
+
+
+@pytest.fixture(scope="module")
+def make(polar, camera):
+    def build(method, **options):
+        return SceneMatcher(polar.site, camera, method, "cpu", MatcherOptions(**options))
+
+    return build
+
+
+def heading_off(fix, heading_deg):
+    return abs(math.remainder(fix.attitude.heading_deg - heading_deg, 360.0))
+
+
+@pytest.mark.parametrize(
+    ("method", "profile"),
+    [("ncc", "engine"), ("sift", "engine"), ("auto", "engine"), ("ncc", "paper"), ("sift", "paper")],
+)
+def test_a_frame_with_its_true_heading_lies_on_the_map(make, polar, frame, method, profile):
+    fix = make(method, profile=profile).locate(frame, polar.prior(NADIR))
+    assert isinstance(fix, Fix)
+    assert fix.score > 0.97
+    assert np.hypot(*(np.array(fix.map_xy_px) - NADIR)) < (1.0 if profile == "paper" else 0.2)
+    if fix.attitude is not None:
+        assert heading_off(fix, frame.heading_deg) < 0.05
+
+
+def test_the_planes_heading_in_its_place_is_off(make, polar, frame):
+    """What the above would be without: the test can fail."""
+    told = replace(frame, heading_deg=PLANE_DEG)
+    assert make("ncc").locate(told, polar.prior(NADIR)).score < 0.9
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+def test_a_heading_that_was_searched_for_is_the_true_one(make, polar, frame, known):
+    """Without a prior the search begins with north as in the map's middle."""
+    matcher = make("ncc", ncc=NccOptions(heading_search_deg=4.0))
+    fix = matcher.locate(
+        replace(frame, heading_deg=frame.heading_deg + 2.0), polar.prior(NADIR) if known else None
+    )
+    assert isinstance(fix, Fix)
+    assert heading_off(fix, frame.heading_deg) < 0.2
+
+
+def test_an_explanation_lays_the_frame_by_its_true_heading(make, frame):
+    scores = [
+        make("ncc").explain(told, Window(300, 100, 340, 400)).surface.score
+        for told in (frame, replace(frame, heading_deg=PLANE_DEG))
+    ]
+    assert scores[0] > 0.97
+    assert scores[1] < 0.93
