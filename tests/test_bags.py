@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+import sys
 import warnings
 
 import numpy as np
@@ -221,8 +222,10 @@ def test_misuse_is_named(tmp_path):
     with pytest.raises(TelemetryError, match="frame 0: expected a stamp"):
         write_bag(tmp_path / "x.bag", [(Frame(frames[0].image), None)], CAMERA, kind="ros1")
     (tmp_path / "there.bag").write_bytes(b"")
-    with pytest.raises(TelemetryError, match="cannot be written"):
+    with pytest.raises(OptionError, match=r"there\.bag exists"):
         write_bag(tmp_path / "there.bag", [], CAMERA, kind="ros1")
+    with pytest.raises(TelemetryError, match=r"/there\.bag/x: cannot be written"):
+        write_bag(tmp_path / "there.bag" / "x", [], CAMERA, kind="ros2-mcap")
     with pytest.raises(TelemetryError, match="no such bag"):
         BagFrames(tmp_path / "missing.bag")
 
@@ -301,17 +304,55 @@ def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     assert "--camera" in capsys.readouterr().err
 
 
-def test_force_removes_a_bag_and_nothing_else(tmp_path, capsys):
-    from engine.cli.bag import _make_room
+def files_in(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
+
+def test_force_replaces_a_bag_and_nothing_else(tmp_path):
     path, _, _ = a_bag(tmp_path, "ros2-mcap")
     (path / "notes.txt").write_text("mine", encoding="utf-8")
+    before = files_in(tmp_path)
     with pytest.raises(OptionError, match=r"notes\.txt"):
-        _make_room(path, True)
-    assert (path / "metadata.yaml").exists()
+        write_bag(path, [], CAMERA, kind="ros2-mcap", replace=True)
+    (tmp_path / "link").symlink_to(path)
     (path / "notes.txt").unlink()
-    _make_room(path, True)
-    assert not path.exists()
+    with pytest.raises(OptionError, match="it is a link"):
+        write_bag(tmp_path / "link", [], CAMERA, kind="ros2-mcap", replace=True)
+    (path / "notes.txt").write_text("mine", encoding="utf-8")
+    (tmp_path / "link").unlink()
+    assert files_in(tmp_path) == before
+
+
+def unreadable():
+    """A frame, and then one that does not decode."""
+    frames, _ = a_flight(1)
+    yield frames[0], None
+    raise TelemetryError("frame 1: expected a readable picture")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_bag_stays_until_the_next_one_is_whole(tmp_path, kind, monkeypatch):
+    path, _, _ = a_bag(tmp_path, kind, count=2)
+    before = files_in(tmp_path)
+    with pytest.raises(TelemetryError, match="readable"):
+        write_bag(path, unreadable(), CAMERA, kind=kind, replace=True)
+    assert files_in(tmp_path) == before
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "rosbags", None)
+        patch.setitem(sys.modules, "rosbags.highlevel", None)
+        with pytest.raises(TelemetryError, match=r"\[bags\]"):
+            write_bag(path, [], CAMERA, kind=kind, replace=True)
+    assert files_in(tmp_path) == before
+    frames, _ = a_flight(3)
+    assert write_bag(path, [(frame, None) for frame in frames], CAMERA, kind=kind, replace=True) == 3
+    assert len(BagFrames(path).names) == 3
+    assert list(tmp_path.iterdir()) == [path]
+    assert sorted(files_in(tmp_path)) == sorted(before)
+
+    new = tmp_path / "deep" / path.name  # where nothing was, nothing half is left
+    with pytest.raises(TelemetryError, match="readable"):
+        write_bag(new, unreadable(), CAMERA, kind=kind)
+    assert not any(new.parent.iterdir())
 
 
 def test_topics_of_the_calibration(tmp_path, maker):

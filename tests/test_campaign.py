@@ -17,9 +17,13 @@ import pytest
 
 from engine import OptionError
 from engine.cli.app import run
+from engine.cli.campaign import _prepare
 from engine.cli.campaign_plan import Campaign, _fingerprint, plan_campaign
 from engine.cli.demo import write_flight
 from engine.cli.executors import in_processes
+from engine.cli.jobs import read_result
+from engine.errors import TelemetryError
+from engine.formats.logs import LogClock
 from engine.formats.settings import read_settings
 from engine.formats.track import read_track
 from engine.report.campaign import Line, pooled, write_tables
@@ -218,6 +222,23 @@ def test_an_input_that_changed_on_disk_changes_its_print(place, tmp_path):
     file.write_text(FILE.replace('surface = "none"', "map_sigma_m = 2"), encoding="utf-8")
     assert set(prints()["good/ncc"].items()) - set(before["good/ncc"].items()) == {("map_sigma_m", "2.0")}
 
+    # When the frames of a flight with a log were taken counts too.
+    (tmp_path / "flight" / "log.ulg").write_bytes(b"log")
+    (tmp_path / "flight" / "stamps.csv").write_text("timestamp_ns,frame\n1,0.jpg\n", encoding="utf-8")
+    (tmp_path / "flight" / "flight.bag").write_bytes(b"bag")
+    logged = 'telemetry = "log.ulg"\nframe_stamps = "stamps.csv"\nlog_offset_s = -0.5\n'
+    logged += 'frames = "flight.bag"\nimage_topic = "/down"'
+    file.write_text(FILE.replace('surface = "none"', logged), encoding="utf-8")
+    (run,) = (job for job in plan_campaign(file, tmp_path).runs if job.name == "good/ncc")
+    stamps = tmp_path.resolve() / "flight" / "stamps.csv"
+    assert run.task.inputs.clock == LogClock(stamps, -0.5)
+    assert run.task.inputs.image_topic == "/down"
+    changed = {name for name, value in run.inputs.items() if before["good/ncc"].get(name) != value}
+    assert changed == {"frames", "telemetry", "frame_stamps", "log_offset_s", "image_topic"}
+    file.write_text(FILE.replace('surface = "none"', "log_offset_s = 2"), encoding="utf-8")
+    with pytest.raises(OptionError, match=r"flights\.good: frame_stamps, log_offset_s: expected a log as telem"):
+        plan_campaign(file, tmp_path)
+
     file.write_text(FILE, encoding="utf-8")
     (tmp_path / "flight" / "frames" / "0.jpg").write_bytes(b"Picture")
     _fingerprint.cache_clear()  # another process, another day
@@ -239,6 +260,11 @@ def test_an_input_that_changed_on_disk_changes_its_print(place, tmp_path):
         ("[simulated]\nseeds = [1.5]", "simulated.seeds: expected a whole number, got 1.5"),
         ("[simulated]\nseeds = [-1]", "simulated.seeds: expected 0 or more, got -1"),
         ("[simulated]\nconditions = ['night']", "conditions: expected one of noon, "),
+        ("[simulated]\nframes = 0", "simulated.frames: expected 1 or more, got 0"),
+        ("[simulated]\nrelief_m = -5.0", "simulated.relief_m: expected 0 to 80, got -5"),
+        ("[simulated]\nrelief_m = nan", "simulated.relief_m: expected 0 to 80, got nan"),
+        ("[flights.a]\nlog_offset_s = inf", "flights.a.log_offset_s: expected finite seconds, got inf"),
+        ("[flights.a]\nmap_sigma_m = -1", "flights.a.map_sigma_m: expected a number above 0"),
         ("[simulated]\nseeds = [1]", "runs: expected a list of METHOD, METHOD/PROFILE or settings files"),
         ("runs = ['ncc']", "expected flights, as [flights.NAME] or as seeds in [simulated], got none"),
         (
@@ -274,6 +300,62 @@ def test_a_folder_that_is_no_campaigns_is_left_alone(place, tmp_path, capsys):
     assert run(["campaign", str(place / "campaign.toml"), f"--out={tmp_path}"]) == 2
     assert "exists; choose another folder" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_folder_that_only_looks_like_a_campaigns_keeps_its_files(place, tmp_path, capsys):
+    """Folders of the same names are nobody's permission to remove what is in them."""
+    for name in ("runs/lake.txt", "unfinished/thesis.txt"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("mine", encoding="utf-8")
+    command = ["campaign", str(place / "campaign.toml"), f"--out={tmp_path}", "--workers=1"]
+    assert run(command) == 2
+    assert "exists; choose another folder" in capsys.readouterr().err
+    assert run([*command, "--force"]) == 2
+    assert "expected a folder without unfinished/" in capsys.readouterr().err
+    found = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file())
+    assert found == ["runs/lake.txt", "unfinished/thesis.txt"]
+
+
+def test_a_campaigns_folder_is_known_by_its_marker_or_its_table(whole, tmp_path):
+    left = []
+    _prepare(tmp_path / "new", left, False)
+    (tmp_path / "new" / "unfinished" / "half").mkdir()
+    _prepare(tmp_path / "new", left, False)  # killed before its table was there
+    assert not any((tmp_path / "new" / "unfinished").iterdir())
+    (tmp_path / "copied" / "runs").mkdir(parents=True)
+    shutil.copy(whole / "campaign.csv", tmp_path / "copied")
+    _prepare(tmp_path / "copied", left, False)
+    (tmp_path / "other" / "runs").mkdir(parents=True)
+    (tmp_path / "other" / "campaign.csv").write_text("votes,party\n", encoding="utf-8")
+    with pytest.raises(OptionError, match="exists"):
+        _prepare(tmp_path / "other", left, False)
+
+
+DAMAGE = {
+    "result.json": [
+        "", "{", "[]", "5", "deep", '{"inputs": 5, "figures": {}}', '{"inputs": {"map": 5}, "figures": {}}',
+        ("figures", None), ("figures", {}), ("frames", "x"), ("frames", None), ("fixes", [1]), ("rms_m", "far"),
+        ("rms_m", 1e300), ("scored_fixes", None), ("false_fixes", None), ("wrong_over_10m", "x"),
+        ("availability", []), ("nees_mean", {}), ("median_m", True),
+    ],
+    "summary.json": ["", "[]", "{}", '{"latency_ms": 5}', '{"latency_ms": {"p50": "x"}}', '{"latency_ms": []}'],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "change"), [(name, change) for name in DAMAGE for change in DAMAGE[name]])
+def test_a_finished_run_that_is_damaged_is_named_before_any_work(name, change, place, whole, tmp_path):
+    (job,) = (job for job in plan_campaign(place / "campaign.toml", whole).runs if job.name == "good/ncc")
+    folder = tmp_path / "ncc"
+    shutil.copytree(job.folder, folder)
+    text = "[" * 100_000 if change == "deep" else change
+    if isinstance(change, tuple):
+        result = json.loads((folder / name).read_text(encoding="utf-8"))
+        (result if change[0] == "figures" else result["figures"])[change[0]] = change[1]
+        text = json.dumps(result)
+    (folder / name).write_text(text, encoding="utf-8")
+    assert read_result(job).latency_ms["p50"] > 0.0
+    with pytest.raises(TelemetryError, match=f"{name}: expected the result of a run, got something else"):
+        read_result(replace(job, folder=folder))
 
 
 # --------------------------------------------------------------------------------------------- executors

@@ -1,6 +1,7 @@
 """compare: several runs over one flight, in one table and one chart."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from engine import OptionError
 from engine.cli.app import run
 from engine.cli.compare import USUAL, parse_runs
 from engine.cli.demo import write_flight
+from engine.cli.track import Settings, folder_inputs, run_track
+from engine.formats.logs import LogClock
 from engine.formats.track import read_track
 from engine.report.comparison import draw_comparison
 from engine.sim import plan_flight
@@ -46,12 +49,52 @@ def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
         assert summary == json.loads((out / name / "summary.json").read_text(encoding="utf-8"))
         assert len(read_track(out / name / "track.csv")) == summary["frames"] == 4
     assert f"{table['ncc']['rms_m']:.2f}" in printed
+    run_track(folder_inputs(flight), tmp_path / "alone", Settings(method="ncc"), report=False)
+    alone, beside = (read_track(path / "track.csv") for path in (tmp_path / "alone", out / "ncc"))
+    assert [replace(row, latency_ms=None) for row in alone] == [replace(row, latency_ms=None) for row in beside]
     assert picture(out / "comparison.png").shape[1] > 500
 
     assert run(command(flight, out, "--run=ncc")) == 2
     assert "--force" in capsys.readouterr().err
     assert run(command(flight, out, "--run=sift", "--force", "--json")) == 0
     assert list(json.loads(capsys.readouterr().out)) == ["sift"]
+
+
+def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp_path, capsys):
+    """The last run is refused: by what the telemetry lacks, by a place, by a file in its folder's place."""
+    rows = [line.split(",") for line in (flight / "telemetry.csv").read_text(encoding="utf-8").splitlines()]
+    column = rows[0].index("heading_deg")
+    text = "\n".join(",".join(cells[:column] + cells[column + 1 :]) for cells in rows)
+    blind = flight / "blind.csv"
+    blind.write_text(text, encoding="utf-8")
+    (tmp_path / "far.toml").write_text('method = "sift"\nstart = "0,0"\n', encoding="utf-8")
+    out = tmp_path / "out"
+    two = ["--run=sift", "--run=ncc"]
+    assert run([*command(flight, out, *two), f"--telemetry={blind}"]) == 1
+    assert "telemetry: ncc needs height_agl_m and heading_deg" in capsys.readouterr().err
+    assert run([*command(flight, out, *two), f"--camera={flight / 'none.yaml'}"]) == 1
+    assert "no such file" in capsys.readouterr().err
+    assert run(command(flight, out, "--run=ncc", f"--run={tmp_path / 'far.toml'}")) == 2
+    assert "--start: expected a place on the map" in capsys.readouterr().err
+    assert not out.exists()
+    out.mkdir()
+    (out / "sift").write_text("mine", encoding="utf-8")
+    assert run(command(flight, out, "--run=ncc", "--run=sift", "--force")) == 2
+    assert "sift is a file" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["sift"]
+
+
+def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("engine.cli.compare.run_compare", lambda inputs, *_, **__: told.append(inputs) or {})
+    monkeypatch.setattr("engine.cli.compare.print_comparison", lambda *_: None)
+    log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
+    options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}", f"--frame-stamps={stamps}"]
+    assert run(command(flight, tmp_path, *options, "--log-offset-s=-1.5", "--image-topic=/down")) == 0
+    assert (told[0].clock, told[0].image_topic) == (LogClock(stamps, -1.5), "/down")
+    assert run(command(flight, tmp_path)) == 0
+    assert (told[1].clock, told[1].image_topic) == (None, None)
+    assert run(command(flight, tmp_path, "--log-offset-s=2")) == 2  # telemetry.csv is no log
 
 
 def test_the_usual_runs_are_table_one():

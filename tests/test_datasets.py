@@ -312,15 +312,97 @@ def test_alto_is_followed_on_the_map_of_its_aerial_pictures(plan, frames, truth,
         (["vpair", ".", "--gsd-m=1"], 2, "--gsd-m: expected with alto only"),
         (["vpair", ".", "--height-is=sea"], 2, "--height-is: expected one of agl, amsl, ellipsoid, got 'sea'"),
         (["vpair", ".", "--camera=c.yaml"], 2, "--camera, --hfov-deg: expected one of the two"),
+        (["vpair", ".", "--interval-s=inf"], 2, "--interval-s: expected 0.001 to 86400 seconds, got inf"),
+        (["vpair", ".", "--interval-s=1e-12"], 2, "--interval-s: expected 0.001 to 86400 seconds, got 1e-12"),
+        (["vpair", ".", "--interval-s=1e10"], 2, "--interval-s: expected 0.001 to 86400 seconds, got 1e+10"),
+        (["vpair", ".", "--ground-m=nan"], 2, "--ground-m: expected -10000 to 10000 metres, got nan"),
+        (["vpair", ".", "--ground-m=inf"], 2, "--ground-m: expected -10000 to 10000 metres, got inf"),
+        (["vpair", ".", "--hfov-deg=0"], 2, "--hfov-deg: expected 0.1 to 179 degrees, got 0"),
+        (["vpair", ".", "--hfov-deg=180"], 2, "--hfov-deg: expected 0.1 to 179 degrees, got 180"),
+        (["vpair", ".", "--hfov-deg=nan"], 2, "--hfov-deg: expected 0.1 to 179 degrees, got nan"),
+        (["alto", ".", "--part=Val", "--gsd-m=inf"], 2, "--gsd-m: expected 0.001 to 100 metres, got inf"),
         (["vpair", "nowhere"], 1, "nowhere/poses_query.txt: no such file"),
         (["uav-visloc", "nowhere", "--part=03"], 1, "nowhere/03/03.csv: no such file"),
     ],
 )
 def test_what_cannot_be_imported_is_said_in_one_line(arguments, code, message, tmp_path, capsys):
     out = tmp_path / "out"
-    assert run(["dataset", "import", *arguments, f"--out={out}", "--hfov-deg=60"]) == code
+    assert run(["dataset", "import", "--hfov-deg=60", *arguments, f"--out={out}"]) == code
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_heights_that_are_not_above_the_ground_are_left_out_and_told(in_degrees, frames, truth, tmp_path, capsys):
+    sequence(tmp_path, in_degrees, frames, truth)
+    command = ["dataset", "import", "uav-visloc", str(tmp_path), "--part=03", "--hfov-deg=60", "--height-is=amsl"]
+    assert run([*command, f"--out={tmp_path / 'flight'}", "--ground-m=9000"]) == 0
+    assert "heights of 4 of 4 pictures are left out: they are not above --ground-m" in capsys.readouterr().err
+    assert {row.height_agl_m for row in read_telemetry(tmp_path / "flight" / "telemetry.csv")} == {None}
+
+
+def files_in(folder):
+    """Every file with its content, links as what they lead to."""
+    return {
+        path.relative_to(folder).as_posix(): str(path.readlink()) if path.is_symlink() else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_symlink() or path.is_file()
+    }
+
+
+def test_force_never_removes_what_is_read_nor_what_no_import_made(in_degrees, frames, truth, tmp_path, capsys):
+    root, flight = tmp_path / "data", tmp_path / "flight"
+    sequence(root, in_degrees, frames, truth)
+    command = ["dataset", "import", "uav-visloc", str(root), "--part=03", f"--out={flight}", "--force"]
+    assert run([*command, "--hfov-deg=60", "--height-is=agl"]) == 0
+    (flight / "frames" / "notes.txt").write_text("mine", encoding="utf-8")
+    (tmp_path / "link.yaml").symlink_to(flight / "camera.yaml")
+    before = files_in(tmp_path)
+    capsys.readouterr()
+    for option in (
+        "camera=flight/camera.yaml",
+        "camera=link.yaml",
+        "map=flight/map.tif",
+        "surface=flight/map.tif",
+    ):
+        name, _, path = option.partition("=")
+        more = [] if name == "camera" else ["--hfov-deg=60"]
+        assert run([*command, f"--{name}={tmp_path / path}", *more]) == 2
+        assert f"--out: expected a folder without --{name}, whose files it replaces" in capsys.readouterr().err
+        assert files_in(tmp_path) == before
+    within = ["dataset", "import", "uav-visloc", str(root), "--part=03", "--hfov-deg=60", "--force"]
+    for out in (root, tmp_path):
+        assert run([*within, f"--out={out}"]) == 2
+        assert "--out: expected a folder without DIR" in capsys.readouterr().err
+    assert files_in(tmp_path) == before
+
+    assert run([*command, "--hfov-deg=60", "--height-is=agl"]) == 0  # as it was, and the notes stay
+    assert files_in(tmp_path) == before
+
+
+def test_force_leaves_photographs_alone_that_no_import_has_put_there(in_degrees, frames, truth, tmp_path, capsys):
+    sequence(tmp_path / "data", in_degrees, frames, truth)
+    mine, flight = tmp_path / "flight" / "frames" / "IMG_1.JPG", tmp_path / "flight"
+    save(mine, frames[0].image)
+    command = ["dataset", "import", "uav-visloc", str(tmp_path / "data"), "--part=03", f"--out={flight}"]
+    command += ["--hfov-deg=60", "--force"]
+    assert run(command) == 0
+    assert mine.is_file()
+    # What an import has copied, where a disk has no links, leaves with it.
+    copied = flight / "frames" / "03_0001.JPG"
+    copied.unlink()
+    save(copied, frames[0].image)
+    assert run(command) == 0
+    assert copied.is_symlink()
+    assert mine.is_file()
+
+    (tmp_path / "album").mkdir()
+    (tmp_path / "album" / "IMG_2.JPG").symlink_to(mine)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "frames").symlink_to(tmp_path / "album")
+    capsys.readouterr()
+    assert run([*command, f"--out={tmp_path / 'other'}"]) == 2
+    assert "frames to be a folder of its own, got a link to" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "album").iterdir()] == ["IMG_2.JPG"]
 
 
 def test_stamps_that_repeat_or_go_back_are_left_out_and_told(in_degrees, frames, truth, tmp_path, capsys):
@@ -610,8 +692,25 @@ def test_anyvisloc_becomes_flights_of_one_frame_on_one_map(plan, truth, tmp_path
     flights = singles_followed(out, 2)
     assert all((flight / "map.tif").samefile(out / "map" / "map.tif") for flight in flights)
     capsys.readouterr()
-    assert run([*command[:-1], f"--out={tmp_path / 'one'}", "--part=Scene_01", "--limit=1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"] == 1
+    for limit, count in ((1, 1), (2, 2), (7, 2)):
+        one = [*command[:-1], f"--out={tmp_path / f'limit{limit}'}", "--part=Scene_01", f"--limit={limit}"]
+        assert run([*one, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["frames"] == count
+        assert len(list((tmp_path / f"limit{limit}").glob("*/telemetry.csv"))) == count
+    assert run([*one, "--max-tilt-deg=nan"]) == 2
+    assert "--max-tilt-deg: expected 0 to 90 degrees, got nan" in capsys.readouterr().err
+
+    # Done again, a flight of the import is replaced, and a folder of anybody else's is not.
+    assert run([*one, "--force"]) == 0
+    (tmp_path / "limit7" / "L01_0002" / "dataset.json").unlink()
+    before = files_in(tmp_path / "limit7")
+    assert run([*one, "--force"]) == 2
+    assert "expected flights of an earlier import to replace" in capsys.readouterr().err
+    within = ["dataset", "import", "anyvisloc", str(tmp_path), "--part=Scene_01", "--force"]
+    for place in (scene, tmp_path):
+        assert run([*within, f"--out={place}"]) == 2
+        assert "--out: expected a folder without DIR" in capsys.readouterr().err
+    assert files_in(tmp_path / "limit7") == before
 
 
 def test_a_sample_that_would_run_code_is_refused(tmp_path, capsys):

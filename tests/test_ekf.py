@@ -27,7 +27,6 @@ from engine.sim.ekf import (
     fuse_gps,
     fuse_heading,
     fuse_height,
-    fuse_range,
     predict,
 )
 from engine.sim.history import History
@@ -164,12 +163,6 @@ def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
         fuse_fix(belief, a_fix(10.0, -5.0, 122.0, sigma_m=1.0)).position_m, [10.0, -5.0, 121.0], atol=1e-9
     )
     assert fix_chi_square(belief, a_fix(14.0, -2.0, sigma_m=1.0)) == pytest.approx(25.0 / 2.0)
-
-
-def test_a_range_is_a_height_over_level_ground():
-    belief = replace(some_belief(), enu_from_body=enu_from_body(0.0, 30.0, 0.0), covariance=np.eye(STATES))
-    after = fuse_range(belief, (121.0 - 7.0) / math.cos(math.radians(30.0)), SUITE, surface_m=7.0)
-    assert after.position_m[2] == pytest.approx(121.0, abs=0.02)
 
 
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():

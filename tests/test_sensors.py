@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from engine.errors import OptionError
-from engine.geo import enu_from_body
-from engine.sim.quadrotor import STEP_S, Felt, State, hovering
+from engine.sim.quadrotor import STEP_S, Felt, hovering
 from engine.sim.sensors import (
     Barometer,
     Compass,
     Gps,
     Imu,
     Instruments,
-    Rangefinder,
     SensorSuite,
     steps_between,
 )
@@ -100,17 +98,6 @@ def test_the_receiver_spreads_as_it_says_and_keeps_the_moment():
     assert samples[0].time_s == STILL.time_s
 
 
-def test_the_rangefinder_looks_along_the_body():
-    carried = instruments(rangefinder=Rangefinder(noise_m=1e-9, max_m=140.0))
-    assert carried.range_m(STILL) == pytest.approx(120.0)
-    assert carried.range_m(STILL, surface_m=20.0) == pytest.approx(100.0)
-    tilted = State(0.0, STILL.position_m, np.zeros(3), enu_from_body(0.0, 25.0, 10.0), np.zeros(3), 9.8)
-    assert carried.range_m(tilted) == pytest.approx(120.0 / math.cos(math.radians(25.0)))
-    over = State(0.0, STILL.position_m, np.zeros(3), enu_from_body(40.0, 0.0, 10.0), np.zeros(3), 9.8)
-    assert carried.range_m(over) is None  # 157 m
-    assert carried.range_m(STILL, surface_m=130.0) is None  # it lies above
-
-
 def test_one_seed_gives_one_flight_and_each_sensor_its_own_stream():
     first, second, other = instruments(7), instruments(7), instruments(8)
     second.gps(STILL)  # another sensor's use changes nothing
@@ -128,7 +115,7 @@ def test_rates_are_those_of_the_steps():
             steps_between(rate)
 
 
-@pytest.mark.parametrize("sensor", [Imu, Compass, Barometer, Gps, Rangefinder])
+@pytest.mark.parametrize("sensor", [Imu, Compass, Barometer, Gps])
 def test_a_sensor_without_noise_or_rate_is_refused_by_name(sensor):
     for name in sensor.__dataclass_fields__:
         with pytest.raises(OptionError, match=name):

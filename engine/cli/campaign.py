@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from importlib.metadata import version
 from pathlib import Path
 
 from engine.cli import console
@@ -15,8 +15,10 @@ from engine.cli.campaign_plan import RUNS, WORKSHOP, Plan, plan_campaign
 from engine.cli.executors import Execute, in_processes, on_ray
 from engine.cli.jobs import Job, do, read_result
 from engine.errors import OptionError
-from engine.report.campaign import Line, write_tables
+from engine.report.campaign import TABLE, TABLE_HEAD, Line, write_tables
 
+MARKER = "scenematch-campaign.txt"
+"""Says of a folder, from its begin on, that a campaign works in it: what is unfinished there may be removed."""
 _SHOWN = 5  # names in a message
 
 
@@ -37,6 +39,7 @@ def run_campaign(
 
     Raises:
         OptionError: the file or the folder is none for a campaign, or inputs have changed.
+        TelemetryError: what a finished run left is damaged.
         BackendError: there is no Ray, or no cluster.
     """
     plan = plan_campaign(path, out.resolve())
@@ -66,11 +69,11 @@ def _left(plan: Plan, force: bool) -> dict[str, Job]:
     left, changed = {}, []
     for job in (*plan.drawn, *plan.runs):
         result = read_result(job)
-        if result is not None and result["inputs"] == job.inputs:
+        if result is not None and result.inputs == job.inputs:
             continue
         left[job.name] = job
         if result is not None:
-            names = sorted(set(result["inputs"].items()) ^ set(job.inputs.items()))
+            names = sorted(set(result.inputs.items()) ^ set(job.inputs.items()))
             changed.append(f"{job.name} ({', '.join(dict(names))})")
     if changed:
         shown = ", ".join(changed[:_SHOWN]) + (f" and {len(changed) - _SHOWN} more" if changed[_SHOWN:] else "")
@@ -86,16 +89,33 @@ def _prepare(out: Path, left: Sequence[Job], force: bool) -> None:
     """Make the campaign's folder; of an earlier start what is unfinished leaves it, and what is done again.
 
     Raises:
-        OptionError: the folder is there and is no campaign's.
+        OptionError: the folder is there and is no campaign's, or has somebody's work where ours would be removed.
     """
-    if not (out / RUNS).is_dir():
+    if not _is_campaign(out):
         check_folder(out, force)
+        if (out / WORKSHOP).exists():
+            raise OptionError(
+                f"--out: expected a folder without {WORKSHOP}/, which is removed here, as {out} is no campaign's "
+                "so far; move it away, or choose another folder"
+            )
     (out / RUNS).mkdir(parents=True, exist_ok=True)
+    (out / MARKER).write_text(f"A campaign of scenematch {version('scenematch')}.\n", encoding="utf-8")
     shutil.rmtree(out / WORKSHOP, ignore_errors=True)
     (out / WORKSHOP).mkdir()
     for job in left:
         if job.folder.exists():
             shutil.rmtree(job.folder)
+
+
+def _is_campaign(out: Path) -> bool:
+    """Whether a campaign has worked in a folder: by its marker, or by its table where that was copied without."""
+    if (out / MARKER).is_file():
+        return True
+    try:
+        with (out / TABLE).open(encoding="utf-8") as file:
+            return file.readline().rstrip("\n") == ",".join(TABLE_HEAD)
+    except (OSError, ValueError):
+        return False
 
 
 def _executor(workers: int | None, ray: str | None) -> AbstractContextManager[Execute]:
@@ -122,7 +142,6 @@ def _line(job: Job, groups: dict[str, str], failures: dict[str, str]) -> Line:
     flight, _, run = job.name.partition("/")
     failure = failures.get(job.name) or failures.get(flight)
     result = None if failure else read_result(job)
-    latency = None
-    if result is not None:
-        latency = json.loads((job.folder / "summary.json").read_text(encoding="utf-8"))["latency_ms"]
-    return Line(groups[flight], flight, run, result and result["figures"], latency, failure)
+    if result is None:
+        return Line(groups[flight], flight, run, None, None, failure)
+    return Line(groups[flight], flight, run, result.figures, result.latency_ms, None)

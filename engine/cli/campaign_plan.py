@@ -18,8 +18,11 @@ from engine.cli.simulate import Scene
 from engine.cli.track import Inputs, folder_inputs
 from engine.errors import OptionError
 from engine.formats.datasets.recording import ABOUT
+from engine.formats.logs import AS_LOGGED, LogClock
 from engine.formats.settings import read_settings
+from engine.rasters import GEOREFERENCE_TAG, stated_sigma
 from engine.sim import CONDITIONS
+from engine.sim.town import RELIEF_MAX_M
 
 RUNS, FLIGHTS, WORKSHOP = "runs", "flights", "unfinished"
 """Folders of a campaign's output folder."""
@@ -37,6 +40,9 @@ class RecordedFlight:
         camera: the calibration.
         frames: a folder of pictures, a video or a bag.
         telemetry: telemetry.csv or a log.
+        frame_stamps: with a log, a CSV with timestamp_ns and frame; without it the frames' own stamps.
+        log_offset_s: with a log, added to the frames' stamps.
+        image_topic: of the pictures, where the frames are a bag with several.
         truth: truth.csv or a log.
         map_sigma_m: how well the map lies, where it does not say so itself.
         group: flights of one group are pooled in the table; without it those of a published data set are, and any
@@ -49,9 +55,19 @@ class RecordedFlight:
     camera: str = "camera.yaml"
     frames: str = "frames"
     telemetry: str | None = "telemetry.csv"
+    frame_stamps: str | None = None
+    log_offset_s: float = 0.0
+    image_topic: str | None = None
     truth: str | None = "truth.csv"
     map_sigma_m: float | None = None
     group: str | None = None
+
+    def __post_init__(self) -> None:
+        try:
+            LogClock(offset_s=self.log_offset_s)
+        except OptionError as error:
+            raise OptionError(f"log_{error}") from None
+        stated_sigma(self.map_sigma_m, None, GEOREFERENCE_TAG, "map_sigma_m")
 
     def inputs(self, name: str, base: Path) -> Inputs:
         """The files as `track` takes them.
@@ -73,15 +89,26 @@ class RecordedFlight:
                 return None
             return needed(what)
 
-        return Inputs(
-            map=needed("map"),
-            surface=optional("surface"),
-            camera=needed("camera"),
-            frames=needed("frames"),
-            telemetry=optional("telemetry"),
-            truth=optional("truth"),
-            map_sigma_m=self.map_sigma_m,
-        )
+        stamps = optional("frame_stamps")
+        try:
+            return Inputs(
+                map=needed("map"),
+                surface=optional("surface"),
+                camera=needed("camera"),
+                frames=needed("frames"),
+                telemetry=optional("telemetry"),
+                truth=optional("truth"),
+                clock=LogClock(stamps, self.log_offset_s) if stamps is not None or self.log_offset_s else None,
+                image_topic=self.image_topic,
+                map_sigma_m=self.map_sigma_m,
+            )
+        except OptionError as error:
+            raise OptionError(f"flights.{name}: {_as_keys(error)}") from None
+
+
+def _as_keys(error: OptionError) -> str:
+    """A message of the command line's, with its options as the keys of the file."""
+    return re.sub(r"--([a-z-]+)", lambda found: found[1].replace("-", "_"), str(error))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,6 +120,9 @@ class SimulatedFlights:
         conditions: of the frames; the map is of noon.
         frames: of each flight; none flies to the end.
         relief_m: height of the hills.
+
+    Raises:
+        OptionError: a value is out of range, or there is no such condition.
     """
 
     seeds: tuple[int, ...] = ()
@@ -106,6 +136,10 @@ class SimulatedFlights:
         for seed in self.seeds:
             if seed < 0:
                 raise OptionError(f"seeds: expected 0 or more, got {seed}")
+        if self.frames is not None and self.frames < 1:
+            raise OptionError(f"frames: expected 1 or more, got {self.frames}")
+        if not 0.0 <= self.relief_m <= RELIEF_MAX_M:
+            raise OptionError(f"relief_m: expected 0 to {RELIEF_MAX_M:g}, got {self.relief_m:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,8 +266,15 @@ def _settings_print(run: Run) -> dict[str, str]:
 def _fingerprints(inputs: Inputs) -> dict[str, str]:
     """A hash of the content of each input; no stamp of a file has to be trusted."""
     files = {name: getattr(inputs, name) for name in ("map", "surface", "camera", "frames", "telemetry", "truth")}
+    clock = inputs.clock or AS_LOGGED
+    files["frame_stamps"] = clock.stamps
     prints = {name: _fingerprint(path) for name, path in files.items() if path is not None}
-    return prints if inputs.map_sigma_m is None else prints | {"map_sigma_m": repr(inputs.map_sigma_m)}
+    told = {
+        "log_offset_s": clock.offset_s or None,
+        "image_topic": inputs.image_topic,
+        "map_sigma_m": inputs.map_sigma_m,
+    }
+    return prints | {name: repr(value) for name, value in told.items() if value is not None}
 
 
 @cache

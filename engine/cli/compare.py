@@ -10,7 +10,7 @@ from typing import Any
 
 from engine.cli import console
 from engine.cli.arguments import check_folder, prepare_folder
-from engine.cli.track import Inputs, Settings, run_track, settings_from
+from engine.cli.track import Inputs, Settings, open_inputs, run_track, settings_from
 from engine.errors import OptionError
 from engine.formats.logs import open_truth
 from engine.formats.track import read_track
@@ -65,12 +65,20 @@ def _run(text: str, given: Mapping[str, Any]) -> Run:
 def run_compare(inputs: Inputs, out: Path, runs: Sequence[Run], *, force: bool) -> dict[str, dict[str, Any]]:
     """Follow the flight once for each run; every run's folder is as ``track`` writes it.
 
+    The inputs are read and held against every run's settings before the first run begins and before a folder is
+    made.
+
     Returns:
         The summaries by name, which ``table.json`` holds too.
     """
     check_folder(out, force)
+    for run in runs:
+        check_folder(out / run.name, force)
+    opened = open_inputs(inputs, [run.settings for run in runs])
     prepare_folder(out, force, (TABLE, CHART))
-    results = {run.name: run_track(inputs, out / run.name, run.settings, force=force) for run in runs}
+    results = {
+        run.name: run_track(inputs, out / run.name, run.settings, force=force, opened=opened) for run in runs
+    }
     (out / TABLE).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
     tracks = {run.name: read_track(out / run.name / "track.csv") for run in runs}
     path = inputs.find_truth()

@@ -9,12 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from engine.cli import console
-from engine.cli.arguments import check_choice, prepare_folder
+from engine.cli.arguments import check_choice, check_folder, prepare_folder
 from engine.errors import OptionError, TelemetryError
 from engine.formats.datasets.alto import read_alto
 from engine.formats.datasets.anyvisloc import MODES, find_anyvisloc, read_anyvisloc, read_place
 from engine.formats.datasets.ortholoc import find_ortholoc, read_ortholoc
-from engine.formats.datasets.recording import OWNED, Recording, Told, check_complete, write_recording
+from engine.formats.datasets.recording import (
+    ABOUT,
+    OWNED,
+    Recording,
+    Told,
+    check_complete,
+    clear_frames,
+    write_recording,
+)
 from engine.formats.datasets.singles import campaign_text, write_place, write_single
 from engine.formats.datasets.uav_visloc import read_uav_visloc
 from engine.formats.datasets.vpair import read_vpair
@@ -48,14 +56,19 @@ def run_import(
         Facts, with the ``notes`` on what could not be known and the ``findings`` on the truth.
 
     Raises:
-        OptionError: the kind is none, or something is needed that nobody says.
+        OptionError: the kind is none, something is needed that nobody says, or what is read lies in the folder
+            that is replaced.
         TelemetryError, MapError, CalibrationError: the data set is not of its layout, or cannot be written.
     """
     check_choice("KIND", kind, FLIGHTS)
+    check_folder(out, force)
+    camera = told.camera if isinstance(told.camera, Path) else None
+    _check_apart(out, ("DIR", root), ("--camera", camera), ("--map", told.map), ("--surface", told.surface))
     recording = _read(kind, root, part, gsd_m)
     check_complete(recording, told)
+    _check_apart(out, *(("a picture of DIR", shot.picture) for shot in recording.shots))
+    clear_frames(out)
     prepare_folder(out, force, OWNED)
-    shutil.rmtree(out / "frames", ignore_errors=True)
     notes = write_recording(out, recording, told)
     findings = check_flight(out)
     for text in (*notes, *(finding.text for finding in findings)):
@@ -69,6 +82,17 @@ def run_import(
         "findings": [finding.text for finding in findings],
         "folder": str(out.resolve()),
     }
+
+
+def _check_apart(out: Path, *inputs: tuple[str, Path | None]) -> None:
+    """Refuse to read from the folder that is written: what is read there would be removed first."""
+    within = out.resolve()
+    for name, path in inputs:
+        # As it is named and as it is meant: a link in the folder is removed, and a link elsewhere leads there.
+        if path is not None and any(
+            place.is_relative_to(within) for place in (path.parent.resolve() / path.name, path.resolve())
+        ):
+            raise OptionError(f"--out: expected a folder without {name}, whose files it replaces, got {out}")
 
 
 def _read(kind: str, root: Path, part: str | None, gsd_m: float | None) -> Recording:
@@ -94,12 +118,19 @@ class Choice:
         reference: which of its two maps.
         max_tilt_deg: of the optical axis from straight down.
         limit: how many, evenly spread; None takes all.
+
+    Raises:
+        OptionError: the tilt is no angle from 0 to 90 degrees.
     """
 
     part: str | None = None
     reference: str
     max_tilt_deg: float
     limit: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.max_tilt_deg <= 90.0:
+            raise OptionError(f"--max-tilt-deg: expected 0 to 90 degrees, got {self.max_tilt_deg:g}")
 
 
 def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, force: bool) -> dict[str, Any]:
@@ -113,7 +144,7 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
         force: whether the folder may be there already.
 
     Raises:
-        OptionError: a choice is none, or nothing is left by it.
+        OptionError: a choice is none, nothing is left by it, or a folder that is no such flight's is in the way.
         TelemetryError, MapError, CalibrationError: the data set is not of its layout, or cannot be written.
     """
     check_choice("KIND", kind, SINGLES)
@@ -123,13 +154,17 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
             f"--part: expected {'a scene with anyvisloc' if choice.part is None else 'none with ortholoc'}"
         )
     scene = root / (choice.part or "")
+    check_folder(out, force)
+    _check_apart(out, ("DIR", scene))
     paths = find_anyvisloc(scene) if kind == "anyvisloc" else find_ortholoc(root)
     if not paths:
         raise TelemetryError(f"{scene}: expected samples of {kind}, got none")
-    if choice.limit is not None:
-        paths = [paths[k * len(paths) // choice.limit] for k in range(min(choice.limit, len(paths)))]
+    limit = min(choice.limit or len(paths), len(paths))
+    paths = [paths[k * len(paths) // limit] for k in range(limit)]
     shared = read_place(scene, choice.reference) if kind == "anyvisloc" else None
-    prepare_folder(out, force, (CAMPAIGN,))
+    for path in paths:
+        _check_replaceable(out / path.stem)
+    prepare_folder(out, force, (CAMPAIGN, *(f"{_MAPS}/{name}" for name in ("map.tif", "dsm.tif"))))
     if shared is not None:
         write_place(out / _MAPS, shared)
     names = []
@@ -138,10 +173,11 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
         if single.tilt_deg > choice.max_tilt_deg:
             continue
         folder = out / single.name
-        shutil.rmtree(folder, ignore_errors=True)
+        if folder.exists():
+            shutil.rmtree(folder)
+        write_single(folder, single, place, folder if shared is None else out / _MAPS, _NAMES[kind])
         if shared is None:
             write_place(folder, place)
-        write_single(folder, single, place, folder if shared is None else out / _MAPS, _NAMES[kind])
         names.append(single.name)
     if not names:
         raise OptionError(
@@ -157,6 +193,12 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
         "too oblique": len(paths) - len(names),
         "campaign": str((out / CAMPAIGN).resolve()),
     }
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Refuse a folder in a flight's place that no import made."""
+    if folder.is_symlink() or (folder.exists() and not (folder / ABOUT).is_file()):
+        raise OptionError(f"--out: expected flights of an earlier import to replace, but {folder} is no such one")
 
 
 _NAMES = {"anyvisloc": "AnyVisLoc", "ortholoc": "OrthoLoC"}

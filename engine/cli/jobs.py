@@ -16,6 +16,7 @@ from engine.cli.simulate import Scene, run_simulate
 from engine.cli.track import Inputs, Settings, run_track
 from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
+from engine.report.campaign import are_figures, are_times
 
 RESULT, LOG = "result.json", "log.txt"
 _TIMES = ("latency_ms", "deadlines_missed", "settings")
@@ -111,17 +112,52 @@ def _publish(folder: Path, target: Path) -> None:
         shutil.rmtree(folder)
 
 
-def read_result(job: Job) -> dict[str, Any] | None:
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a finished job left.
+
+    Attributes:
+        inputs: what it was made of, as :class:`Job` has them.
+        figures: of a flight that was followed those of its summary, without times.
+        latency_ms: p50, p95, p99 and max of its frames; None of a flight that was drawn.
+    """
+
+    inputs: dict[str, str]
+    figures: dict[str, Any]
+    latency_ms: dict[str, float | None] | None
+
+
+def read_result(job: Job) -> Result | None:
     """What a finished job left, or None where it has not been done.
 
     Raises:
-        TelemetryError: its folder is there and holds something else.
+        TelemetryError: its folder is there and holds something else, or what it holds is damaged.
     """
-    path = job.folder / RESULT
     if not job.folder.exists():
         return None
+    told = _read(job.folder / RESULT, "inputs", "figures")
+    inputs, figures, latency_ms = told["inputs"], told["figures"], None
+    whole = isinstance(inputs, dict) and all(isinstance(value, str) for value in inputs.values())
+    followed = isinstance(job.task, Follow)
+    if not (whole and isinstance(figures, dict) and (not followed or are_figures(figures))):
+        raise _damaged(job.folder / RESULT)
+    if followed:
+        latency_ms = _read(job.folder / "summary.json", "latency_ms")["latency_ms"]
+        if not are_times(latency_ms):
+            raise _damaged(job.folder / "summary.json")
+    return Result(inputs, figures, latency_ms)
+
+
+def _read(path: Path, *names: str) -> dict[str, Any]:
+    """Values of a file by name."""
     try:
-        result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return {name: result[name] for name in ("name", "inputs", "figures")}
-    except (OSError, ValueError, KeyError, TypeError):
-        raise TelemetryError(f"{path}: expected the result of a run, got something else") from None
+        told = json.loads(path.read_text(encoding="utf-8"))
+        return {name: told[name] for name in names}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        raise _damaged(path) from None
+
+
+def _damaged(path: Path) -> TelemetryError:
+    return TelemetryError(
+        f"{path}: expected the result of a run, got something else; without its folder the run is done again"
+    )

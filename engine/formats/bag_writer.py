@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +32,8 @@ from engine.types import Frame, Prior, Truth
 KINDS = ("ros1", "ros2-sqlite3", "ros2-mcap")
 """What is written."""
 
+_PARTS = ("metadata.yaml", "*.mcap", "*.db3")  # the files of a bag of ROS 2
+
 Write = Callable[[str, int, Any], None]
 """Writes a message on a topic at a moment."""
 
@@ -42,21 +45,25 @@ def write_bag(
     *,
     kind: str,
     truth: Iterable[Truth] = (),
+    replace: bool = False,
 ) -> int:
     """Write a flight as a bag, under the names that a camera driver and MAVROS give their topics.
 
+    It is written beside its place and put there once it is whole: until then an older one stays.
+
     Args:
-        path: a file that does not exist for ros1, a folder that does not exist for the others.
+        path: a file for ros1, a folder for the others.
         frames: stamped frames with what else is known of their places, consumed one at a time before ``truth``.
         camera: written beside every frame; its mount has no place in a bag.
         kind: one of :data:`KINDS`.
         truth: where the vehicle really was, under ``/truth``.
+        replace: whether a bag that is there leaves for the new one.
 
     Returns:
         int: how many frames were written.
 
     Raises:
-        OptionError: the kind is unknown, or does not go with the name.
+        OptionError: the kind is unknown or does not go with the name, or what is there may not be replaced.
         TelemetryError: rosbags is not installed, a frame has no stamp, or the bag cannot be written.
     """
     path = Path(path)
@@ -64,8 +71,9 @@ def write_bag(
         raise OptionError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
     if (path.suffix.lower() == ".bag") != (kind == "ros1"):
         raise OptionError(f"path: expected a name that ends in .bag for ros1 and for no other kind, got {path}")
+    check_place(path, replace)
     count = 0
-    with _written(path, kind) as (write, maker):
+    with _put(path, replace) as unfinished, _written(path, unfinished, kind) as (write, maker):
         for frame, prior in frames:
             if frame.timestamp_ns is None:
                 raise TelemetryError(f"{path}: frame {count}: expected a stamp, got None")
@@ -74,6 +82,47 @@ def write_bag(
         for row in truth:
             _write_truth(write, maker, row)
     return count
+
+
+def check_place(path: Path, replace: bool) -> None:
+    """Refuse to write a bag where something is that may not leave for it.
+
+    Raises:
+        OptionError: a bag that is not to be replaced, or a folder that holds anything but a bag.
+    """
+    if not (path.exists() or path.is_symlink()):
+        return
+    if not replace:
+        raise OptionError(f"--out: {path} exists; choose another name, or add --force to replace it")
+    if path.is_dir():
+        parts = {file for pattern in _PARTS for file in path.glob(pattern)}
+        others = sorted(set(path.iterdir()) - parts)
+        if others or path.is_symlink():
+            held = f"it holds {others[0].name} too" if others else "it is a link"
+            raise OptionError(f"--out: expected a bag in {path} to replace, but {held}")
+
+
+@contextmanager
+def _put(path: Path, replace: bool) -> Iterator[Path]:
+    """Where a new bag is written; when all is well it takes its place, and the older one leaves."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A folder of its own beside the place: a bag's files have its name within them.
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+            unfinished = Path(folder) / path.name
+            yield unfinished
+            check_place(path, replace)  # again: writing took its time
+            older = Path(folder) / "older"
+            if path.exists():
+                path.rename(older)
+            try:
+                unfinished.rename(path)
+            except OSError:
+                if older.exists():
+                    older.rename(path)
+                raise
+    except OSError as error:
+        raise TelemetryError(f"{path}: cannot be written: {error}") from None
 
 
 def _write_frame(
@@ -111,8 +160,8 @@ def _write_truth(write: Write, maker: Maker, row: Truth) -> None:
 
 
 @contextmanager
-def _written(path: Path, kind: str) -> Iterator[tuple[Write, Maker]]:
-    """What writes messages into a new bag, and makes them."""
+def _written(path: Path, unfinished: Path, kind: str) -> Iterator[tuple[Write, Maker]]:
+    """What writes messages into a new bag, and makes them; ``path`` is what errors call it."""
     _, typesys = import_rosbags(path)
     from rosbags import rosbag1, rosbag2
 
@@ -122,7 +171,11 @@ def _written(path: Path, kind: str) -> Iterator[tuple[Write, Maker]]:
     plugin = rosbag2.StoragePlugin.SQLITE3 if kind == "ros2-sqlite3" else rosbag2.StoragePlugin.MCAP
     connections: dict[str, Any] = {}
     try:
-        writer: Any = rosbag1.Writer(path) if ros1 else rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        writer: Any
+        if ros1:
+            writer = rosbag1.Writer(unfinished)
+        else:
+            writer = rosbag2.Writer(unfinished, version=9, storage_plugin=plugin)
         with writer:
 
             def write(topic: str, time_ns: int, message: Any) -> None:

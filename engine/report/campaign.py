@@ -17,6 +17,9 @@ _FIGURES = (
     "false_fixes", "nees_mean", "height_rms_m", "height_bias_m",
 )  # fmt: skip
 _TIMES = ("p50", "p95", "p99", "max")
+_NAMES = ("group", "flight", "run")
+TABLE_HEAD = (*_NAMES, *_FIGURES, "failure")
+"""The columns of campaign.csv."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +48,10 @@ def write_tables(folder: Path, lines: Sequence[Line]) -> None:
 
     Equal runs give equal bytes in the first two, on whatever they ran and in whatever order they ended.
     """
-    head = ("group", "flight", "run")
     figures = ([*_named(line), *_cells(line.figures, _FIGURES), line.failure or ""] for line in lines)
-    write_table(folder / TABLE, (*head, *_FIGURES, "failure"), list(figures))
+    write_table(folder / TABLE, TABLE_HEAD, list(figures))
     times = ([*_named(line), *_cells(line.latency_ms, _TIMES)] for line in lines)
-    write_table(folder / LATENCIES, (*head, *(f"{name}_ms" for name in _TIMES)), list(times))
+    write_table(folder / LATENCIES, (*_NAMES, *(f"{name}_ms" for name in _TIMES)), list(times))
     (folder / PAGE).write_text(_page(lines), encoding="utf-8")
 
 
@@ -59,6 +61,26 @@ def _named(line: Line) -> tuple[str, str, str]:
 
 def _cells(values: Mapping[str, Any] | None, names: Sequence[str]) -> list[str]:
     return [cell_text((values or {}).get(name), 4) for name in names]
+
+
+def are_figures(values: object) -> bool:
+    """Whether a value can be the figures of a :class:`Line`: a summary's, with those that belong together."""
+    if not isinstance(values, dict) or not all(_is_number(values.get(name)) for name in _FIGURES):
+        return False
+    needed = ["frames", "fixes"]
+    needed += ["scored_fixes"] if values.get("rms_m") is not None else []
+    needed += ["false_fixes", "wrong_over_10m"] if {"false_fixes", "wrong_over_10m"} & set(values) else []
+    return all(type(values.get(name)) is int for name in needed)
+
+
+def are_times(values: object) -> bool:
+    """Whether a value can be the latencies of a :class:`Line`."""
+    return isinstance(values, dict) and all(_is_number(values.get(name)) for name in _TIMES)
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value is a number whose square is one too, or unknown."""
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e100)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +183,7 @@ def _run_cells(line: Line) -> tuple[str, ...]:
         line.flight,
         line.run,
         str(figures["frames"]),
-        _shown(figures["availability"], "{:.1%}"),
+        _shown(figures.get("availability"), "{:.1%}"),
         *metres,
         _shown(figures.get("false_fixes"), "{}"),
         _shown(figures.get("nees_mean"), "{:.2f}"),

@@ -195,15 +195,6 @@ def fuse_heading(belief: Belief, heading_deg: float, suite: SensorSuite) -> Beli
     return correct(belief, residual, H, np.array([[math.radians(suite.compass.noise_deg) ** 2]]))
 
 
-def fuse_range(belief: Belief, range_m: float, suite: SensorSuite, surface_m: float = 0.0) -> Belief:
-    """Takes in the rangefinder over level ground at ``surface_m``; its beam's tilt is taken as believed."""
-    descent = max(-float(belief.enu_from_body[2, 2]), 0.1)
-    H = np.zeros((1, STATES))
-    H[0, 2] = 1.0
-    residual = np.array([range_m * descent + surface_m - belief.position_m[2]])
-    return correct(belief, residual, H, np.array([[(suite.rangefinder.noise_m * descent) ** 2]]))
-
-
 def fuse_gps(belief: Belief, sample: GpsSample, suite: SensorSuite) -> Belief:
     """Takes in position and velocity of the receiver, at the moment that they are of."""
     gps = suite.gps

@@ -1,4 +1,4 @@
-"""The vehicle's sensors and their errors: IMU, compass, barometer, GPS and rangefinder, drawn from one seed."""
+"""The vehicle's sensors and their errors: IMU, compass, barometer and GPS, drawn from one seed."""
 
 from __future__ import annotations
 
@@ -119,28 +119,7 @@ class Gps:
         _check_rate(self)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rangefinder:
-    """A laser that looks down along the body: LightWare's SF30/D states 0.1 m up to 200 m.
-
-    Attributes:
-        rate_hz: how often.
-        noise_m: white noise of the distance.
-        max_m: beyond which nothing comes back.
-
-    Raises:
-        OptionError: a value is not above 0.
-    """
-
-    rate_hz: float = 20.0
-    noise_m: float = 0.1
-    max_m: float = 200.0
-
-    def __post_init__(self) -> None:
-        _check_rate(self)
-
-
-def _check_rate(sensor: Compass | Barometer | Gps | Rangefinder) -> None:
+def _check_rate(sensor: Compass | Barometer | Gps) -> None:
     check_positive(sensor, *sensor.__dataclass_fields__)
     steps_between(sensor.rate_hz)
 
@@ -164,7 +143,6 @@ class SensorSuite:
     compass: Compass = field(default_factory=Compass)
     barometer: Barometer = field(default_factory=Barometer)
     gps: Gps = field(default_factory=Gps)
-    rangefinder: Rangefinder = field(default_factory=Rangefinder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +166,7 @@ class Instruments:
 
     def __init__(self, suite: SensorSuite, rng: np.random.Generator) -> None:
         self.suite = suite
-        self._imu, self._compass, self._baro, self._gps, self._range = rng.spawn(5)
+        self._imu, self._compass, self._baro, self._gps = rng.spawn(4)
         self.accel_bias_mps2: Array = suite.imu.accel_start_mps2 * self._imu.standard_normal(3)
         self.gyro_bias_rps: Array = suite.imu.gyro_start_rps * self._imu.standard_normal(3)
         self.compass_bias_deg = suite.compass.bias_deg * float(self._compass.standard_normal())
@@ -229,11 +207,3 @@ class Instruments:
         spread = np.array([gps.noise_m, gps.noise_m, gps.height_noise_m])
         position, velocity = state.position_m + spread * white[:3], state.velocity_mps
         return GpsSample(state.time_s, position, velocity + gps.velocity_noise_mps * white[3:])
-
-    def range_m(self, state: State, surface_m: float = 0.0) -> float | None:
-        """Distance along the body's down axis to level ground at ``surface_m``, or None out of reach."""
-        laser = self.suite.rangefinder
-        descent = -float(state.enu_from_body[2, 2])
-        noise = laser.noise_m * float(self._range.standard_normal())
-        distance = (float(state.position_m[2]) - surface_m) / max(descent, 1e-6)
-        return float(distance + noise) if 0.0 < distance <= laser.max_m else None

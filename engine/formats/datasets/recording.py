@@ -17,7 +17,7 @@ from engine.camera import Camera
 from engine.errors import OptionError, TelemetryError
 from engine.formats.datasets.mosaic import Mosaic, write_mosaic
 from engine.formats.flight import camera_info
-from engine.formats.telemetry import TelemetryRow, write_telemetry
+from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
 from engine.formats.truth import truth_at, write_truth
 from engine.geo import wrap_heading_deg
 
@@ -25,6 +25,8 @@ DATUMS = ("agl", "amsl", "ellipsoid")
 """What a height is counted from: the ground below, the mean sea level, the WGS84 ellipsoid."""
 START_SIGMA_M = 15.0
 """How well the flight knows where it begins: the first picture's true place, with this standard deviation."""
+HFOV_DEG, INTERVAL_S, GROUND_M = (0.1, 179.0), (1e-3, 86_400.0), (-10_000.0, 10_000.0)
+"""Within what a field of view, the time between two pictures and the level of the ground can be believed."""
 ABOUT = "dataset.json"
 OWNED = ("telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif", ABOUT)
 
@@ -89,6 +91,9 @@ class Told:
         datum: of the heights, where the data set leaves it open.
         ground_m: level of the ground in the same datum, which makes heights above the ground of the others.
         interval_s: time between pictures, where the data set has no times.
+
+    Raises:
+        OptionError: a value is none that can be, by the name of its option.
     """
 
     camera: Path | float
@@ -101,8 +106,14 @@ class Told:
     def __post_init__(self) -> None:
         if self.datum is not None and self.datum not in DATUMS:
             raise OptionError(f"--height-is: expected one of {', '.join(DATUMS)}, got {self.datum!r}")
-        if self.interval_s is not None and not self.interval_s > 0.0:
-            raise OptionError(f"--interval-s: expected seconds above 0, got {self.interval_s:g}")
+        hfov_deg = None if isinstance(self.camera, Path) else self.camera
+        for name, unit, value, (least, most) in (
+            ("--hfov-deg", "degrees", hfov_deg, HFOV_DEG),
+            ("--interval-s", "seconds", self.interval_s, INTERVAL_S),
+            ("--ground-m", "metres", self.ground_m, GROUND_M),
+        ):
+            if value is not None and not least <= value <= most:
+                raise OptionError(f"{name}: expected {least:g} to {most:g} {unit}, got {value:g}")
 
 
 def check_complete(recording: Recording, told: Told) -> None:
@@ -120,6 +131,33 @@ def check_complete(recording: Recording, told: Told) -> None:
     if isinstance(told.camera, Path):
         Camera.load(told.camera)
     _in_time(recording, told)
+
+
+def clear_frames(out: Path) -> None:
+    """Take the pictures of an earlier import out of a flight folder: links, and its copies where a disk has none.
+
+    Whatever else lies there stays.
+
+    Raises:
+        OptionError: the pictures' folder is itself a link, whose files are somebody else's.
+    """
+    frames = out / "frames"
+    if frames.is_symlink():
+        raise OptionError(f"--out: expected {frames} to be a folder of its own, got a link to {frames.resolve()}")
+    imported = _imported(out)
+    for file in frames.iterdir() if frames.is_dir() else ():
+        if file.is_symlink() or (file.name in imported and file.is_file()):
+            file.unlink()
+
+
+def _imported(out: Path) -> set[str]:
+    """The pictures that an earlier import has put into a flight folder, by name."""
+    if not (out / ABOUT).is_file():
+        return set()
+    try:
+        return {row.frame for row in read_telemetry(out / "telemetry.csv")}
+    except TelemetryError:
+        return set()
 
 
 def write_recording(out: Path, recording: Recording, told: Told) -> tuple[str, ...]:
@@ -144,20 +182,23 @@ def write_recording(out: Path, recording: Recording, told: Told) -> tuple[str, .
     rows = [_telemetry_row(shot, stamp_ns, datum, told, first=not k) for k, (shot, stamp_ns) in enumerate(shots)]
     if datum is None and any(shot.height_m is not None for shot, _ in shots):
         notes += ("heights are left out: the authors do not say what they are counted from, --height-is does",)
+    elif told.ground_m is not None and (count := _below_ground(shots, datum, told.ground_m)):
+        notes += (f"heights of {count} of {len(shots)} pictures are left out: they are not above --ground-m",)
     elif datum not in (None, "agl") and told.ground_m is None:
         notes += (
             f"heights above the ground are unknown: they are {datum}, and --ground-m gives the ground's level",
         )
-    _link_frames(out / "frames", [shot.picture for shot, _ in shots])
+    # First, since they say of the pictures that an import has put them there.
+    about: dict[str, Any] = {"dataset": recording.dataset, "part": recording.part, "notes": notes}
+    (out / ABOUT).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     write_telemetry(out / "telemetry.csv", rows)
+    _link_frames(out / "frames", [shot.picture for shot, _ in shots])
     truth = [truth_at(row, shot.lat_deg, shot.lon_deg) for row, (shot, _) in zip(rows, shots, strict=True)]
     write_truth(out / "truth.csv", truth)
     _write_camera(out / "camera.yaml", told.camera, shots[0][0].picture, recording.mount)
     _write_map(out / "map.tif", told.map or recording.map)
     if told.surface is not None:
         _link(told.surface, out / "dsm.tif")
-    about: dict[str, Any] = {"dataset": recording.dataset, "part": recording.part, "notes": notes}
-    (out / ABOUT).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return notes
 
 
@@ -182,6 +223,12 @@ def _in_time(recording: Recording, told: Told) -> tuple[list[tuple[Shot, int]], 
     if len(kept) < len(here):
         notes.append(f"{len(here) - len(kept)} of {len(here)} stamps repeat or go back, left out")
     return kept, tuple(notes)
+
+
+def _below_ground(shots: Sequence[tuple[Shot, int]], datum: str | None, ground_m: float) -> int:
+    """How many heights are not above a ground whose level counts for them."""
+    heights_m = [shot.height_m for shot, _ in shots if shot.height_m is not None and datum != "agl"]
+    return sum(height_m <= ground_m for height_m in heights_m)
 
 
 def _telemetry_row(shot: Shot, stamp_ns: int, datum: str | None, told: Told, *, first: bool) -> TelemetryRow:
@@ -214,7 +261,9 @@ def _link(source: Path, target: Path) -> None:
     try:
         os.symlink(source.resolve(strict=True), target)
     except FileExistsError:
-        raise TelemetryError(f"{target}: expected each file name once in the data set, got it twice") from None
+        raise TelemetryError(
+            f"{target}: expected each file name once in the data set, and none of them there before"
+        ) from None
     except (NotImplementedError, PermissionError):
         shutil.copyfile(source, target)
 

@@ -113,7 +113,7 @@ def write_single(folder: Path, single: Single, place: Place, maps: Path, dataset
         folder: made here.
         single: the photograph.
         place: what it looks at.
-        maps: the folder that :func:`write_place` wrote the place into.
+        maps: the folder that :func:`write_place` writes the place into.
         dataset: its name.
 
     Raises:
@@ -128,6 +128,8 @@ def write_single(folder: Path, single: Single, place: Place, maps: Path, dataset
     to_degrees = Transformer.from_crs(EPSG, 4326, always_xy=True)
     lon_deg, lat_deg = to_degrees.transform(ANCHOR_M[0] + east_m, ANCHOR_M[1] + north_m)
     (folder / "frames").mkdir(parents=True, exist_ok=True)
+    # First: it says that an import made the folder, and that a later one may replace it.
+    (folder / ABOUT).write_text(json.dumps({"dataset": dataset, "part": single.name}) + "\n", encoding="utf-8")
     Image.fromarray(single.image).save(folder / "frames" / f"{single.name}.png")
     attitude = single.attitude
     angles = {
@@ -150,7 +152,6 @@ def write_single(folder: Path, single: Single, place: Place, maps: Path, dataset
     for name in ("map.tif", "dsm.tif"):
         if maps != folder:
             os.symlink(os.path.relpath(maps / name, folder), folder / name)
-    (folder / ABOUT).write_text(json.dumps({"dataset": dataset, "part": single.name}) + "\n", encoding="utf-8")
 
 
 def campaign_text(names: Sequence[str]) -> str:
