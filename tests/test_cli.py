@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -263,7 +264,7 @@ def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
         assert run([*base, *option, "--threads=1"]) == 0
         variances.append(np.diag(json.loads(capsys.readouterr().out)["covariance_m2"]))
     np.testing.assert_allclose(variances[1] - variances[0], 9.0, rtol=1e-4)
-    assert "georeference_sigma_m: expected a number above 0" in error_line(capsys, [*base, "--map-sigma-m=0"], 2)
+    assert "--map-sigma-m: expected a number above 0" in error_line(capsys, [*base, "--map-sigma-m=0"], 2)
 
 
 def test_locate_near_and_its_refusals(flight, capsys):
@@ -291,7 +292,22 @@ def test_doctor(capsys):
     assert run(["doctor"]) == 0
     assert "torch" in capsys.readouterr().out
     assert run(["doctor", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["missing"] == "nothing"
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["missing"] == "nothing"
+    assert facts["numba"] == metadata.version("numba")
+
+
+def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
+    stated = [
+        "numpy>=2.0", "no-such-package<2,>=1", 'pillow>=10; extra == "pictures"',
+        'no-such-tool; platform_system == "Linux" and extra == "pictures"', 'pytest>=8.3; extra == "test"',
+    ]  # fmt: skip
+    monkeypatch.setattr(metadata, "requires", lambda _: stated)
+    assert run(["doctor", "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["missing"] == ["no-such-package"]
+    told = f"pillow {metadata.version('pillow')}, no-such-tool is not installed"
+    assert [(name, value) for name, value in facts.items() if "extra" in name] == [("extra [pictures]", told)]
 
 
 @pytest.mark.parametrize(

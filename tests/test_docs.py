@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 import engine
 from docs.site_roles import on_page_content
@@ -160,6 +161,27 @@ def test_every_command_has_its_section():
     for group in app.registered_groups:
         commands |= {f"{group.name} {info.name}" for info in group.typer_instance.registered_commands}
     assert told == commands
+
+
+def command_options():
+    """Options by command, without those that the page tells once for all."""
+    pending = [("", get_command(app))]
+    while pending:
+        name, command = pending.pop()
+        if hasattr(command, "commands"):
+            pending += [(f"{name} {word}".strip(), each) for word, each in command.commands.items()]
+            continue
+        words = {word for option in command.params for word in (*option.opts, *option.secondary_opts)}
+        options = {word for word in words if word.startswith("--")}
+        yield name, options - {"--help", "--json", "--threads", "--force"}
+
+
+@pytest.mark.parametrize(("command", "options"), sorted(command_options()), ids=lambda value: str(value)[:20])
+def test_every_option_is_in_the_lines_of_its_command(command, options):
+    section = read("docs/command-line.md").split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
+    lines = next(iter(re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)), "")
+    told = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force", "--threads"}
+    assert told == options
 
 
 def test_the_changelog_names_the_version():

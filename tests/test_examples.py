@@ -26,7 +26,7 @@ FRAMES = 8
 def flight(tmp_path_factory):
     """A flight folder."""
     folder = tmp_path_factory.mktemp("examples")
-    write_flight(folder, plan_flight(frames=FRAMES))
+    write_flight(folder, plan_flight(frames=FRAMES, rate_hz=2.0))
     return folder
 
 
@@ -65,8 +65,9 @@ def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
     assert "connected=True" in said
     # A busy machine hears of the height after its first fix, and is late with some.
     assert set(re.findall(r"'([\w ]+)': \d+", said)) <= {"late", "unconfirmed", "no height"}
+    assert came["fixes"] >= 1
     assert came["fixes"] == int(re.search(r"sent=(\d+)", said)[1])
-    assert came["median_m"] is None or came["median_m"] < 3.0
+    assert came["median_m"] < 3.0
 
 
 def test_a_video_and_its_telemetry_are_the_flight_again(flight, monkeypatch):

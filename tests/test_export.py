@@ -175,8 +175,10 @@ def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_pa
 
 def test_the_truth_comes_at_the_moments_of_the_fixes_about_the_same_origin(tmp_path, capfd):
     write_track(tmp_path / "track.csv", ROWS)
-    names = ("map", "surface", "truth", "method", "profile", "ground_m", "ground_amsl_m")
-    settings = dict.fromkeys(names) | {"origin": {"lat_deg": 32.5, "lon_deg": 35.25}}
+    settings = {
+        "map": "m.tif", "surface": None, "truth": None, "method": "ncc", "profile": "engine", "ground_m": 0.0,
+        "ground_amsl_m": None, "origin": {"lat_deg": 32.5, "lon_deg": 35.25},
+    }  # fmt: skip
     (tmp_path / "summary.json").write_text(json.dumps({"settings": settings}))
     # 100 m north of the origin at T0, another 4 m in each second; it ends before the last two fixes.
     degrees_a_metre = 1.0 / 110_888.0  # of latitude at 32.5 degrees

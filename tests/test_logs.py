@@ -474,5 +474,18 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
     capfd.readouterr()
     assert run(["evaluate", str(tmp_path / "log"), "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["scored_fixes"] == 3
+    stamps = tmp_path / "stamps.csv"
+    rows = read_telemetry(table)
+    lines = [f"{row.timestamp_ns - 500_000_000},{row.frame}" for row in rows]
+    stamps.write_text("\n".join(["timestamp_ns,frame", *lines]) + "\n", encoding="utf-8")
+    told = ["--frame-stamps", str(stamps), "--log-offset-s", "0.5", "--map-sigma-m", "2"]
+    assert follow("told", "--telemetry", log, "--truth", log, *told) == 0
+    page, summary = (tmp_path / "told" / name for name in ("report.html", "summary.json"))
+    before = page.read_bytes(), summary.read_bytes()
+    assert b"No frames are shown" not in before[0]
+    assert all(word in before[0] for word in (str(stamps).encode(), b"<td>log offset (s)</td>", b"map sigma (m)"))
+    assert run(["evaluate", str(tmp_path / "told")]) == 0
+    assert (page.read_bytes(), summary.read_bytes()) == before
+    capfd.readouterr()
     assert follow("no", "--telemetry", table, "--log-offset-s", "1") == 2
     assert "--frame-stamps, --log-offset-s: expected a log as telemetry, got" in capfd.readouterr().err

@@ -687,6 +687,23 @@ def test_fixes_reach_the_autopilot_with_stamps_of_capture(bridge_to):
     assert all(captures[0] - 10**10 < m.tc1 < captures[-1] + 10**10 for m in answers)
 
 
+def test_a_packet_that_cannot_be_read_does_not_end_the_reading(bridge_to, monkeypatch, caplog):
+    made = bridge_to()
+    update, faults = made.bridge.telemetry.update, []
+
+    def fail_thrice(message, now_ns):
+        if len(faults) < 3:
+            faults.append(message)
+            raise ValueError("cannot convert float NaN to integer")
+        update(message, now_ns)
+
+    monkeypatch.setattr(made.bridge.telemetry, "update", fail_thrice)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    assert len(faults) == 3
+    assert [record.exc_info[0] for record in caplog.records] == [ValueError]
+
+
 @pytest.mark.parametrize("use", [True, False])
 def test_the_velocity_is_believed_where_it_is_told_to(bridge_to, use):
     made = bridge_to(use_velocity=use)

@@ -146,7 +146,7 @@ def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, l
         (["--condition", "eclipse"], "--condition"),
         (["--surface", "dsm.tif"], "--surface"),
         (["--map", "map.tif", "--relief-m", "5"], "--relief-m"),
-        (["--relief-m", "-5"], "relief_m"),
+        (["--relief-m", "-5"], "--relief-m"),
         (["--frames", "0"], "--frames"),
         (["--closed-loop", "--condition", "eclipse"], "--condition"),
     ],

@@ -66,7 +66,10 @@ class Connection:
             "tcp": _Tcp,
             "serial": _Serial,
         }
-        return makers[self.kind](self.host, self.number)
+        try:
+            return makers[self.kind](self.host, self.number)
+        except UnicodeError:  # names are encoded before they are looked up
+            raise OSError(f"{self.host!r} cannot be the name of a host") from None
 
 
 def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:

@@ -126,7 +126,7 @@ class Bridge:
         self._peer: Sender = None
         self._met_ns = 0  # when the vehicle was heard first, or again
         self._originless_ns = 0  # since when the autopilot states no origin
-        self._done_ns = {"beat": 0, "sync": 0, "ask": 0}
+        self._done_ns = {"beat": 0, "sync": 0, "ask": 0, "complaint": 0}
         self._closed = threading.Event()
         self._link: Link | None = connection.open()
         self._decoder = self._new_decoder(self._link)
@@ -254,6 +254,10 @@ class Bridge:
                 _log.warning("MAVLink: %s; opened again after %g s", error, _REOPEN_S)
                 self._drop_link()
                 self._closed.wait(_REOPEN_S)
+            except Exception:  # of one packet: the next may be sound, and without a reader nothing comes any more
+                if self._is_due("complaint", time.monotonic_ns(), _REOPEN_S):
+                    _log.exception("MAVLink: a packet could not be read or sent")
+                self._closed.wait(_POLL_S)
 
     def _take(self, data: bytes, sender: Sender) -> None:
         """What one sender sent; while a vehicle is heard, only what comes from its address."""

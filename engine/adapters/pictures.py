@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.formats.flight import open_flight
+from engine.formats.telemetry import shown
 
 Picture = tuple[NDArray[np.uint8], int]
 """(H, W, 3) RGB, and when it was captured on ``time.monotonic_ns``."""
@@ -56,9 +57,13 @@ def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Iterator[Pictur
     """
     import cv2
 
-    camera = cv2.VideoCapture(int(source) if source.isdecimal() else source)
-    if not camera.isOpened():
-        raise TelemetryError(f"--camera-source: expected a camera or stream that opens, got {source!r}")
+    try:
+        camera = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+        opened = camera.isOpened()
+    except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python takes
+        opened = False
+    if not opened:
+        raise TelemetryError(f"--camera-source: expected a camera or stream that opens, got {shown(source)}")
     camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     try:
         while camera.grab():

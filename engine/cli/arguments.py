@@ -1,13 +1,19 @@
-"""What the commands share in reading their arguments and preparing their output folder."""
+"""What the commands share in reading their arguments, opening the map and preparing their output folder."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from engine import device as devices
 from engine.budget import Budget
-from engine.errors import OptionError
+from engine.cli import console
+from engine.errors import EngineError, OptionError
+from engine.motion import WIDEST_M
+from engine.orthomap import OrthoMap
 from engine.types import Prior
 
 START_SIGMA_M = 15.0
@@ -22,16 +28,38 @@ def parse_position(name: str, text: str | None) -> Prior | None:
     """
     if text is None:
         return None
+    numbers = _numbers(name, text, "LAT,LON[,SIGMA_M]", (2, 3))
+    sigma_m = numbers[2] if numbers[2:] else START_SIGMA_M
+    if sigma_m > WIDEST_M:
+        raise OptionError(f"{name}: expected a SIGMA_M of at most {WIDEST_M:g} m, got {sigma_m:g}")
+    try:
+        return Prior(lat_deg=numbers[0], lon_deg=numbers[1], sigma_m=sigma_m)
+    except OptionError as error:
+        raise OptionError(f"{name}: {error}") from None
+
+
+def parse_circle(name: str, text: str | None) -> tuple[float, float, float] | None:
+    """Read LAT,LON,RADIUS_M; None where nothing was given.
+
+    Raises:
+        OptionError: the text is of another form, or a number is out of range.
+    """
+    if text is None:
+        return None
+    lat, lon, radius_m = _numbers(name, text, "LAT,LON,RADIUS_M", (3,))
+    if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and radius_m > 0.0):
+        raise OptionError(f"{name}: expected a place on the Earth and a radius above 0 m, got {text!r}")
+    return lat, lon, radius_m
+
+
+def _numbers(name: str, text: str, form: str, counts: Sequence[int]) -> list[float]:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
-        raise OptionError(f"{name}: expected LAT,LON[,SIGMA_M] in degrees and metres, got {text!r}")
-    try:
-        return Prior(lat_deg=numbers[0], lon_deg=numbers[1], sigma_m=numbers[2] if numbers[2:] else START_SIGMA_M)
-    except OptionError as error:
-        raise OptionError(f"{name}: {error}") from None
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        raise OptionError(f"{name}: expected {form} in degrees and metres, got {text!r}")
+    return numbers
 
 
 def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
@@ -55,6 +83,66 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """
     if value not in choices:
         raise OptionError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def refuse_given(given: Mapping[str, object], expected: str) -> None:
+    """Refuse options that would say nothing in this run.
+
+    Args:
+        given: values by option; None where it was not given.
+        expected: with what they would be taken.
+
+    Raises:
+        OptionError: names the first that was given.
+    """
+    for name, value in given.items():
+        if value is not None:
+            raise OptionError(f"{name}: expected with {expected} only")
+
+
+@contextmanager
+def named_as_typed(**options: str) -> Iterator[None]:
+    """Within it, what the engine says of a field is said of the option that was typed.
+
+    Args:
+        options: option by field.
+    """
+    try:
+        yield
+    except EngineError as error:
+        field, colon, rest = str(error).partition(":")
+        if not colon or field not in options:
+            raise
+        raise type(error)(f"{options[field]}:{rest}") from None
+
+
+def check_device(name: str, device: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        OptionError, DeviceError: see :func:`engine.device.resolve`.
+    """
+    with named_as_typed(device=name):
+        devices.resolve(device)
+
+
+def open_map(
+    path: str | os.PathLike[str], surface: str | os.PathLike[str] | None = None, sigma_m: float | None = None
+) -> OrthoMap:
+    """The map, with a bar on a terminal while it is copied into the cache.
+
+    Args:
+        path: see :meth:`engine.OrthoMap.open`.
+        surface: heights.
+        sigma_m: how well the map lies; None for what it says.
+
+    Raises:
+        OptionError: the last is not above 0, or wider than any map.
+    """
+    if sigma_m is not None and not 0.0 < sigma_m <= WIDEST_M:
+        raise OptionError(f"--map-sigma-m: expected a number above 0 and at most {WIDEST_M:g}, got {sigma_m:g}")
+    with console.told_progress("copying the map into the cache") as tell:
+        return OrthoMap.open(path, surface=surface, georeference_sigma_m=sigma_m, on_copy=tell)
 
 
 def check_folder(out: Path, force: bool) -> None:

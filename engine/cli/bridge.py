@@ -9,14 +9,20 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from engine import device as devices
 from engine.adapters.links import parse_connection
 from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import Picture, capture, replay
 from engine.adapters.vehicle import Origin
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import check_choice, parse_position
+from engine.cli.arguments import (
+    check_choice,
+    check_device,
+    named_as_typed,
+    open_map,
+    parse_position,
+    refuse_given,
+)
 from engine.cli.checks import check_place
 from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
@@ -32,6 +38,8 @@ if TYPE_CHECKING:
 
 _SAY_EVERY_S = 5.0
 _HEAR_S = 10.0
+_MOST_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
+_MOST_GRAB_MS = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,27 +52,39 @@ class Inputs:
     frames: Path | None
     telemetry: Path | None
     source: str | None
-    rate_hz: float
-    exposure_to_grab_ms: float
+    rate_hz: float | None = None  # of pictures without stamps; None for 10
+    exposure_to_grab_ms: float | None = None  # of a camera; None for none
     map_sigma_m: float | None = None  # how well the map lies, where it does not say
 
     def __post_init__(self) -> None:
         if (self.frames is None) == (self.source is None):
             raise OptionError("--frames: expected either --frames or --camera-source")
-        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise OptionError(f"--rate-hz: expected a number above 0, got {self.rate_hz:g}")
+        if self.frames is None:
+            refuse_given({"--telemetry": self.telemetry, "--rate-hz": self.rate_hz}, "--frames")
+        else:
+            refuse_given({"--exposure-to-grab-ms": self.exposure_to_grab_ms}, "--camera-source")
+        if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
+            raise OptionError(f"--rate-hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
+        if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MOST_GRAB_MS:
+            raise OptionError(
+                f"--exposure-to-grab-ms: expected 0 to {_MOST_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
+            )
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[Picture]:
         """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
         if self.frames is not None:
-            return replay(self.frames, self.telemetry, rate_hz=self.rate_hz, wait=wait)
+            return replay(self.frames, self.telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
         assert self.source is not None  # one of the two is given
-        return capture(self.source, exposure_to_grab_ms=self.exposure_to_grab_ms)
+        return capture(self.source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wire:
-    """How the autopilot is reached and what it is told, as the command line has it."""
+    """How the autopilot is reached and what it is told, as the command line has it.
+
+    Raises:
+        OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
+    """
 
     connect: str
     listen_anywhere: bool
@@ -77,16 +97,40 @@ class Wire:
     origin_alt_m: float | None
     use_velocity: bool
 
+    def __post_init__(self) -> None:
+        if not self.set_origin:
+            refuse_given({"--origin-alt-m": self.origin_alt_m}, "--set-origin")
+        if self.origin_alt_m is not None and not abs(self.origin_alt_m) <= _MOST_ALT_M:
+            raise OptionError(
+                f"--origin-alt-m: expected {-_MOST_ALT_M:g} to {_MOST_ALT_M:g}, got {self.origin_alt_m:g}"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matching:
-    """How frames are matched, as the command line has it."""
+    """How frames are matched, as the command line has it.
+
+    Raises:
+        OptionError: a word or a number is none of those that are expected.
+        DeviceError: the device is missing.
+    """
 
     method: str
     device: str
     start: str | None
     deadline_ms: float
     seconds: float | None
+
+    def __post_init__(self) -> None:
+        check_choice("--method", self.method, METHODS)
+        check_device("--device", self.device)
+        parse_position("--start", self.start)
+        self.live_options()
+
+    def live_options(self) -> LiveOptions:
+        """The deadlines of the frames."""
+        with named_as_typed(deadline_ms="--deadline-ms"):
+            return LiveOptions(deadline_ms=self.deadline_ms)
 
 
 def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool, watching: Watching) -> None:
@@ -98,11 +142,9 @@ def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool,
 
     connection = parse_connection(wire.connect, listen_anywhere=wire.listen_anywhere)
     options = _outgoing(wire.firmware, wire.message, wire.max_sigma_m)
-    check_choice("--method", matching.method, METHODS)
-    devices.resolve(matching.device)
     start = parse_position("--start", matching.start)
     key = None if wire.key is None else read_key(wire.key)
-    site = OrthoMap.open(inputs.map, surface=inputs.surface, georeference_sigma_m=inputs.map_sigma_m)
+    site = open_map(inputs.map, inputs.surface, inputs.map_sigma_m)
     camera = Camera.load(inputs.camera)
     check_place("--start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, matching.method, matching.device)
@@ -116,7 +158,7 @@ def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool,
 
         try:
             bridge = Bridge(
-                connection, make_navigator, options, start, LiveOptions(deadline_ms=matching.deadline_ms),
+                connection, make_navigator, options, start, matching.live_options(),
                 origin=_origin(site, wire), use_velocity=wire.use_velocity, system_id=wire.system_id, key=key,
                 watch=watcher,
             )  # fmt: skip
@@ -154,10 +196,8 @@ def _need_pymavlink() -> None:
 def _outgoing(firmware: str, message: str, max_sigma_m: float) -> Outgoing:
     from engine.adapters.mavlink_out import Outgoing
 
-    try:
+    with named_as_typed(firmware="--firmware", message="--message", max_sigma_m="--max-sigma-m"):
         return Outgoing(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
-    except OptionError as error:
-        raise OptionError("--" + str(error).replace("_", "-", str(error).split(":")[0].count("_"))) from None
 
 
 def _origin(site: OrthoMap, wire: Wire) -> Origin | None:

@@ -49,15 +49,16 @@ def mavlink(
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
     ] = None,
     rate: Annotated[
-        float, typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps.")
-    ] = 10.0,
+        float | None,
+        typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless told."),
+    ] = None,
     source: Annotated[
         str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
     ] = None,
     grab: Annotated[
-        float,
+        float | None,
         typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
-    ] = 0.0,
+    ] = None,
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
     max_sigma: MaxSigmaOption = 10.0,

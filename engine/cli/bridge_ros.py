@@ -5,22 +5,19 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from engine import device as devices
 from engine.adapters.ros import RosBridge, RosNode, Topics
 from engine.adapters.ros_out import RosOptions
 from engine.adapters.vehicle import Origin
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import check_choice, parse_position
+from engine.cli.arguments import named_as_typed, open_map, parse_position
 from engine.cli.bridge import Matching
 from engine.cli.checks import check_place
 from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError
 from engine.formats.ros_messages import camera_of
-from engine.live import LiveOptions
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
 from engine.navigator import Navigator
-from engine.orthomap import OrthoMap
 from engine.types import Prior
 
 _PATIENCE_S = 30.0
@@ -53,15 +50,11 @@ def run_bridge_ros(
 ) -> None:
     """Run the node until ROS, the time or somebody ends it, and print what was done."""
     watching.check()
-    check_choice("--method", matching.method, METHODS)
-    devices.resolve(matching.device)
     start, place = parse_position("--start", matching.start), parse_position("--origin", origin)
     begin = None if place is None else Origin(place.lat_deg or 0.0, place.lon_deg or 0.0, 0.0)
-    try:
+    with named_as_typed(firmware="--firmware"):
         options = RosOptions(firmware=firmware, origin=begin)
-    except OptionError as error:
-        raise OptionError(f"--{error}") from None
-    site = OrthoMap.open(inputs.map, surface=inputs.surface, georeference_sigma_m=inputs.map_sigma_m)
+    site = open_map(inputs.map, inputs.surface, inputs.map_sigma_m)
     check_place("--start", start, site, OptionError)
     camera = None if inputs.camera is None else Camera.load(inputs.camera)
     node = _node(version)
@@ -76,8 +69,7 @@ def run_bridge_ros(
             navigator = Navigator(matcher, prior)
             return navigator if watcher is None else watcher.follow(navigator)
 
-        live = LiveOptions(deadline_ms=matching.deadline_ms)
-        bridge = RosBridge(node, site, make_navigator, options, start, live, watch=watcher)
+        bridge = RosBridge(node, site, make_navigator, options, start, matching.live_options(), watch=watcher)
         console.say(f"listening to {inputs.topics.image}")
         try:
             node.spin(bridge.handlers(inputs.topics), bridge.beat, matching.seconds)

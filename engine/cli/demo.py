@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from engine import device as devices
 from engine.cli import console
-from engine.cli.arguments import check_folder, prepare_folder
+from engine.cli.arguments import check_device, check_folder, prepare_folder
 from engine.cli.compare import CHART, COLUMNS, TABLE, USUAL, cells, parse_runs, run_compare
 from engine.cli.track import Inputs, folder_inputs
 from engine.formats.flight import write_flight_folder
@@ -26,7 +25,7 @@ def run_demo(
     out: Path, *, frames: int | None, seed: int, device: str, force: bool, as_json: bool
 ) -> dict[str, Any]:
     """Fly, match, print Table I; the report folder holds the flight, and what ``compare`` writes."""
-    devices.resolve(device)
+    check_device("--device", device)
     check_folder(out, force)
     console.say("drawing the town and the flight over it")
     plan = plan_flight(seed, frames=frames)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from engine.cli.arguments import check_choice
-from engine.cli.track import read_record
+from engine.cli.record import read_record
 from engine.errors import OptionError, TelemetryError
 from engine.formats.export import WRITERS, segments
 from engine.formats.logs import open_truth
@@ -57,7 +57,7 @@ def run_export(
 
 def _at_truth(directory: Path, rows: list[TrackRow], path: Path) -> list[TrackRow]:
     """The rows of the fixes, each where the truth has the vehicle at that moment; those that it knows."""
-    origin = read_record(directory / "summary.json")["origin"]
+    origin = read_record(directory / "summary.json").origin
     frame = LocalFrame(origin["lat_deg"], origin["lon_deg"])
     truth = open_truth(path, rows[0].timestamp_ns)
     moved: list[TrackRow] = []

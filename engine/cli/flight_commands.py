@@ -13,7 +13,10 @@ from engine.cli.options import (
     CameraOption,
     DeviceOption,
     ForceOption,
+    FrameStampsOption,
+    ImageTopicOption,
     JsonOption,
+    LogOffsetOption,
     MapOption,
     MapSigmaOption,
     MethodOption,
@@ -72,16 +75,9 @@ def track(
             "--telemetry", metavar="FILE", help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; without it EXIF."
         ),
     ] = None,
-    image_topic: Annotated[
-        str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")
-    ] = None,
-    frame_stamps: Annotated[
-        Path | None,
-        typer.Option("--frame-stamps", metavar="FILE", help="With a log: a CSV with timestamp_ns and frame."),
-    ] = None,
-    log_offset: Annotated[
-        float, typer.Option("--log-offset-s", metavar="S", help="With a log: added to the frames' own stamps.")
-    ] = 0.0,
+    image_topic: ImageTopicOption = None,
+    frame_stamps: FrameStampsOption = None,
+    log_offset: LogOffsetOption = 0.0,
     surface: SurfaceOption = None,
     map_sigma: MapSigmaOption = None,
     truth: Annotated[
@@ -115,12 +111,11 @@ def track(
     Writes track.csv (one row a frame), summary.json and figures into the output folder. Without --start the
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
-    from engine.cli.track import Inputs, camera_or_bag, run_track, settings_from
+    from engine.cli.track import Inputs, camera_or_bag, parse_clock, run_track, settings_from
     from engine.cli.watching import Watching
-    from engine.formats.logs import LogClock
 
     use_threads(threads)
-    clock = LogClock(frame_stamps, log_offset) if frame_stamps is not None or log_offset else None
+    clock = parse_clock(frame_stamps, log_offset)
     calibration = camera_or_bag(camera, frames)
     inputs = Inputs(map_path, surface, calibration, frames, telemetry, truth, clock, image_topic, map_sigma)
     settings = settings_from(
@@ -133,11 +128,16 @@ def track(
 def compare(
     map_path: MapOption,
     camera: CameraOption,
-    frames: Annotated[Path, typer.Option("--frames", metavar="DIR|VIDEO", help="Folder of pictures, or a video.")],
+    frames: Annotated[
+        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
+    ],
     out: OutOption,
     telemetry: Annotated[
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
     ] = None,
+    image_topic: ImageTopicOption = None,
+    frame_stamps: FrameStampsOption = None,
+    log_offset: LogOffsetOption = 0.0,
     surface: SurfaceOption = None,
     map_sigma: MapSigmaOption = None,
     truth: Annotated[
@@ -160,11 +160,12 @@ def compare(
     and one chart.
     """
     from engine.cli.compare import parse_runs, print_comparison, run_compare
-    from engine.cli.track import Inputs
+    from engine.cli.track import Inputs, parse_clock
 
     use_threads(threads)
     wanted = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
-    inputs = Inputs(map_path, surface, camera, frames, telemetry, truth, map_sigma_m=map_sigma)
+    clock = parse_clock(frame_stamps, log_offset)
+    inputs = Inputs(map_path, surface, camera, frames, telemetry, truth, clock, image_topic, map_sigma)
     results = run_compare(inputs, out, wanted, force=force)
     if as_json:
         console.print_json(results)
@@ -256,7 +257,10 @@ def simulate(
     ] = None,
     rerun: RerunOption = None,
     rerun_connect: RerunConnectOption = None,
-    device: DeviceOption = "auto",
+    device: Annotated[
+        str | None,
+        typer.Option("--device", metavar="auto|cpu|cuda", help="With --closed-loop: where tensors live."),
+    ] = None,
     threads: ThreadsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -266,20 +270,23 @@ def simulate(
     Writes a flight folder that track reads. With --closed-loop the vehicle steers by the engine's fixes, and the
     folder holds its track, estimate, figures and summary too.
     """
+    from engine.cli.arguments import refuse_given
     from engine.cli.simulate import Loop, Scene, run_closed_loop, run_simulate
     from engine.cli.watching import Watching
 
     use_threads(threads)
     scene = Scene(seed=seed, condition=condition, relief_m=relief, map=map_path, surface=surface)
-    given = {"minutes": minutes, "method": method, "fault": fault, "rerun": rerun, "rerun-connect": rerun_connect}
-    unwanted = [name for name, value in given.items() if value is not None and not closed_loop]
-    if unwanted:
-        raise OptionError(f"--{unwanted[0]}: expected with --closed-loop only")
+    given = {
+        "--minutes": minutes, "--method": method, "--fault": fault, "--rerun": rerun,
+        "--rerun-connect": rerun_connect, "--device": device,
+    }  # fmt: skip
+    if not closed_loop:
+        refuse_given(given, "--closed-loop")
     if closed_loop and frames is not None:
         raise OptionError("--frames: expected without --closed-loop, which has --minutes")
     if closed_loop:
         minutes = 5.0 if minutes is None else minutes
-        loop = Loop(minutes=minutes, method=method or "auto", fault=fault or "none", device=device)
+        loop = Loop(minutes=minutes, method=method or "auto", fault=fault or "none", device=device or "auto")
         facts = run_closed_loop(out, scene, loop, force=force, watching=Watching(rerun, rerun_connect))
     else:
         facts = run_simulate(out, scene, frames=frames, force=force)

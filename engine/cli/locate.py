@@ -7,15 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from engine import device as devices
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import check_choice, parse_position
+from engine.cli.arguments import check_choice, check_device, open_map, parse_position
 from engine.cli.checks import check_place
 from engine.errors import OptionError
 from engine.formats.frames import read_image
 from engine.matcher import METHODS, SceneMatcher
-from engine.orthomap import OrthoMap
 from engine.types import Fix, Frame, NoFix
 
 
@@ -67,9 +65,9 @@ def run_locate(
 ) -> bool:
     """Match one picture and print what came of it; whether there was a fix."""
     check_choice("--method", method, METHODS)
-    devices.resolve(device)
+    check_device("--device", device)
     prior = parse_position("--near", known.near)
-    site = OrthoMap.open(map_path, surface=surface, georeference_sigma_m=map_sigma_m)
+    site = open_map(map_path, surface, map_sigma_m)
     camera = Camera.load(camera_path)
     check_place("--near", prior, site, OptionError)
     pixels = read_image(image)

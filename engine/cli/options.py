@@ -64,6 +64,16 @@ SecondsOption = Annotated[
 OtherDeviceOption = Annotated[
     str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
 ]
+ImageTopicOption = Annotated[
+    str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")
+]
+FrameStampsOption = Annotated[
+    Path | None,
+    typer.Option("--frame-stamps", metavar="FILE", help="With a log: a CSV with timestamp_ns and frame."),
+]
+LogOffsetOption = Annotated[
+    float, typer.Option("--log-offset-s", metavar="S", help="With a log: added to the frames' own stamps.")
+]
 RerunOption = Annotated[
     Path | None, typer.Option("--rerun", metavar="FILE.rrd", help="Record the live view, for rerun's viewer.")
 ]

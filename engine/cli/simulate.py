@@ -13,11 +13,10 @@ import numpy as np
 
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import check_choice, check_folder, prepare_folder
+from engine.cli.arguments import check_choice, check_device, check_folder, prepare_folder
 from engine.cli.demo import START_SIGMA_M, write_flight
 from engine.cli.track import OWNED
 from engine.cli.watching import Watching, watched
-from engine.device import resolve
 from engine.errors import OptionError
 from engine.formats.flight import write_flight_folder
 from engine.formats.track import TrackRow, read_track, track_row, write_track
@@ -34,7 +33,7 @@ from engine.sim.light import Image
 from engine.sim.loop import START_NS, ClosedLoop
 from engine.sim.pilot import plan_rounds
 from engine.sim.quadrotor import State
-from engine.sim.town import EXACT, generator
+from engine.sim.town import EXACT, RELIEF_MAX_M, generator
 from engine.types import Frame, Prior, Truth
 
 if TYPE_CHECKING:  # rerun is optional
@@ -61,7 +60,7 @@ class Scene:
     """What is flown over, as the command line has it.
 
     Raises:
-        OptionError: the options do not go together, or there is no such condition.
+        OptionError: the options do not go together, there is no such condition, or the hills are too high.
     """
 
     seed: int = 1
@@ -75,6 +74,8 @@ class Scene:
             check_choice("--condition", self.condition, tuple(CONDITIONS))
         if self.surface is not None and self.map is None:
             raise OptionError(f"--surface: expected with --map only, got {self.surface}")
+        if not 0.0 <= self.relief_m <= RELIEF_MAX_M:
+            raise OptionError(f"--relief-m: expected 0 to {RELIEF_MAX_M:g}, got {self.relief_m:g}")
         if self.relief_m and self.map is not None:
             raise OptionError(
                 f"--relief-m: expected without --map, whose surface has its own, got {self.relief_m:g}"
@@ -110,7 +111,7 @@ class Loop:
         check_choice("--fault", self.fault, KINDS)
         if not 0.1 <= self.minutes <= 120.0:
             raise OptionError(f"--minutes: expected 0.1 to 120, got {self.minutes:g}")
-        resolve(self.device)
+        check_device("--device", self.device)
 
     def planned_fault(self) -> Fault:
         """The fault with its times: ten seconds, but a map that is shifted stays so."""

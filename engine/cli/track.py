@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engine import device as devices
 from engine.budget import Budget
 from engine.camera import Camera
 from engine.cli import console
-from engine.cli.arguments import check_choice, check_folder, parse_budget, parse_position, prepare_folder
+from engine.cli.arguments import (
+    check_choice,
+    check_device,
+    check_folder,
+    named_as_typed,
+    open_map,
+    parse_budget,
+    parse_position,
+    prepare_folder,
+)
 from engine.cli.checks import check_needs, check_pictures, check_place, check_start
+from engine.cli.record import Record, read_record
 from engine.cli.watching import Watching, watched
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.bags import is_bag, read_bag_camera
@@ -61,10 +71,18 @@ class Inputs:
     def __post_init__(self) -> None:
         if self.clock is not None and (self.telemetry is None or not is_log(self.telemetry)):
             raise OptionError(f"--frame-stamps, --log-offset-s: expected a log as telemetry, got {self.telemetry}")
+        if self.image_topic is not None and not is_bag(self.frames):
+            raise OptionError(f"--image-topic: expected a bag as frames, got {self.frames}")
 
     def load_camera(self) -> Camera:
         """The calibration, of a file or of a bag."""
         return read_bag_camera(self.camera, self.image_topic) if is_bag(self.camera) else Camera.load(self.camera)
+
+    def open_flight(self) -> Flight:
+        """The frames with what is known of each."""
+        return open_flight(
+            self.frames, self.telemetry, clock=self.clock or LogClock(), image_topic=self.image_topic
+        )
 
     def find_truth(self) -> Path | None:
         """The truth that was named, else ``truth.csv`` beside the telemetry where there is one."""
@@ -84,6 +102,16 @@ def folder_inputs(directory: Path) -> Inputs:
         telemetry=directory / "telemetry.csv",
         truth=directory / "truth.csv",
     )
+
+
+def parse_clock(stamps: Path | None, offset_s: float) -> LogClock | None:
+    """When the frames were taken, where that was told.
+
+    Raises:
+        OptionError: the offset is not finite.
+    """
+    with named_as_typed(offset_s="--log-offset-s"):
+        return LogClock(stamps, offset_s) if stamps is not None or offset_s else None
 
 
 def camera_or_bag(camera: Path | None, frames: Path) -> Path:
@@ -133,7 +161,7 @@ class Settings:
             raise OptionError("--method: expected ncc or sift with --profile paper, got 'auto'")
         parse_position("--start", self.start)
         parse_budget("--budget-ms", self.budget_ms)
-        devices.resolve(self.device)
+        check_device("--device", self.device)
 
 
 def settings_from(path: Path | None, **given: Any) -> Settings:
@@ -147,7 +175,7 @@ def settings_from(path: Path | None, **given: Any) -> Settings:
 
 
 @dataclass(frozen=True)
-class _Opened:
+class Opened:
     """A flight whose every part was read and found to fit the others."""
 
     site: OrthoMap
@@ -174,17 +202,19 @@ def run_track(
     force: bool = False,
     report: bool = True,
     watching: Watching | None = None,
+    opened: Opened | None = None,
 ) -> dict[str, Any]:
     """Follow a flight and write the output folder; returns the summary.
 
     Everything that can be wrong with the input is found before the output folder is made. Without ``report`` there
-    are no figures and no page; ``evaluate`` makes them at any later time.
+    are no figures and no page; ``evaluate`` makes them at any later time. ``opened`` is what :func:`open_inputs`
+    made of the inputs, where that was done before for several runs.
     """
     check_folder(out, force)
     watching = watching or Watching()
     watching.check(force=force)
     start, budget = parse_position("--start", settings.start), parse_budget("--budget-ms", settings.budget_ms)
-    opened = _open(inputs, settings, start)
+    opened = opened or open_inputs(inputs, [settings])
     site, flight = opened.site, opened.flight
     matcher = _matcher(site, opened.camera, settings)
     matcher.warmup()
@@ -196,8 +226,7 @@ def run_track(
     with watched(matcher, watching) as view:
         attitude = follow(flight, navigator, out / "track.csv", budget, what, use_priors=start is None, view=view)
     ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
-    record = _record(inputs, settings, opened, str(matcher.device), ground)
-    record["attitude"] = None if attitude is None else asdict(attitude)
+    record = _record(inputs, settings, opened, str(matcher.device), ground, attitude)
     # From the rows as they stand in the file, so that evaluate gives the same figures.
     rows = read_track(out / "track.csv")
     return conclude(out, rows, opened.truth, site, ground, record, Replay(flight, matcher), report=report)
@@ -208,55 +237,72 @@ def _matcher(site: OrthoMap, camera: Camera, settings: Settings) -> SceneMatcher
     return SceneMatcher(site, camera, settings.method, settings.device, options)
 
 
-def _open(inputs: Inputs, settings: Settings, start: Prior | None) -> _Opened:
-    """Read what a run needs, and refuse what does not belong together."""
-    site = OrthoMap.open(inputs.map, surface=inputs.surface, georeference_sigma_m=inputs.map_sigma_m)
+def open_inputs(inputs: Inputs, wanted: Sequence[Settings]) -> Opened:
+    """Read what runs of one flight with the settings that are wanted need.
+
+    Raises:
+        OptionError, TelemetryError, CalibrationError, MapError: something cannot be read, or does not belong
+            together, or is of no use to one of the runs.
+    """
+    site = open_map(inputs.map, inputs.surface, inputs.map_sigma_m)
     camera = inputs.load_camera()
-    flight = open_flight(
-        inputs.frames, inputs.telemetry, clock=inputs.clock or LogClock(), image_topic=inputs.image_topic
-    )
+    flight = inputs.open_flight()
     truth_path = inputs.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
     truth = open_truth(truth_path, stamp_ns) if truth_path is not None else None
-    check_needs(flight, settings.method, settings.profile)
-    check_place("--start", start, site, OptionError)
-    if start is None:
-        first = next((row.prior for row in flight.rows if row.prior is not None), None)
-        check_place(str(inputs.telemetry or inputs.frames), first, site, TelemetryError)
-        check_start(first, site)
+    for settings in wanted:
+        check_needs(flight, settings.method, settings.profile)
+        start = parse_position("--start", settings.start)
+        check_place("--start", start, site, OptionError)
+        if start is None:
+            first = next((row.prior for row in flight.rows if row.prior is not None), None)
+            check_place(str(inputs.telemetry or inputs.frames), first, site, TelemetryError)
+            check_start(first, site)
     check_pictures(flight, camera)
     if flight.unused:
         console.say(f"frames without a row in the telemetry, left out: {flight.unused}")
     if flight.heights:
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
         console.say(f"height above ground, by source, of {len(flight)} frames: {counts}")
-    return _Opened(site, camera, flight, truth_path, truth)
+    return Opened(site, camera, flight, truth_path, truth)
 
 
-def _record(inputs: Inputs, settings: Settings, opened: _Opened, device: str, ground: Ground) -> dict[str, Any]:
+def _record(
+    inputs: Inputs,
+    settings: Settings,
+    opened: Opened,
+    device: str,
+    ground: Ground,
+    attitude: AttitudeCheck | None,
+) -> Record:
     """What a run was made of, for summary.json."""
 
     def absolute(path: Path | None) -> str | None:
         return None if path is None else str(path.resolve())
 
-    return {
-        "map": absolute(inputs.map),
-        "surface": absolute(inputs.surface),
-        "camera": absolute(inputs.camera),
-        "frames": absolute(inputs.frames),
-        "telemetry": absolute(inputs.telemetry),
-        "truth": absolute(opened.truth_path),
-        "heights": dict(opened.flight.heights),
-        "method": settings.method,
-        "profile": settings.profile,
-        "device": device,
-        "start": settings.start,
-        "budget_ms": settings.budget_ms,
-        "changed": changed(settings),
-        "origin": {"lat_deg": opened.site.frame.lat_deg, "lon_deg": opened.site.frame.lon_deg},
-        "ground_m": ground.ground_m,
-        "ground_amsl_m": ground.ground_amsl_m,
-    }
+    return Record(
+        map=str(inputs.map.resolve()),
+        surface=absolute(inputs.surface),
+        camera=absolute(inputs.camera),
+        frames=absolute(inputs.frames),
+        telemetry=absolute(inputs.telemetry),
+        truth=absolute(opened.truth_path),
+        frame_stamps=None if inputs.clock is None else absolute(inputs.clock.stamps),
+        log_offset_s=None if inputs.clock is None else inputs.clock.offset_s,
+        image_topic=inputs.image_topic,
+        map_sigma_m=inputs.map_sigma_m,
+        heights=dict(opened.flight.heights),
+        method=settings.method,
+        profile=settings.profile,
+        device=device,
+        start=settings.start,
+        budget_ms=settings.budget_ms,
+        changed=changed(settings),
+        origin={"lat_deg": opened.site.frame.lat_deg, "lon_deg": opened.site.frame.lon_deg},
+        ground_m=ground.ground_m,
+        ground_amsl_m=ground.ground_amsl_m,
+        attitude=None if attitude is None else asdict(attitude),
+    )
 
 
 def follow(
@@ -317,21 +363,21 @@ def conclude(
     truth: list[Truth] | None,
     site: OrthoMap,
     ground: Ground,
-    record: dict[str, Any],
+    record: Record,
     replay: Replay | None = None,
     *,
     report: bool = True,
 ) -> dict[str, Any]:
     """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones."""
-    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record}
+    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
-        console.say(f"no fix is scored: {record['truth']} says nothing of the times of this flight")
+        console.say(f"no fix is scored: {record.truth} says nothing of the times of this flight")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not report:
         return summary
     for name in FIGURES:
         (out / name).unlink(missing_ok=True)
-    title = f"{record['method']} ({record['profile']} profile)"
+    title = f"{record.method} ({record.profile} profile)"
     draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
     notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
     _write_page(out / PAGE, Flown(rows, truth, site, ground, summary, notes), replay or Replay())
@@ -362,49 +408,52 @@ def run_evaluate(directory: Path, truth_path: Path | None) -> dict[str, Any]:
     rows = read_track(directory / "track.csv")
     record = read_record(directory / "summary.json")
     if truth_path is None:
-        if record["truth"] is None:
+        if record.truth is None:
             raise TelemetryError(f"{directory}: the track was made without truth; name one with --truth")
-        truth_path = Path(record["truth"])
+        truth_path = Path(record.truth)
     truth = open_truth(truth_path, rows[0].timestamp_ns if rows else None)
-    site = OrthoMap.open(record["map"], surface=record["surface"])
-    ground = Ground(record["ground_m"], record["ground_amsl_m"])
+    site = open_map(record.map, record.surface, record.map_sigma_m)
+    ground = Ground(record.ground_m, record.ground_amsl_m)
     replay = _reopened(record, rows, site)
-    return conclude(directory, rows, truth, site, ground, record | {"truth": str(truth_path.resolve())}, replay)
+    record = replace(record, truth=str(truth_path.resolve()))
+    return conclude(directory, rows, truth, site, ground, record, replay)
 
 
-def _reopened(record: dict[str, Any], rows: list[TrackRow], site: OrthoMap) -> Replay:
+def _reopened(record: Record, rows: list[TrackRow], site: OrthoMap) -> Replay:
     """The flight and the matcher of a run that is over, as far as its record and its files still give them."""
     try:
         settings = options_from_mapping(
-            Settings, nested({name: record[name] for name in ("method", "profile")} | record.get("changed", {}))
+            Settings, nested({"method": record.method, "profile": record.profile} | dict(record.changed))
         )
-        telemetry = None if record["telemetry"] is None else Path(record["telemetry"])
-        inputs = Inputs(
-            Path(record["map"]), None, Path(record["camera"]), Path(record["frames"]), telemetry, truth=None
-        )
-        flight = open_flight(inputs.frames, inputs.telemetry)
+        inputs = _recorded(record)
+        flight = inputs.open_flight()
         stamps = [row.timestamp_ns for row in flight.rows]
         told = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
         if (stamps, flight.names) != (told, [row.frame for row in rows]):
             return Replay(why_not="the frames or their telemetry are not those of the run any more.")
         return Replay(flight, _matcher(site, inputs.load_camera(), settings))
-    except KeyError as error:
-        return Replay(why_not=f"the record of the run lacks {error}.")
     except (EngineError, OSError) as error:
         return Replay(why_not=f"{error}.")
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """The settings in a summary.json.
+def _recorded(record: Record) -> Inputs:
+    """The files of a run that is over.
 
     Raises:
-        TelemetryError: the file is missing, or is not one that track wrote.
+        TelemetryError: the record does not name them all.
+        OptionError: what it names does not go together.
     """
-    needed = ("map", "surface", "truth", "method", "profile", "origin", "ground_m", "ground_amsl_m")
-    try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["settings"]
-        return {name: record[name] for name in needed} | record
-    except FileNotFoundError:
-        raise TelemetryError(f"{path}: expected the summary of a finished track, got no such file") from None
-    except (OSError, ValueError, KeyError, TypeError):
-        raise TelemetryError(f"{path}: expected the summary that track writes, got something else") from None
+    if record.camera is None or record.frames is None:
+        raise TelemetryError("the record of the run lacks its camera or its frames")
+    stamps, offset_s = record.frame_stamps, record.log_offset_s
+    told = stamps is not None or offset_s is not None
+    return Inputs(
+        Path(record.map),
+        None,
+        Path(record.camera),
+        Path(record.frames),
+        None if record.telemetry is None else Path(record.telemetry),
+        truth=None,
+        clock=LogClock(None if stamps is None else Path(stamps), offset_s or 0.0) if told else None,
+        image_topic=record.image_topic,
+    )

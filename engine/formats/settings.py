@@ -85,6 +85,8 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
         table = out
         for part in path:
             table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                raise OptionError(f"{name}: expected a setting of its own, but {part} is one")
         table[last] = NONE if value is None else value
     return out
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from engine.errors import TelemetryError
 from engine.geo import wrap_heading_deg
+from engine.motion import WIDEST_M
 from engine.types import Prior
 
 DEFAULT_PRIOR_SIGMA_M = 15.0
@@ -50,6 +51,7 @@ QUARTER_TURN = Bounds(-90.0, 90.0, "degrees from -90 to 90")
 LONGITUDE = Bounds(-180.0, 360.0, "degrees from -180 to 360")
 POSITIVE = Bounds(math.ulp(0.0), math.inf, "a finite number above 0")
 NOT_NEGATIVE = Bounds(0.0, math.inf, "a finite number of 0 or more")
+SIGMA = Bounds(0.0, WIDEST_M, f"a number from 0 to {WIDEST_M:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +280,7 @@ _BOUNDS = {
     "north_velocity_mps": ANY,
     "lat_deg": QUARTER_TURN,
     "lon_deg": LONGITUDE,
-    "sigma_m": NOT_NEGATIVE,
+    "sigma_m": SIGMA,
 }
 _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(("height_agl_m", "alt_amsl_m", "sigma_m"), 3)
 _REQUIRED = ("timestamp_ns", "frame")

@@ -28,9 +28,10 @@ from engine.report.verdict import MEANINGS, metres, verdict_of
 from engine.types import Reason, Truth, Window
 
 _FACTS = {
-    "map": "map", "surface": "surface model", "camera": "camera", "frames": "frames", "telemetry": "telemetry",
-    "truth": "truth", "method": "method", "profile": "profile", "device": "device", "start": "start",
-    "budget_ms": "budget (ms)",
+    "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
+    "frames": "frames", "image_topic": "image topic", "telemetry": "telemetry", "frame_stamps": "frame stamps",
+    "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
+    "device": "device", "start": "start", "budget_ms": "budget (ms)",
 }  # fmt: skip
 
 

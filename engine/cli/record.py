@@ -1,0 +1,141 @@
+"""Records: what a finished track was made of, as its summary.json keeps it for ``evaluate`` and ``export``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from engine.errors import TelemetryError
+
+_TEXTS = ("map", "method", "profile")
+_TEXTS_OR_NONE = (
+    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "device", "start",
+)  # fmt: skip
+_NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "budget_ms", "ground_amsl_m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """The inputs and settings of a run; paths are absolute, and None is what there was not.
+
+    Attributes:
+        map: file or folder.
+        surface: heights.
+        camera: calibration, or a bag that has it.
+        frames: folder, video or bag.
+        telemetry: telemetry.csv or a log.
+        truth: truth.csv or a log.
+        frame_stamps: when the frames were taken, where the telemetry is a log.
+        log_offset_s: added to the frames' own stamps, in the same case.
+        image_topic: of the pictures, where the frames are a bag.
+        map_sigma_m: how well the map lies, where that was told.
+        heights: frames by the source of their height, where the telemetry is a log.
+        method: "ncc", "sift" or "auto".
+        profile: "engine" or "paper".
+        device: where tensors lived.
+        start: where the flight began, as typed.
+        budget_ms: of a frame.
+        changed: settings that are not the defaults, by name.
+        origin: ``lat_deg`` and ``lon_deg`` of the plane of the track.
+        ground_m: height of the ground on the map.
+        ground_amsl_m: the same above the sea, by the telemetry.
+        attitude: what the fixes said of the telemetry's attitude.
+        more: what else stands in the file, by name.
+
+    Raises:
+        TelemetryError: a value is not of its kind.
+    """
+
+    map: str
+    surface: str | None
+    camera: str | None = None
+    frames: str | None = None
+    telemetry: str | None = None
+    truth: str | None
+    frame_stamps: str | None = None
+    log_offset_s: float | None = None
+    image_topic: str | None = None
+    map_sigma_m: float | None = None
+    heights: Mapping[str, int] = field(default_factory=dict)
+    method: str
+    profile: str
+    device: str | None = None
+    start: str | None = None
+    budget_ms: float | None = None
+    changed: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, float]
+    ground_m: float
+    ground_amsl_m: float | None
+    attitude: Mapping[str, Any] | None = None
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._check(_TEXTS, "a text", _is_text)
+        self._check(_TEXTS_OR_NONE, "a text or null", lambda value: value is None or _is_text(value))
+        self._check(("ground_m",), "a number", _is_number)
+        self._check(_NUMBERS_OR_NONE, "a number or null", lambda value: value is None or _is_number(value))
+        self._check(("origin",), "lat_deg and lon_deg on the Earth", _is_place)
+        self._check(("heights",), "counts by source", lambda value: _is_table(value, int))
+        self._check(("changed",), "settings by name", lambda value: _is_table(value, object))
+        self._check(("attitude",), "a table or null", lambda value: value is None or _is_table(value, object))
+
+    def _check(self, names: tuple[str, ...], expected: str, holds: Callable[[object], bool]) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if not holds(value):
+                raise TelemetryError(f"{name}: expected {expected}, got {_shown(value)}")
+
+    def facts(self) -> dict[str, Any]:
+        """The same as JSON holds it."""
+        told = asdict(self)
+        more: dict[str, Any] = told.pop("more")
+        return told | more
+
+
+def read_record(path: Path) -> Record:
+    """The settings in a summary.json.
+
+    Raises:
+        TelemetryError: the file is missing, or is not one that track wrote.
+    """
+    wrong = f"{path}: expected the summary that track writes"
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        known = {each.name for each in fields(Record)} - {"more"}
+        more = {name: value for name, value in told.items() if name not in known}
+        return Record(**{name: value for name, value in told.items() if name in known}, more=more)
+    except FileNotFoundError:
+        raise TelemetryError(f"{path}: expected the summary of a finished track, got no such file") from None
+    except TelemetryError as error:
+        raise TelemetryError(f"{wrong}; settings, {error}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise TelemetryError(f"{wrong}, got something else") from None
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and value != "" and "\0" not in value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_place(value: object) -> bool:
+    if not isinstance(value, Mapping):
+        return False
+    lat_deg: Any = value.get("lat_deg")
+    lon_deg: Any = value.get("lon_deg")
+    return _is_number(lat_deg) and _is_number(lon_deg) and abs(lat_deg) <= 90.0 and abs(lon_deg) <= 360.0
+
+
+def _is_table(value: object, kind: type) -> bool:
+    return isinstance(value, Mapping) and all(isinstance(each, kind) for each in value.values())
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."
