@@ -1,10 +1,10 @@
-# make demo | test | check | package | bench | bench-flights | bench-latency: each sets itself up in .venv and is quick the second time.
+# make demo | test | check | package | extras | bench | bench-flights | bench-latency: each sets itself up in .venv and is quick the second time.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test check package docs bench integrity simulated bench-flights bench-latency clean
+.PHONY: demo test check package extras docs bench integrity simulated bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -39,6 +39,9 @@ package: $(VENV)/dev.stamp
 	$(PYTHON) -m venv build/clean
 	build/clean/bin/pip --disable-pip-version-check install --quiet dist/*.whl
 	cd build && clean/bin/scenematch doctor && clean/bin/scenematch demo --frames 4 --out flown
+
+extras: package
+	.ci/extras
 
 docs: $(VENV)/dev.stamp
 	$(BIN)/python -m mkdocs build --quiet
