@@ -22,20 +22,25 @@ def lower_plane(offsets, heights_m, share, on_plane_m, rounds):
     """
     plane, weights = np.zeros(3), np.ones(len(heights_m))
     for _ in range(rounds):
-        normal, side = np.zeros((3, 3)), np.zeros(3)
+        one = x = y = xx = xy = yy = z = xz = yz = 0.0
         for n in range(len(heights_m)):
-            weight, x, y, z = weights[n], offsets[n, 0], offsets[n, 1], heights_m[n]
-            normal[0, 0] += weight
-            normal[0, 1] += weight * x
-            normal[0, 2] += weight * y
-            normal[1, 1] += weight * x * x
-            normal[1, 2] += weight * x * y
-            normal[2, 2] += weight * y * y
-            side[0] += weight * z
-            side[1] += weight * x * z
-            side[2] += weight * y * z
-        normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
-        plane[:] = np.linalg.solve(normal, side)
+            weight = weights[n]
+            east, north, up = weight * offsets[n, 0], weight * offsets[n, 1], weight * heights_m[n]
+            one += weight
+            x += east
+            y += north
+            z += up
+            xx += east * offsets[n, 0]
+            xy += east * offsets[n, 1]
+            yy += north * offsets[n, 1]
+            xz += east * heights_m[n]
+            yz += north * heights_m[n]
+        # About the means, which leaves two equations; numba's own solver asks for SciPy.
+        xx, xy, yy = xx - x * x / one, xy - x * y / one, yy - y * y / one
+        xz, yz = xz - x * z / one, yz - y * z / one
+        size = xx * yy - xy * xy
+        plane[1], plane[2] = (yy * xz - xy * yz) / size, (xx * yz - xy * xz) / size
+        plane[0] = (z - plane[1] * x - plane[2] * y) / one
         for n in range(len(heights_m)):
             above = heights_m[n] - plane[0] - plane[1] * offsets[n, 0] - plane[2] * offsets[n, 1]
             weights[n] = (share if above > 0.0 else 1.0 - share) / max(abs(above), on_plane_m)
