@@ -161,6 +161,14 @@ def test_a_price_that_is_refused_fades_until_it_is_tried_again(ground, camera, f
     assert isinstance(results[-1], Fix)
 
 
+def test_a_vague_prior_is_no_price_of_a_sharp_one(site, camera, frame, prior):
+    """A window is never larger than the map, whatever the prior says: neither is what it is thought to cost."""
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    for vague in (5.0, 1e6, 5.0, 1e6):
+        matcher.locate(frame, replace(prior, sigma_m=vague))
+    assert isinstance(matcher.locate(frame, prior, Budget(total_ms=60_000.0)), Fix)
+
+
 def test_after_warmup_nothing_is_made_in_flight(ground, site, camera):
     matcher = SceneMatcher(site, camera, "auto", "cpu")
     matcher.warmup()

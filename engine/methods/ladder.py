@@ -150,7 +150,8 @@ def _window_px(query: Query, options: NccOptions) -> dict[int, float]:
         if coarser == 0 or (own + coarser < site.levels and least >= _LEAST_SIDE_PX):
             slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
             width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
-            out[coarser] = width * height
+            rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
+            out[coarser] = min(width, columns) * min(height, rows)
     return out
 
 
