@@ -85,12 +85,15 @@ def fly(flight: Path, port: int, firmware: str, seconds: float | None = None) ->
 
 def off_m(message: Any, motion: Callable[[float], State], pilot: Standin) -> float:
     """How far a fix is from where the vehicle was when its picture was taken."""
-    if message.get_type() == "GLOBAL_POSITION_SENSOR":
-        captured_s = (message.time_usec - message.processing_time) * 1e-6
+    kind = message.get_type()
+    captured_us = message.usec if kind == "VISION_POSITION_ESTIMATE" else message.time_usec
+    if kind == "GLOBAL_POSITION_SENSOR":
+        captured_us -= message.processing_time
+    if kind in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
         east, north = pilot.place.enu_from_geodetic(message.lat * 1e-7, message.lon * 1e-7)[:2]
     else:
-        captured_s, east, north = message.usec * 1e-6, message.y, message.x
-    was = motion(captured_s)
+        east, north = message.y, message.x
+    was = motion(captured_us * 1e-6)
     return math.hypot(east - was.east_m, north - was.north_m)
 
 
