@@ -28,9 +28,7 @@ from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.live import LiveOptions
 from engine.matcher import METHODS, SceneMatcher
-from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
-from engine.types import Prior
 
 if TYPE_CHECKING:
     from engine.adapters.mavlink import Bridge, Status
@@ -150,12 +148,7 @@ def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool,
     matcher = SceneMatcher(site, camera, matching.method, matching.device)
     matcher.warmup()
 
-    with watched_beside(matcher, watching) as watcher:
-
-        def make_navigator(prior: Prior | None) -> Navigator:
-            navigator = Navigator(matcher, prior)
-            return navigator if watcher is None else watcher.follow(navigator)
-
+    with watched_beside(matcher, watching) as (make_navigator, watcher):
         try:
             bridge = Bridge(
                 connection, make_navigator, options, start, matching.live_options(),

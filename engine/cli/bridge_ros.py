@@ -17,8 +17,6 @@ from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError
 from engine.formats.ros_messages import camera_of
 from engine.matcher import SceneMatcher
-from engine.navigator import Navigator
-from engine.types import Prior
 
 _PATIENCE_S = 30.0
 
@@ -63,12 +61,7 @@ def run_bridge_ros(
     )
     matcher.warmup()
 
-    with watched_beside(matcher, watching) as watcher:
-
-        def make_navigator(prior: Prior | None) -> Navigator:
-            navigator = Navigator(matcher, prior)
-            return navigator if watcher is None else watcher.follow(navigator)
-
+    with watched_beside(matcher, watching) as (make_navigator, watcher):
         bridge = RosBridge(node, site, make_navigator, options, start, matching.live_options(), watch=watcher)
         console.say(f"listening to {inputs.topics.image}")
         try:

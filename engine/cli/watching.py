@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from engine.errors import BackendError, OptionError
 from engine.matcher import SceneMatcher
+from engine.navigator import Navigator
+from engine.types import Prior
 
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView, Watcher
@@ -85,15 +88,17 @@ def watched(matcher: SceneMatcher, watching: Watching) -> Iterator[LiveView | No
 
 
 @contextmanager
-def watched_beside(matcher: SceneMatcher, watching: Watching) -> Iterator[Watcher | None]:
-    """The same for a bridge, whose answers do not wait for the view."""
+def watched_beside(
+    matcher: SceneMatcher, watching: Watching
+) -> Iterator[tuple[Callable[[Prior | None], Navigator], Watcher | None]]:
+    """The same for a bridge, whose answers do not wait for the view: what makes its navigators, and the view."""
     if not watching:
-        yield None
+        yield partial(Navigator, matcher), None
         return
     from engine.report.live_view import Watcher, open_live_view
 
     watcher = Watcher(open_live_view(matcher, watching.recording, watching.address))
     try:
-        yield watcher
+        yield lambda prior: watcher.follow(Navigator(matcher, prior)), watcher
     finally:
         watcher.close()
