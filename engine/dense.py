@@ -32,7 +32,6 @@ from engine.errors import ShapeError
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-PARAMETERS = 8
 LEAST_SAMPLES = 60
 _STEPS = 12  # Gauss-Newton steps at most; three or four are usual
 _EDGE_PX = 2.0  # along the picture's edge nothing is sampled

@@ -32,7 +32,6 @@ SIDE_PX = 360
 _MOST_REMARKABLE = 40  # of these wrong ones and refusals, so that ordinary ones stay beside them
 _MOST_BYTES = 32_000  # of one, so that a report of 60 frames stays below 15 MB
 _QUALITIES = (82, 70, 55, 40, 25)
-_ELLIPSE_SIGMAS = 3.0
 _AGREE, _OTHER = (0, 158, 115), (200, 200, 200)
 
 
