@@ -27,11 +27,11 @@ from bench.scores import vintages
 from bench.views import SHARED
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.align import view_of
-from engine.audit import Audit, audit_map, features
+from engine.audit.availability import Audit, audit_map, features
 from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.sim import build_town
-from engine.types import Attitude, Truth, Window
+from engine.values import Attitude, Truth, Window
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

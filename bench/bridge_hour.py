@@ -21,11 +21,11 @@ from bench.bridge_minutes import minutes_real
 from bench.page import machine, paragraph, table
 from bench.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from engine.adapters.links import Connection
-from engine.adapters.mavlink import LEAST_HZ, Bridge
+from engine.adapters.mavlink import MIN_RATE_HZ, Bridge
 from engine.adapters.mavlink_out import Outgoing
 from engine.adapters.vehicle import Origin
 from engine.geo import LocalFrame
-from engine.types import Fix, Frame, NoFix, Reason, Timings, Window
+from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 
 PAGE = Path(__file__).parents[1] / "docs" / "mavlink.md"
 BEGIN, END = "<!-- written by bench.bridge_hour -->", "<!-- end of what bench.bridge_hour writes -->"
@@ -256,7 +256,7 @@ def hour_rows(r: dict[str, Any]) -> list[list[str]]:
         ["position where ArduPilot puts it, off by at most", f"{r['place_off_m'] * 1000:.1f} mm"],
         ["heading of a frame, turning by 20 degrees/s; height: off by at most",
          f"{r['heading_off_deg']:.2f} degrees; {r['height_off_m']:.2f} m"],
-        [f"fewest fixes a second over 5 s (ArduPilot needs {LEAST_HZ:g})", f"{r['least_hz']:.1f}"],
+        [f"fewest fixes a second over 5 s (ArduPilot needs {MIN_RATE_HZ:g})", f"{r['least_hz']:.1f}"],
         ["re-localisations; steps of the reset counter, largest",
          f"{r['resets']}; {r['steps']}, {r['longest_step']}"],
         ["reconnections after a silence, one of them to another port", f"{r['reconnections']}"],

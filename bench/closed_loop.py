@@ -9,7 +9,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from engine.cli.simulate import Loop, Scene, run_closed_loop
+from engine.cli.simulate import LoopSettings, WorldSettings, run_closed_loop
 from engine.device import set_threads
 
 FLIGHTS = (
@@ -46,7 +46,10 @@ def main() -> None:
 
 
 def row(folder: Path, seed: int, minutes: float, condition: str, method: str, fault: str) -> list[str]:
-    scene, loop = Scene(seed=seed, condition=condition), Loop(minutes=minutes, method=method, fault=fault)
+    scene, loop = (
+        WorldSettings(seed=seed, condition=condition),
+        LoopSettings(minutes=minutes, method=method, fault=fault),
+    )
     figures = run_closed_loop(folder, scene, loop, force=True)
     return [
         str(seed),

@@ -1,4 +1,4 @@
-"""Fit the probability that a fix is right: prints the constants of ``engine.evidence``.
+"""Fit the probability that a fix is right: prints the constants of ``engine.confidence``.
 
     python -m bench.confidence [--matches N] [--method NCC|SIFT]
 
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from bench.judged import Bench, Row
 from bench.trials import Trial, ground
+from engine.confidence import PeakModel, PoseModel
 from engine.device import set_threads
-from engine.evidence import Logistic, PoseLogistic
 from engine.methods.sift import SiftOptions
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
-MODELS = {"NCC": Logistic, "SIFT": PoseLogistic}
+MODELS = {"NCC": PeakModel, "SIFT": PoseModel}
 UNTOLD = 0.25  # how often something is left out
 SCALES = (0.5, 0.35, 0.25)  # of the frame, as a budget asks for
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Budget, Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.navigator import BELIEVE_ALL
+from engine.navigator import ACCEPT_ALL
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import plan_flight
 
@@ -202,7 +202,7 @@ def fly(
     each: Callable[[int], None] | None = None,
 ) -> Flown:
     """Follow the course for ``count`` frames; ``each`` is called after each of them, untimed."""
-    options = BELIEVE_ALL if matcher.options.profile == "paper" else None
+    options = ACCEPT_ALL if matcher.options.profile == "paper" else None
     navigator = Navigator(matcher, course.start, Budget(total_ms=budget_ms), options)
     wall, cpu, error, sigmas = np.full((4, count), np.nan)  # written now, so that memory does not grow in flight
     stages, reasons, causes = Counter[str](), Counter[str](), Counter[str]()

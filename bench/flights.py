@@ -31,10 +31,10 @@ from engine.formats.track import TrackRow, track_row
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
 from engine.methods.sift import SiftOptions
-from engine.navigator import BELIEVE_ALL, Matcher
+from engine.navigator import ACCEPT_ALL, Matcher
 from engine.report.metrics import Ground, errors_en_m, summarise
 from engine.sim import plan_flight
-from engine.types import Attitude, Truth
+from engine.values import Attitude, Truth
 
 DOCS = Path(__file__).parents[1] / "docs"
 STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "nust": 2, "caliterra": 1}
@@ -81,7 +81,7 @@ def fly(flight: Recorded, who: str, matcher: Matcher) -> Run:
     """Follow the flight from its true start."""
     first = flight.truth[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-    navigator = Navigator(matcher, start, options=BELIEVE_ALL if who == PAPER else None)
+    navigator = Navigator(matcher, start, options=ACCEPT_ALL if who == PAPER else None)
     results, rows = [], []
     for index, (frame, prior) in enumerate(flight.frames):
         begin = time.perf_counter()

@@ -22,7 +22,7 @@ from bench.log_files import S, dataflash_flight, ulog_flight
 from engine.errors import EngineError
 from engine.formats.export import WRITERS
 from engine.formats.flight import _frame
-from engine.formats.logs import open_log
+from engine.formats.logs.readers import open_log
 from engine.formats.resampling import EPOCH_NS, telemetry_at, truth_of
 from engine.formats.route import read_route
 from engine.formats.telemetry import TelemetryRow, ground_amsl_m, read_telemetry, write_telemetry

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from bench.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.evidence import probability, terms
+from engine.confidence import probability, regressors
 from engine.methods import ncc, sift
-from engine.methods.laid import NccOptions
+from engine.methods.hypothesis import NccOptions
 from engine.methods.query import Query, level_crop
 from engine.methods.sift import SiftOptions
 from engine.ncc_fft import surface
@@ -48,7 +48,7 @@ class Row(NamedTuple):
     fixed: bool
     right: bool
     scores: list[float]  # as SCORES names them; higher speaks for it
-    terms: list[float]
+    regressors: list[float]
     error_m: float
     sigma_m: float
     squared: float  # squared Mahalanobis distance from the truth
@@ -97,7 +97,7 @@ class Bench:
             assert found.evidence is not None  # there is a prior, and a heading and height to trust
             scores = [probability(found.evidence), found.peak.score, _psr(query, matcher, found)]
             scores.append(-found.evidence.ratio)
-            values = terms(found.evidence).tolist()
+            values = regressors(found.evidence).tolist()
             return self.row(made, method, found.fix, isinstance(result, Fix), scores, values)
         if method == "SIFT":
             return self.posed(made, made.frame, made.prior, matcher.options.sift)
@@ -117,7 +117,7 @@ class Bench:
         if isinstance(found, NoFix):
             return self.row(made, "SIFT", None, False, [], [])
         scores = [probability(found.evidence), -found.evidence.log10_nfa, found.fix.score]
-        return self.row(made, "SIFT", found.fix, fixed, scores, terms(found.evidence).tolist())
+        return self.row(made, "SIFT", found.fix, fixed, scores, regressors(found.evidence).tolist())
 
     def row(
         self, made: Trial, method: str, fix: Fix | None, fixed: bool, scores: list[float], values: list[float]

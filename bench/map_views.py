@@ -21,7 +21,7 @@ from engine.formats.telemetry import ground_amsl_m
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
 from engine.methods.query import level_for
-from engine.types import Attitude, Truth, Window
+from engine.values import Attitude, Truth, Window
 
 ALIGNED = 0.75  # least correlation at which a photograph counts as aligned with its map
 _PHOTOGRAPHS = "caliterra"

@@ -18,7 +18,7 @@ from engine.geo import attitude_from_rotation, enu_from_body
 from engine.methods.query import Query, Stopwatch, level_crop, level_for
 from engine.methods.sift import SiftOptions
 from engine.pose import AttitudePrior, PoseStats, solve_pose
-from engine.types import Attitude, Reason, Window
+from engine.values import Attitude, Reason, Window
 
 Image = NDArray[np.float32]
 
@@ -63,7 +63,7 @@ class OpenCvStep:
     """
 
     def __init__(self, site: OrthoMap, camera: Camera, *, prepared: bool, radius_px: int = 8) -> None:
-        from engine.types import Window
+        from engine.values import Window
 
         self._site, self._camera, self._radius_px = site, camera, radius_px
         self._gray = site.gray(Window(0, 0, site.width_px, site.height_px))

@@ -23,7 +23,7 @@ from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.device import set_threads
 from engine.formats.track import track_row
 from engine.report.metrics import Ground, summarise
-from engine.sim import Plan, plan_flight
+from engine.sim import FlightPlan, plan_flight
 
 DOCS = Path(__file__).parents[1] / "docs"
 SEEDS = (1, 2, 31, 32, 71)
@@ -46,7 +46,7 @@ class Run:
     summary: dict[str, Any]
 
 
-def fly(plan: Plan, frames: list[Frame], matcher: SceneMatcher, site: OrthoMap) -> dict[str, Any]:
+def fly(plan: FlightPlan, frames: list[Frame], matcher: SceneMatcher, site: OrthoMap) -> dict[str, Any]:
     """The figures of merit of a flight from the true start."""
     truth = plan.truth_rows()
     start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)

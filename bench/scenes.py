@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.sim import build_town, plan_flight
-from engine.types import Truth
+from engine.values import Truth
 
 Image = NDArray[np.float32]
 

@@ -25,12 +25,12 @@ from engine.budget import Budget, Deadline
 from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
+from engine.indexes.prepared import PreparedMap
 from engine.integrity import judge_peak, score_sigma
-from engine.methods import laid
-from engine.methods.laid import Aligned, NccOptions
+from engine.methods import hypothesis
+from engine.methods.hypothesis import Aligned, NccOptions
 from engine.methods.query import Query, Stopwatch, level_for
 from engine.ncc_fft import match_template, prepare
-from engine.prepared import PreparedMap
 from engine.sim import plan_flight
 
 Gray = NDArray[np.uint8]
@@ -134,11 +134,11 @@ def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDAr
     site, height_m = query.site, query.frame.height_agl_m
     assert height_m is not None
     level = level_for(site.gsd_m_per_px, height_m / query.camera.focal_px, site.levels)
-    aligned = laid.align(query, query.frame, level, options)
+    aligned = hypothesis.align(query, query.frame, level, options)
     if not isinstance(aligned, Aligned):
         return refused
-    window = laid.window_about(query, aligned, options)
-    peak = None if window is None else laid.search(query, prepared, aligned, window, options)
+    window = hypothesis.window_about(query, aligned, options)
+    peak = None if window is None else hypothesis.search(query, prepared, aligned, window, options)
     if peak is None:
         return refused
     pixels = aligned.template.numel()

@@ -25,11 +25,11 @@ from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatc
 from engine.device import set_threads
 from engine.formats.track import track_row
 from engine.geo import LocalFrame
-from engine.navigator import BELIEVE_ALL
+from engine.navigator import ACCEPT_ALL
 from engine.report.metrics import Ground, summarise
-from engine.sim import CONDITIONS, Optics, Plan, build_town, picture_at, plan_flight
+from engine.sim import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
 from engine.sim.render import transformer
-from engine.types import Attitude
+from engine.values import Attitude
 
 DOCS = Path(__file__).parents[1] / "docs"
 SEEDS = (71, 72, 73, 74, 75)
@@ -71,12 +71,12 @@ def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) 
         yield method, profile, matcher
 
 
-def fly(plan: Plan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap) -> Iterator[Run]:
+def fly(plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap) -> Iterator[Run]:
     """The same frames by every matcher, each from the true start."""
     truth, frames = plan.truth_rows(), list(plan.iter_frames())
     start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
     for method, profile, matcher in ready:
-        navigator = Navigator(matcher, start, options=BELIEVE_ALL if profile == "paper" else None)
+        navigator = Navigator(matcher, start, options=ACCEPT_ALL if profile == "paper" else None)
         rows = []
         for index, frame in enumerate(frames):
             begin = time.perf_counter()

@@ -93,7 +93,7 @@ class Growth:
 
     def __init__(self, matcher: SceneMatcher, frames: int) -> None:
         self._matcher = matcher
-        self._work = matcher.one_off_work
+        self._work = matcher.cache_counters
         self._samples = np.full((-(-frames // SAMPLE_EVERY), 3), np.nan)
         self._frames = 0
 
@@ -106,7 +106,7 @@ class Growth:
 
     def row(self) -> Row:
         """What grew, from the first sample to the last."""
-        work, samples = self._matcher.one_off_work, self._samples
+        work, samples = self._matcher.cache_counters, self._samples
         return {
             "frames": self._frames,
             "rss_mb": samples[:, 0].tolist(),

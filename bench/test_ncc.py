@@ -14,7 +14,7 @@ from bench.conftest import peak_memory_mb
 from bench.scenes import flight, pair
 from engine import Fix, MatcherOptions, SceneMatcher, ncc_fft
 from engine.kernels import reference  # the float64 truth that errors are counted from
-from engine.methods.laid import NccOptions
+from engine.methods.hypothesis import NccOptions
 
 SIZES = [
     (96, 64),
@@ -133,7 +133,7 @@ def test_bank(benchmark: Any, peer: str, threads: int) -> None:
     from dataclasses import replace
 
     from engine.align import enhance, rectify, view_of
-    from engine.types import Attitude, Window
+    from engine.values import Attitude, Window
 
     scene = flight()
     frame, truth, site = scene.frames[5], scene.truth[5], scene.site

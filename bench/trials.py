@@ -20,7 +20,7 @@ from engine import Camera, Fix, Frame, OrthoMap, Prior
 from engine.formats.truth import interpolate_truth
 from engine.geo import enu_from_body
 from engine.sim import plan_flight
-from engine.types import Window
+from engine.values import Window
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -17,7 +17,7 @@ from engine.errors import (
 from engine.matcher import MatcherOptions, SceneMatcher
 from engine.navigator import Navigator, NavigatorOptions, NavigatorState
 from engine.orthomap import OrthoMap
-from engine.types import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
+from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 __all__ = [
     "Attitude",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import enu_from_body
-from engine.types import Attitude, Frame
+from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -136,7 +136,7 @@ def _masked(picture: Image, weight: Image | None) -> Image:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class GroundView:
     """How a plane under the camera is seen, in map pixels about the nadir.
 
     Attributes:
@@ -154,7 +154,7 @@ class View:
 
 def view_of(
     camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array, slope_m_per_px: Array | None = None
-) -> View | None:
+) -> GroundView | None:
     """The camera's view of ground ``height_m`` below it, level or leaning.
 
     Equation 2 (scale) and equation 3 (rotation) are the special case of a level camera: the homography holds
@@ -169,8 +169,8 @@ def view_of(
         slope_m_per_px: (2,) rise of the plane per map pixel x and y; None is level.
 
     Returns:
-        View | None: None where a corner of the frame looks too near the horizon, see :data:`MAX_RAY_DEG`, or along
-        the plane.
+        GroundView | None: None where a corner of the frame looks too near the horizon, see :data:`MAX_RAY_DEG`,
+        or along the plane.
     """
     enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
     rays = camera.frame_rays @ enu_from_camera.T
@@ -186,7 +186,7 @@ def view_of(
     extent = np.ptp(ground_px[:4], axis=0)
     plane = np.zeros((3, 3))  # map pixels about the nadir to east, north, up of the ground below the camera
     plane[:2, :2], plane[2, :2], plane[2, 2] = enu_jacobian, slope, -height_m
-    return View(
+    return GroundView(
         camera.matrix @ enu_from_camera.T @ plane,
         ground_px[4],
         (float(extent[0]), float(extent[1])),
@@ -202,7 +202,7 @@ class Patch:
     offset_px: Array
 
 
-def rectify(gray: NDArray[np.uint8], camera: Camera, view: View, *, fraction: float = 0.7) -> Patch | None:
+def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView, *, fraction: float = 0.7) -> Patch | None:
     """Draw the frame in the map's pixels, and keep the largest upright rectangle that it fills.
 
     Args:
@@ -251,7 +251,7 @@ def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Ar
     return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), np.uint8), homography
 
 
-def _inscribed_size(view: View, shape: tuple[int, ...], fraction: float) -> tuple[int, int] | None:
+def _inscribed_size(view: GroundView, shape: tuple[int, ...], fraction: float) -> tuple[int, int] | None:
     """Width and height of the largest upright rectangle about the view's centre inside the frame."""
     side = fraction * math.sqrt(view.area_px)
     limit = np.array([shape[1] - 1, shape[0] - 1])

@@ -32,7 +32,7 @@ from engine.errors import ShapeError
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-LEAST_SAMPLES = 60
+MIN_SAMPLES = 60
 _STEPS = 12  # Gauss-Newton steps at most; three or four are usual
 _EDGE_PX = 2.0  # along the picture's edge nothing is sampled
 # What the samples pull is summed over so many cells of the picture, squared: how the sums scatter says how far
@@ -81,7 +81,7 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class GaussianPrior:
     """What is known before the pictures are compared.
 
     Attributes:
@@ -94,7 +94,7 @@ class Belief:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class EnhancedFrame:
     """What the camera saw: (H, W) grey levels, enhanced as the map is, and the (3, 3) pinhole that they obey."""
 
     levels: Image
@@ -102,7 +102,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class _Projection:
     """All samples as a pose sees them.
 
     Attributes:
@@ -153,10 +153,10 @@ class DenseFit:
     pose: Pose
     correlation: float
     settled: bool
-    look: _Look
+    look: _Projection
 
 
-def correlation_at(picture: Picture, samples: Samples, pose: Pose) -> float:
+def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> float:
     """Weighted correlation of picture and map at the samples that a pose sees; 0 where it sees too few.
 
     The pose is taken as it is, on ground without a further slope.
@@ -167,7 +167,7 @@ def correlation_at(picture: Picture, samples: Samples, pose: Pose) -> float:
 
 
 def refine(
-    picture: Picture, samples: Samples, start: Pose, belief: Belief, *, last_step_sigmas: float = 0.2
+    picture: EnhancedFrame, samples: Samples, start: Pose, belief: GaussianPrior, *, last_step_sigmas: float = 0.2
 ) -> DenseFit | None:
     """Gauss-Newton from a start whose picture is a few pixels off at most.
 
@@ -196,7 +196,7 @@ def refine(
     return None
 
 
-def covariance_of(fit: DenseFit, belief: Belief) -> Array | None:
+def covariance_of(fit: DenseFit, belief: GaussianPrior) -> Array | None:
     """(8, 8) of a refined pose, or None where picture and map leave it undetermined.
 
     The scatter of what the samples pull, over the squared pull of what both pictures show. Parts of the picture
@@ -225,7 +225,7 @@ def covariance_of(fit: DenseFit, belief: Belief) -> Array | None:
     return _inverse(information * (share / (_EXCESS * scatter)) + belief.precision)
 
 
-def _step(look: _Look, pose: Pose, belief: Belief) -> tuple[Array, float] | None:
+def _step(look: _Projection, pose: Pose, belief: GaussianPrior) -> tuple[Array, float] | None:
     """The Gauss-Newton step (8,), and in standard deviations, squared."""
     # The mean of both gradients finds its way from farther than that of the picture alone.
     derivatives = look.derivatives(0.5 * (look.shown + look.expected))
@@ -254,7 +254,9 @@ def _away(pose: Pose, other: Pose) -> Array:
     return np.concatenate([pose.center_m - other.center_m, turn, pose.slope - other.slope])
 
 
-def _look(picture: Picture, samples: Samples, offset_m: Array, pose: Pose, pivot: Pose) -> _Look | None:
+def _look(
+    picture: EnhancedFrame, samples: Samples, offset_m: Array, pose: Pose, pivot: Pose
+) -> _Projection | None:
     """Project the samples, which lie (3, N) metres from the slope's pivot, and compare what is seen there."""
     from engine.kernels import dense_loops  # numba takes a while to import
 
@@ -263,8 +265,8 @@ def _look(picture: Picture, samples: Samples, offset_m: Array, pose: Pose, pivot
         picture.levels, picture.matrix, rotation, pose.center_m, pose.slope,
         offset_m, pivot.center_m, samples.gradients, samples.weights, _EDGE_PX, _CELLS,
     )  # fmt: skip
-    if count < LEAST_SAMPLES:
+    if count < MIN_SAMPLES:
         return None
     differences, weights, correlation, gain = dense_loops.compare(levels, samples.values, weights)
     expected *= gain
-    return _Look(differences, places, offset_m[:2], rotation, shown, expected, weights, cells, correlation)
+    return _Projection(differences, places, offset_m[:2], rotation, shown, expected, weights, cells, correlation)

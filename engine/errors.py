@@ -14,7 +14,7 @@
     └── BackendError                    a fast path that could not do its work
 
 A message is one line and names the argument, what was expected and what came.
-A frame that cannot be matched is no error: it is the value :class:`engine.types.NoFix`.
+A frame that cannot be matched is no error: it is the value :class:`engine.values.NoFix`.
 """
 
 

@@ -2,8 +2,8 @@
 
 The detector is Lowe's: extrema of differences of Gaussians over position and scale, refined by a quadratic.
 The descriptor is Lowe's 4 x 4 cells of 8 orientations. Where the usual loops run over levels and keypoints, the
-work here is a fixed number of tensor ops, in three steps: :mod:`engine.scalespace`, :mod:`engine.keypoints`,
-:mod:`engine.descriptors`.
+work here is a fixed number of tensor ops, in three steps: :mod:`engine.sift.scale_space`,
+:mod:`engine.sift.keypoints`, :mod:`engine.sift.descriptors`.
 
 Convention:
     Points are (x, y) with pixel centres at integers and the origin at the centre of the top-left pixel.
@@ -23,11 +23,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from engine.descriptors import describe, dominant_angle
 from engine.device import in_parallel
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.keypoints import Points, allowed, detect, rank, strongest
-from engine.scalespace import make_plan
+from engine.sift.descriptors import describe, dominant_angle
+from engine.sift.keypoints import Points, allowed, detect, rank, strongest
+from engine.sift.scale_space import make_plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def sift(
     return done[0] if len(done) == 1 else Features(*(torch.cat(f) for f in zip(*map(_fields, done), strict=True)))
 
 
-def plans_made() -> int:
+def plans_created() -> int:
     """How many sizes of image were planned for so far; a flight of one camera needs a few."""
     return make_plan.cache_info().misses
 

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
+from engine.confidence import PeakFeatures, PoseFeatures, probability
 from engine.errors import OptionError
-from engine.evidence import Evidence, PoseEvidence, probability
 from engine.geo import transport_covariance
-from engine.motion import WIDEST_M
 from engine.orthomap import OrthoMap
-from engine.types import Frame, Peak, Reason, check_positive
+from engine.values import MAX_SIGMA_M, Frame, Peak, Reason, check_positive
 
 Array = NDArray[np.float64]
 
-SAME_PLACE = 13.8
+CONSISTENT_CHI_SQUARE = 13.8
 """Chi-square of two places, by the errors of both, that chance exceeds once in a thousand."""
 
 
@@ -35,7 +34,7 @@ class AssumedErrors:
         heading_deg: of the heading.
         tilt_deg: of roll and of pitch, where the frame came with them.
         unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
-        map_m: of the map's georeference, per axis, where the map does not say it (:func:`told_by_map`).
+        map_m: of the map's georeference, per axis, where the map does not say it (:func:`with_map_accuracy`).
         surface_slope_deg: of the ground under one frame, where a surface model gives its height and does not say.
         unknown_slope_deg: the same where flat ground is assumed.
     """
@@ -52,8 +51,8 @@ class AssumedErrors:
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
         for name in self.__dataclass_fields__:
-            if getattr(self, name) > WIDEST_M:
-                raise OptionError(f"{name}: expected at most {WIDEST_M:g}, got {getattr(self, name):g}")
+            if getattr(self, name) > MAX_SIGMA_M:
+                raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
 
     def height_sigma_m(self, height_m: float) -> float:
         """Of a height."""
@@ -65,7 +64,7 @@ class AssumedErrors:
         return (unknown if frame.roll_deg is None else told, unknown if frame.pitch_deg is None else told)
 
 
-def told_by_map(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
+def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
     """The errors with what the map says of itself in place of what is assumed of any map."""
     return replace(
         errors,
@@ -105,7 +104,7 @@ class PeakRule:
         min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
             another town, turned until they fit, look like these.
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
-        min_confidence: probability of :func:`engine.evidence.probability` below which a peak is not believed.
+        min_confidence: probability of :func:`engine.confidence.probability` below which a peak is not believed.
         sure: above this the peak is not compared with the patch upside down; 1 always compares.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
@@ -156,23 +155,23 @@ def judge_peak(
     return None
 
 
-def judge_evidence(evidence: Evidence | PoseEvidence, min_confidence: float) -> tuple[Reason, str] | None:
+def judge_confidence(evidence: PeakFeatures | PoseFeatures, min_confidence: float) -> tuple[Reason, str] | None:
     """The reason to refuse a peak or a pose that is not probable enough, with its figures; None if it is believed.
 
     Args:
         evidence: of either.
-        min_confidence: probability of :func:`engine.evidence.probability` that is asked for.
+        min_confidence: probability of :func:`engine.confidence.probability` that is asked for.
     """
     confidence = probability(evidence)
     if confidence >= min_confidence:
         return None
-    if isinstance(evidence, PoseEvidence):
-        reason, off_prior = Reason.BAD_POSE, evidence.off_prior
+    if isinstance(evidence, PoseFeatures):
+        reason, prior_chi_square = Reason.BAD_POSE, evidence.prior_chi_square
         figures = f"log10 of false alarms {evidence.log10_nfa:.1f}"
     else:
-        reason, off_prior = Reason.AMBIGUOUS, evidence.expected.off_prior
+        reason, prior_chi_square = Reason.AMBIGUOUS, evidence.expected.prior_chi_square
         figures = f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}"
-    off = "unknown" if off_prior is None else f"{off_prior:.1f}"
+    off = "unknown" if prior_chi_square is None else f"{prior_chi_square:.1f}"
     asked = f"{min_confidence:g} is asked for ({figures}, chi-square {off} from the prior)"
     return reason, f"right with a probability of {confidence:.3f}, {asked}"
 
@@ -193,7 +192,9 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
     return np.asarray((vectors * variances) @ vectors.T, dtype=np.float64)
 
 
-def pull_px2(peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors) -> Array:
+def misalignment_covariance_px2(
+    peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors
+) -> Array:
     """(2, 2) covariance, in square pixels, of a peak whose patch is turned or scaled against the map.
 
     An error of heading or height moves every part of the patch by an amount of its own. Where the parts stay

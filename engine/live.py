@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from engine.budget import Budget
 from engine.errors import EngineError, OptionError, StateError
 from engine.navigator import Navigator
-from engine.types import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
+from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
 
 _log = logging.getLogger("scenematch")
 
 _LEAVE_S = 5.0  # that closing waits for workers that were given up; one that hangs for good is left behind
-_LONGEST_MS = 60_000.0  # that anything may be waited for in flight
+_MAX_MS = 60_000.0  # that anything may be waited for in flight
 _MAX_DOUBLINGS = 10  # of the patience with one maker of navigators after the other
 
 
@@ -43,8 +43,8 @@ class LiveOptions:
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
         for name in ("deadline_ms", "patience_ms"):
-            if getattr(self, name) > _LONGEST_MS:
-                raise OptionError(f"{name}: expected at most {_LONGEST_MS:g}, got {getattr(self, name):g}")
+            if getattr(self, name) > _MAX_MS:
+                raise OptionError(f"{name}: expected at most {_MAX_MS:g}, got {getattr(self, name):g}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,23 +12,22 @@ from engine import device as devices
 from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
-from engine.costs import Costs
 from engine.errors import OptionError
-from engine.features import plans_made
+from engine.features import plans_created
 from engine.geo import wrap_heading_deg
-from engine.integrity import told_by_map
+from engine.indexes.landmarks import LandmarkMap
+from engine.indexes.prepared import PreparedMap
+from engine.indexes.samples import SampleMap
+from engine.integrity import with_map_accuracy
 from engine.kernels import loops_compiled
-from engine.landmarks import LandmarkMap
-from engine.methods import explained, ladder, paper
-from engine.methods.explained import Explanation
-from engine.methods.laid import NccOptions
+from engine.methods import explanation, paper, scheduler
+from engine.methods.costs import Costs
+from engine.methods.explanation import Explanation
+from engine.methods.hypothesis import NccOptions
 from engine.methods.query import Query, Stopwatch, level_crop, level_for
-from engine.methods.samples import SampleMap
 from engine.methods.sift import SiftOptions
-from engine.motion import WIDEST_M
 from engine.orthomap import OrthoMap
-from engine.prepared import PreparedMap
-from engine.types import Fix, Frame, NoFix, Prior, Reason, Window
+from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 
 METHODS = ("ncc", "sift", "auto")
 PROFILES = ("engine", "paper")
@@ -56,22 +55,22 @@ class MatcherOptions:
             raise OptionError(f"profile: expected one of {', '.join(PROFILES)}, got {self.profile!r}")
 
 
-def _told_by_map(site: OrthoMap, options: MatcherOptions) -> MatcherOptions:
+def _with_map_accuracy(site: OrthoMap, options: MatcherOptions) -> MatcherOptions:
     ncc, sift = options.ncc, options.sift
     return replace(
         options,
-        ncc=replace(ncc, errors=told_by_map(site, ncc.errors)),
-        sift=replace(sift, errors=told_by_map(site, sift.errors)),
+        ncc=replace(ncc, errors=with_map_accuracy(site, ncc.errors)),
+        sift=replace(sift, errors=with_map_accuracy(site, sift.errors)),
     )
 
 
 def _bounded(prior: Prior) -> Prior:
     """The prior no vaguer, and moved no farther, than any map is wide."""
     moved = (prior.moved_east_m, prior.moved_north_m)
-    if prior.sigma_m <= WIDEST_M and max(map(abs, moved)) <= WIDEST_M:
+    if prior.sigma_m <= MAX_SIGMA_M and max(map(abs, moved)) <= MAX_SIGMA_M:
         return prior
-    east, north = (min(max(v, -WIDEST_M), WIDEST_M) for v in moved)
-    return replace(prior, sigma_m=min(prior.sigma_m, WIDEST_M), moved_east_m=east, moved_north_m=north)
+    east, north = (min(max(v, -MAX_SIGMA_M), MAX_SIGMA_M) for v in moved)
+    return replace(prior, sigma_m=min(prior.sigma_m, MAX_SIGMA_M), moved_east_m=east, moved_north_m=north)
 
 
 class SceneMatcher:
@@ -100,7 +99,7 @@ class SceneMatcher:
     ) -> None:
         if method not in METHODS:
             raise OptionError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
-        self.options = _told_by_map(site, options or MatcherOptions())
+        self.options = _with_map_accuracy(site, options or MatcherOptions())
         if self.options.profile == "paper" and method == "auto":
             raise OptionError("method: the paper's profile has ncc and sift, got 'auto'")
         self.site = site
@@ -110,7 +109,7 @@ class SceneMatcher:
         self._prepared = PreparedMap(site, self.device, self.options.ncc.enhance_radius_px, self.options.ncc.score)
         self._landmarks = LandmarkMap(site, self.device)
         self._samples = SampleMap(site, self._prepared)
-        self._tools = ladder.Tools(
+        self._tools = scheduler.Tools(
             self._prepared, self._landmarks, self._samples, self.options.ncc, self.options.sift
         )
         self._costs = Costs()
@@ -120,8 +119,8 @@ class SceneMatcher:
     def warmup(self) -> None:
         """Do before take-off what is done once: find the map's features, compile, plan, and learn what rungs cost.
 
-        Features are found on every level that is small enough (:data:`engine.landmarks.PREPARED_PX`); those of a
-        map that comes from a file are kept for the next start. The frames that are matched are the map's own.
+        Features are found on every level of at most :data:`engine.indexes.landmarks.PREPARED_PX` pixels; those of
+        a map that comes from a file are kept for the next start. The frames that are matched are the map's own.
         """
         features = self.options.sift.map_features == "prepared" and self.options.sift.matcher is None
         if features and self.method != "ncc" and self.options.profile == "engine":
@@ -133,7 +132,9 @@ class SceneMatcher:
                 for _ in range(_WARM_ROUNDS if warm else 1):
                     self.locate(frame, prior)
                     if self.options.profile == "engine":
-                        ladder.every_rung(self._query(frame, prior, Deadline(Budget())), self._tools, self.method)
+                        scheduler.every_rung(
+                            self._query(frame, prior, Deadline(Budget())), self._tools, self.method
+                        )
             if self.options.profile == "engine" and self.site.is_searchable:
                 self.locate(frame)  # the search of the whole map
 
@@ -155,13 +156,13 @@ class SceneMatcher:
         return Frame(np.asarray(image, np.uint8), 0, height_m, 0.0, 0.0, 0.0), prior
 
     @property
-    def one_off_work(self) -> dict[str, int]:
+    def cache_counters(self) -> dict[str, int]:
         """Counts of what is made once and kept; after :meth:`warmup` none should rise while the map is small."""
         return {
-            "map regions": self._prepared.made,
-            "landmark tiles": self._landmarks.made,
-            "sampled cells": self._samples.made,
-            "feature plans": plans_made(),
+            "map regions": self._prepared.created,
+            "landmark tiles": self._landmarks.created,
+            "sampled cells": self._samples.created,
+            "feature plans": plans_created(),
             "compiled loops": loops_compiled(),
         }
 
@@ -205,10 +206,10 @@ class SceneMatcher:
         query = self._query(frame, prior, Deadline(Budget()))
         method = method or self.method
         if self.options.profile == "paper":
-            return explained.by_paper(query, method, window)
+            return explanation.by_paper(query, method, window)
         if method == "sift":
-            return explained.by_sift(query, self._landmarks, window, self.options.sift)
-        return explained.by_ncc(query, self._prepared, window, self.options.ncc)
+            return explanation.by_sift(query, self._landmarks, window, self.options.sift)
+        return explanation.by_ncc(query, self._prepared, window, self.options.ncc)
 
     def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
         watch = Stopwatch(deadline, self.device, self._costs)
@@ -239,7 +240,7 @@ class SceneMatcher:
         if self.options.profile == "paper":
             return paper.locate(query, self.method)
         if self.method == "ncc":
-            return ladder.by_ncc(query, self._tools)
+            return scheduler.by_ncc(query, self._tools)
         if self.method == "sift":
-            return ladder.by_sift(query, self._tools)
-        return ladder.by_both(query, self._tools)
+            return scheduler.by_sift(query, self._tools)
+        return scheduler.by_both(query, self._tools)

@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.geo import chi_square
-from engine.types import Fix, Frame, Prior
+from engine.values import MAX_SIGMA_M, Fix, Frame, Prior
 
 Array = NDArray[np.float64]
 
-WIDEST_M = 1e6
-"""Uncertainty beyond which no map goes."""
-
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class OdometrySample:
     """A moment on the way.
 
     Attributes:
@@ -35,14 +32,14 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Velocity:
+class VelocityEstimate:
     """A velocity (2,) east and north, and one standard deviation of each of the two."""
 
     mps: Array
     sigma_mps: float
 
 
-class Way:
+class DeadReckoning:
     """When the frames were taken, and the way flown meanwhile.
 
     Args:
@@ -52,13 +49,13 @@ class Way:
 
     def __init__(self, late_s: float, default_interval_s: float) -> None:
         self._late_s, self._default_interval_s = late_s, default_interval_s
-        self._moments: deque[Moment] = deque()  # of the last late_s
+        self._moments: deque[OdometrySample] = deque()  # of the last late_s
         self._stamps: deque[int] = deque()  # of the same
         self._newest_ns: int | None = None
         self._measured: Array | None = None  # velocity of the newest frame, where it had one
 
     @property
-    def last(self) -> Moment | None:
+    def last(self) -> OdometrySample | None:
         """The moment of the newest frame, or None before the first."""
         return self._moments[-1] if self._moments else None
 
@@ -80,7 +77,7 @@ class Way:
             )
         return True
 
-    def moment(self, frame: Frame, velocity: Velocity | None) -> Moment:
+    def moment(self, frame: Frame, velocity: VelocityEstimate | None) -> OdometrySample:
         """Where on the way a frame was taken; the way is left as it is.
 
         Args:
@@ -89,7 +86,7 @@ class Way:
         """
         last = self.last
         if last is None:
-            return Moment(0.0, np.zeros(2), 0.0)
+            return OdometrySample(0.0, np.zeros(2), 0.0)
         interval_s = self._default_interval_s
         if frame.timestamp_ns is not None and self._newest_ns is not None:
             interval_s = (frame.timestamp_ns - self._newest_ns) * 1e-9
@@ -98,11 +95,11 @@ class Way:
         measured = _velocity_of(frame)
         if measured is not None:
             mean = measured if self._measured is None else 0.5 * (measured + self._measured)
-            return Moment(last.time_s + interval_s, last.moved_m + mean * interval_s, last.blind_s)
+            return OdometrySample(last.time_s + interval_s, last.moved_m + mean * interval_s, last.blind_s)
         step = np.zeros(2) if velocity is None else velocity.mps * interval_s
-        return Moment(last.time_s + interval_s, last.moved_m + step, last.blind_s + interval_s)
+        return OdometrySample(last.time_s + interval_s, last.moved_m + step, last.blind_s + interval_s)
 
-    def note(self, frame: Frame, moment: Moment) -> None:
+    def note(self, frame: Frame, moment: OdometrySample) -> None:
         """Take in a frame that was matched."""
         stamp, newest = frame.timestamp_ns, self._newest_ns
         if stamp is not None:
@@ -116,16 +113,16 @@ class Way:
         while len(self._moments) > 2 and self._moments[1].time_s < moment.time_s - self._late_s:
             self._moments.popleft()
 
-    def _between(self, time_s: float) -> Moment:
+    def _between(self, time_s: float) -> OdometrySample:
         """A moment between two frames; the first of all before them."""
         times = [moment.time_s for moment in self._moments]
         rows = np.array([(*moment.moved_m, moment.blind_s) for moment in self._moments])
         east, north, blind = (float(np.interp(time_s, times, column)) for column in rows.T)
-        return Moment(time_s, np.array([east, north]), blind)
+        return OdometrySample(time_s, np.array([east, north]), blind)
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class DriftModel:
     """How fast dead reckoning is led astray.
 
     Attributes:
@@ -139,7 +136,9 @@ class Drift:
     acceleration_mps2: float
     max_speed_mps: float
 
-    def sigma_m(self, start: Moment, end: Moment, velocity: Velocity | None = None) -> float:
+    def sigma_m(
+        self, start: OdometrySample, end: OdometrySample, velocity: VelocityEstimate | None = None
+    ) -> float:
         """One standard deviation, per axis, of the way between two moments.
 
         Args:
@@ -155,7 +154,7 @@ class Drift:
             blind_m = min(velocity.sigma_mps * blind_s + changed_m, 2.0 * blind_m)
         return self.measured_sigma_mps * measured_s + blind_m
 
-    def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> Velocity:
+    def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate:
         """The velocity at the later of two fixes.
 
         Args:
@@ -164,11 +163,11 @@ class Drift:
             interval_s: between them.
         """
         changed_mps = self.acceleration_mps2 * math.sqrt(interval_s / 3.0)
-        return Velocity(apart_m / interval_s, sigma_m / interval_s + changed_mps)
+        return VelocityEstimate(apart_m / interval_s, sigma_m / interval_s + changed_mps)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PositionEstimate:
     """Where the vehicle should be: (2,) east and north, and one standard deviation of each."""
 
     en_m: Array
@@ -182,7 +181,7 @@ class Place:
         """The same as a matcher is told it, ``widened`` times as uncertain; no wider than any map."""
         east, north = (float(v) for v in self.en_m)
         moved_east, moved_north = (0.0, 0.0) if moved_m is None else (float(v) for v in moved_m)
-        sigma_m = min(self.sigma_m * widened, WIDEST_M)
+        sigma_m = min(self.sigma_m * widened, MAX_SIGMA_M)
         return Prior(
             east_m=east, north_m=north, sigma_m=sigma_m, moved_east_m=moved_east, moved_north_m=moved_north
         )
@@ -193,7 +192,7 @@ def en_m(fix: Fix) -> Array:
     return np.array([fix.east_m, fix.north_m])
 
 
-def is_sound(fix: Fix) -> bool:
+def is_valid_fix(fix: Fix) -> bool:
     """Whether the place is finite and the covariance positive definite."""
     finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
     return finite and bool(np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0)

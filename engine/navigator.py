@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 
 from engine.budget import Budget
 from engine.errors import OptionError
-from engine.motion import WIDEST_M, Drift, Moment, Place, Velocity, Way, en_m, is_sound
+from engine.motion import (
+    DeadReckoning,
+    DriftModel,
+    OdometrySample,
+    PositionEstimate,
+    VelocityEstimate,
+    en_m,
+    is_valid_fix,
+)
 from engine.orthomap import OrthoMap
-from engine.types import Fix, Frame, NoFix, Prior, Reason, check_positive
+from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, check_positive
 
 Array = NDArray[np.float64]
 
@@ -89,7 +97,7 @@ class NavigatorOptions:
             raise OptionError(f"growth: expected 1 or more, got {self.growth}")
 
 
-BELIEVE_ALL = NavigatorOptions(gate=1e12, confirm=1)
+ACCEPT_ALL = NavigatorOptions(gate=1e12, confirm=1)
 """Every match is handed out, as the paper's recipe does: the baseline."""
 
 
@@ -104,18 +112,18 @@ class _Anchor:
         support: fixes that agreed one after the other up to this one.
     """
 
-    place: Place
-    moment: Moment | None
+    place: PositionEstimate
+    moment: OdometrySample | None
     fix: Fix | None = None
     support: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class _Held:
+class _PendingFix:
     """The last of some fixes that agree with each other and are not believed yet."""
 
     fix: Fix
-    moment: Moment
+    moment: OdometrySample
     count: int
 
 
@@ -141,12 +149,12 @@ class Navigator:
         self._matcher = matcher
         self._budget = budget
         self._options = o = options or NavigatorOptions()
-        self._drift = Drift(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
-        self._way = Way(o.late_s, o.default_interval_s)
-        self._velocity: Velocity | None = None  # by the last fixes
+        self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
+        self._way = DeadReckoning(o.late_s, o.default_interval_s)
+        self._velocity: VelocityEstimate | None = None  # by the last fixes
         self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
         self._anchor = None if start is None else _Anchor(self._place(start), None)
-        self._held: _Held | None = None
+        self._held: _PendingFix | None = None
         self._refusals = 0  # in a row
         self._frames_lost = 0
         self._fixed = self._lost = False  # whether the newest frame was; whether the flight is
@@ -229,20 +237,20 @@ class Navigator:
 
     # ------------------------------------------------------------------------------------------ predictions
 
-    def _reckoned(self, now: Moment, anchor: _Anchor | None = None) -> Place | None:
+    def _reckoned(self, now: OdometrySample, anchor: _Anchor | None = None) -> PositionEstimate | None:
         """Dead reckoning from an anchor, or from the last one."""
         anchor = anchor or self._anchor
         if anchor is None or anchor.moment is None:
             return None if anchor is None else anchor.place
         drift_m = self._drift.sigma_m(anchor.moment, now, self._velocity)
-        sigma_m = min(math.hypot(anchor.place.sigma_m, drift_m), WIDEST_M)
-        return Place(anchor.place.en_m + now.moved_m - anchor.moment.moved_m, sigma_m)
+        sigma_m = min(math.hypot(anchor.place.sigma_m, drift_m), MAX_SIGMA_M)
+        return PositionEstimate(anchor.place.en_m + now.moved_m - anchor.moment.moved_m, sigma_m)
 
-    def _asked(self, now: Moment, *, late: bool) -> Prior | None:
+    def _asked(self, now: OdometrySample, *, late: bool) -> Prior | None:
         """What the matcher is told; None to search the whole map."""
         place, options = self._reckoned(now), self._options
         if self._lost or place is None:
-            held = self._held_place(now)
+            held = self._pending_position(now)
             if held is not None:
                 return held.prior()
             vague = place is None or place.sigma_m > options.lost_sigma_m
@@ -253,7 +261,7 @@ class Navigator:
         last = self._way.last
         return place.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
 
-    def _held_place(self, now: Moment) -> Place | None:
+    def _pending_position(self, now: OdometrySample) -> PositionEstimate | None:
         """Where a fix that is not believed yet would lead, or None where that says little."""
         held = self._held
         if held is None:
@@ -261,15 +269,15 @@ class Navigator:
         sigma_m = math.hypot(held.fix.sigma_m, self._drift.sigma_m(held.moment, now))
         if sigma_m > self._options.trusted_sigma_m:
             return None
-        return Place(en_m(held.fix) + now.moved_m - held.moment.moved_m, sigma_m)
+        return PositionEstimate(en_m(held.fix) + now.moved_m - held.moment.moved_m, sigma_m)
 
-    def _place(self, prior: Prior) -> Place:
+    def _place(self, prior: Prior) -> PositionEstimate:
         if prior.east_m is not None and prior.north_m is not None:
-            return Place(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
+            return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
         assert prior.lat_deg is not None  # a Prior has one of the two
         assert prior.lon_deg is not None
         place = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
-        return Place(np.asarray(place[:2], np.float64), prior.sigma_m)
+        return PositionEstimate(np.asarray(place[:2], np.float64), prior.sigma_m)
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
@@ -282,9 +290,9 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- beliefs
 
-    def _judge(self, fix: Fix, now: Moment, given: Place | None, *, late: bool) -> Fix | NoFix:
+    def _judge(self, fix: Fix, now: OdometrySample, given: PositionEstimate | None, *, late: bool) -> Fix | NoFix:
         """The fix where it is believed; else it is held, and refused for now."""
-        if not is_sound(fix):
+        if not is_valid_fix(fix):
             return _refusal(fix, Reason.BAD_POSE, "the covariance of the match is not positive definite")
         own, against = self._reckoned(now), self._against(fix, now)
         contradicted = against is not None
@@ -292,23 +300,25 @@ class Navigator:
         if given is not None and (own is None or self._lost or given.sigma_m < own.sigma_m):
             confirmed = self._confirms(given, fix)
         if confirmed:
-            self._believe(fix, now, 1, jump=contradicted)
+            self._accept(fix, now, 1, jump=contradicted)
             return fix
         if late:
             return self._refuse_match(fix, against, 0)
-        before = self._held_place(now)
+        before = self._pending_position(now)
         agree = before is not None and self._confirms(before, fix)
-        held = _Held(fix, now, self._held.count + 1 if agree and self._held is not None else 1)
-        if held.count >= self._options.confirm and not (contradicted and self._holds_on(now, held.count)):
-            self._believe(fix, now, held.count, jump=contradicted)
+        held = _PendingFix(fix, now, self._held.count + 1 if agree and self._held is not None else 1)
+        if held.count >= self._options.confirm and not (
+            contradicted and self._dead_reckoning_outweighs(now, held.count)
+        ):
+            self._accept(fix, now, held.count, jump=contradicted)
             return fix
         self._held = held
         return self._refuse_match(fix, against, held.count)
 
-    def _confirms(self, place: Place, fix: Fix) -> bool:
+    def _confirms(self, place: PositionEstimate, fix: Fix) -> bool:
         return place.sigma_m <= self._options.trusted_sigma_m and place.chi_square(fix) <= self._options.gate
 
-    def _against(self, fix: Fix, now: Moment) -> Place | None:
+    def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
         """A well-known prediction that a fix contradicts: by the last fix, or by one some seconds ago.
 
         Step by step a wrong match may lead away slowly enough; over seconds, measured velocities show it.
@@ -322,14 +332,14 @@ class Navigator:
                 return place
         return None
 
-    def _holds_on(self, now: Moment, against: int) -> bool:
+    def _dead_reckoning_outweighs(self, now: OdometrySample, against: int) -> bool:
         """Whether dead reckoning outweighs so many fixes that agree with each other and not with it."""
         anchor = self._anchor
         if anchor is None or anchor.moment is None or now.blind_s > anchor.moment.blind_s:
             return False  # it was not measured
         return against <= anchor.support and now.time_s - anchor.moment.time_s <= self._options.hold_s
 
-    def _believe(self, fix: Fix, now: Moment, count: int, *, jump: bool) -> None:
+    def _accept(self, fix: Fix, now: OdometrySample, count: int, *, jump: bool) -> None:
         """Dead reckoning goes on from this fix."""
         last = self._anchor
         known = last is not None and last.fix is not None
@@ -338,7 +348,7 @@ class Navigator:
         jump = jump or self._lost
         self._resets += known and jump
         support = count if last is None or jump else last.support + count
-        self._anchor = _Anchor(Place(en_m(fix), fix.sigma_m), now, fix, support)
+        self._anchor = _Anchor(PositionEstimate(en_m(fix), fix.sigma_m), now, fix, support)
         self._note_velocity(self._anchor, jump=jump)
         self._refusals, self._frames_lost, self._held, self._lost = 0, 0, None, False
 
@@ -358,7 +368,7 @@ class Navigator:
             sigma_m = math.hypot(anchor.place.sigma_m, first.place.sigma_m)
             self._velocity = self._drift.velocity(anchor.place.en_m - first.place.en_m, sigma_m, interval_s)
 
-    def _refuse_match(self, fix: Fix, against: Place | None, count: int) -> NoFix:
+    def _refuse_match(self, fix: Fix, against: PositionEstimate | None, count: int) -> NoFix:
         """What is said of a match that is not believed."""
         if against is not None:
             apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
@@ -368,7 +378,7 @@ class Navigator:
         detail = f"{count} of the {self._options.confirm} matches in a row that must agree"
         return _refusal(fix, Reason.UNCONFIRMED, detail)
 
-    def _note_loss(self, now: Moment) -> None:
+    def _note_loss(self, now: OdometrySample) -> None:
         """Declare the flight lost, or its start forgotten, where it is time to."""
         anchor, options = self._anchor, self._options
         if anchor is None or self._fixed:
@@ -382,7 +392,7 @@ class Navigator:
             self._anchor = None
 
 
-def _moment(anchor: _Anchor) -> Moment:
+def _moment(anchor: _Anchor) -> OdometrySample:
     assert anchor.moment is not None  # a fix has one
     return anchor.moment
 

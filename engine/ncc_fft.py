@@ -18,7 +18,7 @@ from torch import Tensor
 from engine import kernels
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.peaks import FAR, NEAR, best_places, find_peak, fit_summit
-from engine.types import Peak
+from engine.values import Peak
 
 _DTYPES = (torch.uint8, torch.int16, torch.uint16, torch.int32, torch.float16, torch.float32, torch.float64)
 _DOUBLE = (torch.float64, torch.int32)  # float32 would round these

@@ -17,20 +17,12 @@ from numpy.typing import ArrayLike
 
 from engine.errors import DtypeError, MapError, ShapeError
 from engine.geo import LocalFrame
-from engine.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
-from engine.metric_copy import Tell, is_large, needs_copy, open_metric_copy
-from engine.pyramid import Arrays, Pyramid, Reader
-from engine.rasters import (
-    GEOREFERENCE_TAG,
-    SLOPE_TAG,
-    Gray,
-    GrayReader,
-    Mask,
-    open_source,
-    stated_sigma,
-)
-from engine.surface import GROUND_PERCENT, Surface, open_surface
-from engine.types import Window
+from engine.maps.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
+from engine.maps.metric_copy import ProgressCallback, is_large, needs_copy, open_metric_copy
+from engine.maps.pyramid import Arrays, Pyramid, Reader
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG, Gray, GrayReader, Mask, open_source, stated_sigma
+from engine.maps.surface import GROUND_PERCENT, SurfaceModel, open_surface
+from engine.values import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -40,7 +32,7 @@ GROUND_REACH_M = 30.0
 """So far about a place its ground is looked for: wider than a house, narrower than a hill."""
 SEARCH_LIMIT_PX = 1 << 29
 """A map of up to this many pixels may be searched as a whole, where nothing is known of the place."""
-_LEAST_KNOWN = 100  # places at which the ground's level is taken
+_MIN_KNOWN = 100  # places at which the ground's level is taken
 _ROUGH_M = 1.0  # heights about a place that differ by this much halve its weight
 
 
@@ -71,7 +63,7 @@ class OrthoMap:
         self.name, self.width_px, self.height_px = name, grid.width_px, grid.height_px
         self.crs, self.source_crs = grid.crs, source_crs
         self._grid, self._facts = grid, facts or {}
-        self._surface: Surface | None = None
+        self._surface: SurfaceModel | None = None
         self.has_surface, self.ground_m = False, 0.0
         self._to_geodetic, self._from_geodetic = grid.pixels_of(earth_crs("EPSG:4326", "crs"))
         lon_deg, lat_deg = self._to_geodetic(grid.centre_px)
@@ -100,7 +92,7 @@ class OrthoMap:
         cache_dir: str | os.PathLike[str] | None = None,
         georeference_sigma_m: float | None = None,
         slope_sigma_deg: float | None = None,
-        on_copy: Tell | None = None,
+        on_copy: ProgressCallback | None = None,
     ) -> OrthoMap:
         """Open a GeoTIFF, or a picture whose place is given, with an optional surface model.
 
@@ -108,13 +100,13 @@ class OrthoMap:
         ``cache_dir`` (``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``).
 
         Args:
-            path: the map; see :func:`engine.rasters.open_source` for what may be opened.
+            path: the map; see :func:`engine.maps.rasters.open_source` for what may be opened.
             surface: heights in any grid and CRS.
             bounds_deg: west, south, east, north of the outer edges of a picture without georeference.
             crs: of a file that names none.
             cache_dir: where resampled maps are kept.
             georeference_sigma_m: how well the map lies; None takes what the file says, see
-                :data:`engine.rasters.GEOREFERENCE_TAG`.
+                :data:`engine.maps.rasters.GEOREFERENCE_TAG`.
             slope_sigma_deg: how well the surface leans; None takes what its file says.
             on_copy: called while a copy is made for the cache, with the pixels that it has and those that it will
                 have.
@@ -204,19 +196,19 @@ class OrthoMap:
         )
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG, "slope_sigma_deg")
         if heights is not None:
-            site._attach(Surface(heights, warp_between(grid, grid)), grid)
+            site._attach(SurfaceModel(heights, warp_between(grid, grid)), grid)
         return site
 
-    def _attach(self, surface: Surface, lies: Grid) -> None:
+    def _attach(self, surface: SurfaceModel, lies: Grid) -> None:
         known = self._known_heights(surface, self._grid.lattice(257))
-        if known.size < _LEAST_KNOWN:  # a surface of a small part of the map, or a map of small parts
+        if known.size < _MIN_KNOWN:  # a surface of a small part of the map, or a map of small parts
             known = self._known_heights(surface, warp_between(lies, self._grid)(lies.lattice(257)))
         if known.size == 0:
             raise MapError("surface: expected known heights under the valid part of the map, got none")
         self._surface, self.has_surface = surface, True
         self.ground_m = float(np.percentile(known, GROUND_PERCENT))
 
-    def _known_heights(self, surface: Surface, xy_px: Array) -> Array:
+    def _known_heights(self, surface: SurfaceModel, xy_px: Array) -> Array:
         """The surface's heights at those of the pixels (N, 2) where they and the map are known."""
         last = np.array([self.width_px - 1, self.height_px - 1])
         xy = np.rint(xy_px)
@@ -307,7 +299,7 @@ class OrthoMap:
             found = self._surface.ground_plane(np.asarray(xy_px, np.float64), reach_m / self.gsd_m_per_px)
         return found or (self.ground_m, np.zeros(2))
 
-    def steadiness_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
+    def roughness_weight_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
         """Weight (...,) of what is seen at pixels (..., 2): 1 on level ground, less at walls, edges and crowns.
 
         Where heights ``reach_px`` off differ from each other by a metre, what is seen may stand at either, and

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from engine.errors import ShapeError
-from engine.types import Peak
+from engine.values import Peak
 
 # Of surfaces of more places than this only the best place of every tile is looked at.
 _TILED_PX = 1 << 18

@@ -60,7 +60,7 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class Reprojection:
     """All matches as a pose sees them.
 
     Attributes:
@@ -89,7 +89,7 @@ class Fit:
 
     rotation: Array
     center: Array
-    view: View
+    view: Reprojection
     inliers: Mask
     information: Array
     variance_px2: float
@@ -150,7 +150,7 @@ def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
 # ----------------------------------------------------------------------------------------------------- refinement
 
 
-def look(problem: Problem, R: Array, center: Array) -> View:
+def look(problem: Problem, R: Array, center: Array) -> Reprojection:
     """Return all matches as the pose sees them."""
     x = R @ problem.points - (R @ center)[:, None]
     behind = x[2] < 1e-9
@@ -162,7 +162,7 @@ def look(problem: Problem, R: Array, center: Array) -> View:
     x[2] = near
     residual = projected - problem.pixels
     residual *= residual
-    return View(x, projected, residual[0] + residual[1])
+    return Reprojection(x, projected, residual[0] + residual[1])
 
 
 def refine(problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, slack: float = 1.0) -> Fit | None:
@@ -207,7 +207,7 @@ def refine(problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, sl
     return Fit(R, center, view, inliers, gain * normal, variance)
 
 
-def _normal_equations(problem: Problem, view: View, agreement: Array) -> tuple[Array, Array]:
+def _normal_equations(problem: Problem, view: Reprojection, agreement: Array) -> tuple[Array, Array]:
     """Return J^T W J (6, 6) and -J^T W r (6,) for a step of the centre, in the camera's axes, and of the rotation.
 
     With x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel is K x / z.

@@ -24,7 +24,7 @@ from engine.errors import DtypeError, OptionError, ShapeError
 from engine.pnp import (
     Fit,
     Problem,
-    View,
+    Reprojection,
     covariance_of,
     look,
     ransac,
@@ -320,7 +320,7 @@ def _same(R: Array, other: Array) -> bool:
     return float(np.sum(R * other)) > 1 + 2 * math.cos(math.radians(_SAME_POSE_DEG))
 
 
-def _cost(problem: Problem, R: Array, view: View, variance: float, options: PoseOptions) -> float:
+def _cost(problem: Problem, R: Array, view: Reprojection, variance: float, options: PoseOptions) -> float:
     """Return chi-square of all matches, each bounded at the threshold, and of the prior."""
     cost = float(problem.weights @ np.minimum(view.squared, options.reprojection_px**2)) / variance
     turn = turn_from_attitude(problem, R)

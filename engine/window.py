@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from engine.errors import OptionError
-from engine.types import Window
+from engine.values import Window
 
 SPREAD_SIGMAS = 3.0
 """Of the prior: a window holds what is matched at every place this near to the middle."""

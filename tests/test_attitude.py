@@ -7,7 +7,7 @@ import pytest
 
 from engine import Fix, Frame, NoFix, Reason
 from engine.report.attitude import attitude_row, check_attitude
-from engine.types import Attitude, Timings, Window
+from engine.values import Attitude, Timings, Window
 
 PICTURE = np.zeros((4, 4), np.uint8)
 

@@ -11,13 +11,13 @@ from pyproj import Transformer
 
 from bench.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
-from engine.audit import Flag, audit_map, predict, probability
-from engine.audit_plan import AuditOptions, plan_audit
+from engine.audit.availability import Flag, audit_map, predict, probability
+from engine.audit.plan import AuditOptions, plan_audit
+from engine.audit.self_match import measure
 from engine.cli.app import run
 from engine.errors import OptionError, TelemetryError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
-from engine.self_match import measure
 from engine.sim import build_town
 
 CAMERA = Camera.from_fov(300, 300, 60.0)

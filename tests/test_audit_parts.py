@@ -13,8 +13,8 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
 from engine import Camera, OrthoMap
-from engine.audit import Flag, audit_map, predict
-from engine.audit_plan import AuditOptions, Part, plan_audit
+from engine.audit.availability import Flag, audit_map, predict
+from engine.audit.plan import AuditOptions, MapPart, plan_audit
 from engine.cli.app import run
 from engine.errors import OptionError
 from engine.sim import build_town
@@ -70,7 +70,7 @@ def around(site, xy_px, radius_m):
 
 
 def test_around_a_place_all_within_the_radius_is_looked_at_and_nothing_else(site):
-    plan = plan_audit(site, CAMERA, HEIGHT_M, part=Part(around=around(site, [450, 300], 100.0)))
+    plan = plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [450, 300], 100.0)))
     off_m = np.hypot(*np.moveaxis(plan.places_px - [450, 300], -1, 0)) * site.gsd_m_per_px
     np.testing.assert_array_equal(plan.looked, off_m <= 100.0)
     assert plan.area_px * site.gsd_m_per_px**2 == pytest.approx(np.pi * 100.0**2, rel=0.1)
@@ -80,19 +80,19 @@ def test_around_a_place_all_within_the_radius_is_looked_at_and_nothing_else(site
 
 
 def test_a_radius_below_the_spacing_is_one_place_there(site):
-    plan = plan_audit(site, CAMERA, HEIGHT_M, part=Part(around=around(site, [450, 300], 1.0)))
+    plan = plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [450, 300], 1.0)))
     assert plan.places_px[plan.looked] == pytest.approx(np.array([[450, 300]]), abs=3.0)
 
 
 def test_a_part_at_the_edge_ends_with_the_map(site):
-    plan = plan_audit(site, CAMERA, HEIGHT_M, part=Part(around=around(site, [5, 890], 60.0)))
+    plan = plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [5, 890], 60.0)))
     assert (plan.window.x0, plan.window.y0 + plan.window.height_px) == (0, 900)
 
 
 def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(site):
     route = lat_lon(site, [[200, 250], [640, 300], [700, 650]])
     whole = audit_map(site, CAMERA, HEIGHT_M)
-    part = audit_map(site, CAMERA, HEIGHT_M, part=Part(route=route, corridor_m=10.0))
+    part = audit_map(site, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
     assert len(part.plan) < 0.5 * len(whole.plan)
     told, expected = (predict(one, *route.T) for one in (part, whole))
     assert told.length_m == expected.length_m
@@ -110,23 +110,23 @@ def test_the_corridor_is_of_what_the_camera_sees_not_of_where_it_flies(site):
     aside = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
     route = lat_lon(site, [[200, 450], [700, 450]])
     fine = AuditOptions(spacing=0.05)
-    plan = plan_audit(site, aside, HEIGHT_M, fine, part=Part(route=route, corridor_m=5.0))
+    plan = plan_audit(site, aside, HEIGHT_M, fine, part=MapPart(route=route, corridor_m=5.0))
     beside_m = abs(plan.places_px[plan.looked][:, 1].mean() - 450) * site.gsd_m_per_px
     assert beside_m == pytest.approx(HEIGHT_M * np.tan(np.radians(30.0)), abs=3.0)
 
 
 def test_both_parts_are_looked_at(site):
     place, route = around(site, [200, 200], 50.0), lat_lon(site, [[500, 700], [800, 700]])
-    both = plan_audit(site, CAMERA, HEIGHT_M, part=Part(around=place, route=route))
+    both = plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=place, route=route))
     one, other = (
-        plan_audit(site, CAMERA, HEIGHT_M, part=part) for part in (Part(around=place), Part(route=route))
+        plan_audit(site, CAMERA, HEIGHT_M, part=part) for part in (MapPart(around=place), MapPart(route=route))
     )
     assert len(both) == pytest.approx(len(one) + len(other), rel=0.15)
 
 
 def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_memory_allows(huge):
     route = lat_lon(huge, [[10, 10], [23_990, 23_990], [23_990, 10]])
-    plan = plan_audit(huge, CAMERA, 20.0, AuditOptions(max_cells=500), part=Part(route=route, corridor_m=5.0))
+    plan = plan_audit(huge, CAMERA, 20.0, AuditOptions(max_cells=500), part=MapPart(route=route, corridor_m=5.0))
     assert 100 < len(plan) <= 500
     assert plan.looked.size < 200_000
 
@@ -141,12 +141,12 @@ def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_me
 )
 def test_a_part_of_nothing_is_refused(options, words):
     with pytest.raises(OptionError, match=words):
-        Part(**options)
+        MapPart(**options)
 
 
 def test_a_part_beside_the_map_is_refused(site):
     with pytest.raises(OptionError, match="part: expected one on the map arrays, got one beside it"):
-        plan_audit(site, CAMERA, HEIGHT_M, part=Part(around=around(site, [-5000, 100], 100.0)))
+        plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [-5000, 100], 100.0)))
 
 
 # ----------------------------------------------------------------------------------------------- command line

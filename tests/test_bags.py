@@ -20,19 +20,12 @@ from bench.fuzz_bags import damaged
 from engine.camera import Camera
 from engine.cli.app import run as main
 from engine.errors import OptionError, TelemetryError
-from engine.formats.bag_writer import KINDS, write_bag
-from engine.formats.bags import (
-    CAMERA_INFO,
-    IMAGE,
-    BagFrames,
-    is_bag,
-    read_bag,
-    read_bag_camera,
-)
 from engine.formats.flight import open_flight
-from engine.formats.logs import open_truth
-from engine.formats.ros_messages import Maker
-from engine.types import Frame, Prior, Truth
+from engine.formats.logs.readers import open_truth
+from engine.formats.ros.bag_writer import KINDS, write_bag
+from engine.formats.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
+from engine.formats.ros.messages import MessageFactory
+from engine.values import Frame, Prior, Truth
 
 STEP_NS = 100_000_000
 CAMERA = Camera(
@@ -135,7 +128,7 @@ def test_others_read_what_is_written(tmp_path, kind):
 
 def test_without_a_compass_the_imu_has_the_heading(tmp_path):
     types = get_typestore(Stores.ROS1_NOETIC)
-    maker = Maker(types.types.__getitem__, True)
+    maker = MessageFactory(types.types.__getitem__, True)
     with Writer1(tmp_path / "imu.bag") as writer:
         connection = writer.add_connection("/imu/data", "sensor_msgs/msg/Imu", typestore=types)
         for k in range(3):
@@ -160,7 +153,7 @@ def written(path, topics):
 
 @pytest.fixture
 def maker():
-    return Maker(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
+    return MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
 
 
 def test_several_topics_with_pictures_ask_for_one(tmp_path, maker):

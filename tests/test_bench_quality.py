@@ -11,7 +11,7 @@ from bench.map_views import map_pairs
 from bench.quality import Keypoints, ViewPair, judge
 from bench.views import by_homography, warped_pairs
 from engine import Camera, Fix
-from engine.types import Attitude, Timings, Truth
+from engine.values import Attitude, Timings, Truth
 
 SIZE = 200
 TURN = np.array([[0.0, -1.0, SIZE - 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter: (x, y) to (last - y, x)

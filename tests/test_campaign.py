@@ -23,7 +23,7 @@ from engine.cli.demo import write_flight
 from engine.cli.executors import in_processes
 from engine.cli.jobs import read_result
 from engine.errors import TelemetryError
-from engine.formats.logs import LogClock
+from engine.formats.logs.readers import LogClock
 from engine.formats.settings import read_settings
 from engine.formats.track import read_track
 from engine.report.campaign import Line, pooled, write_tables

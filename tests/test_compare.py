@@ -12,7 +12,7 @@ from engine.cli.app import run
 from engine.cli.compare import USUAL, parse_runs
 from engine.cli.demo import write_flight
 from engine.cli.track import Settings, folder_inputs, run_track
-from engine.formats.logs import LogClock
+from engine.formats.logs.readers import LogClock
 from engine.formats.track import read_track
 from engine.report.comparison import draw_comparison
 from engine.sim import plan_flight

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engine.costs import Costs
+from engine.methods.costs import Costs
 
 
 def learned(works, price, step="step"):

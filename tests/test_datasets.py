@@ -27,10 +27,10 @@ from engine.formats.telemetry import TelemetryRow, read_telemetry
 from engine.formats.truth import read_truth
 from engine.formats.truth_checks import check_truth
 from engine.geo import LocalFrame, ecef_from_geodetic, enu_from_body
-from engine.rasters import open_source
+from engine.maps.rasters import open_source
 from engine.report.published import PUBLISHED, published_cells
 from engine.sim import picture_at, plan_flight
-from engine.types import Attitude, Truth
+from engine.values import Attitude, Truth
 
 CAMERA = Camera.from_fov(300, 300, 60.0)  # the simulated flights'
 GROUND_M = 120.0  # level of the miniatures' ground, above whatever their heights are counted from

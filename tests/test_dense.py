@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from engine import Fix, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.dense import Belief, Picture, Pose, Samples, correlation_at, covariance_of, refine
+from engine.dense import EnhancedFrame, GaussianPrior, Pose, Samples, correlation_at, covariance_of, refine
 from engine.errors import ShapeError
 from engine.geo import enu_from_body
-from engine.methods.laid import NccOptions
-from engine.methods.samples import BLOCK_PX, SampleMap
-from engine.prepared import PreparedMap
-from engine.types import Window
+from engine.indexes.prepared import PreparedMap
+from engine.indexes.samples import BLOCK_PX, SampleMap
+from engine.methods.hypothesis import NccOptions
+from engine.values import Window
 
 NADIR = np.array([315.0, 296.0])
 HEIGHT_M = 150.0
@@ -55,7 +55,7 @@ def believed(pose, turn_deg=(0.0, 0.0, 0.0), moved_m=(0.0, 0.0, 0.0), precision=
     """A belief that is off by so much, weak by default."""
     turned = cv2.Rodrigues(np.radians(np.array(turn_deg)))[0] @ pose.rotation
     weak = np.diag([0.0, 0.0, 1e-4, 10.0, 10.0, 10.0, 1e8, 1e8]) if precision is None else precision
-    return Belief(Pose(turned, pose.center_m + moved_m, np.zeros(2)), weak)
+    return GaussianPrior(Pose(turned, pose.center_m + moved_m, np.zeros(2)), weak)
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, -0.4, 0.6), (-0.6, 0.3, -0.8), (0.0, 0.0, 0.0)])
@@ -63,7 +63,7 @@ def believed(pose, turn_deg=(0.0, 0.0, 0.0), moved_m=(0.0, 0.0, 0.0), precision=
 def test_all_six_degrees_are_found_again_whatever_gain_and_bias(scene, camera, turn_deg, gain, bias):
     pose, samples, levels = scene
     belief = believed(pose, turn_deg, moved_m=(0.8, -0.6, 1.0))
-    picture = Picture(gain * levels + np.float32(bias), camera.matrix)
+    picture = EnhancedFrame(gain * levels + np.float32(bias), camera.matrix)
     fit = refine(picture, samples, belief.pose, belief)
     assert fit is not None
     assert np.abs(fit.pose.center_m - pose.center_m).max() < 0.1
@@ -78,7 +78,7 @@ def test_outliers_do_not_move_the_pose(scene, camera):
     wrong = rng.random(len(samples.values)) < 0.2
     values = np.where(wrong, rng.uniform(-3, 3, len(wrong)), samples.values)
     belief = believed(pose, (0.3, 0.2, -0.4), moved_m=(0.5, 0.5, -0.5))
-    fit = refine(Picture(levels, camera.matrix), replace(samples, values=values), belief.pose, belief)
+    fit = refine(EnhancedFrame(levels, camera.matrix), replace(samples, values=values), belief.pose, belief)
     assert fit is not None
     assert np.abs(fit.pose.center_m - pose.center_m).max() < 0.3
 
@@ -90,7 +90,7 @@ def test_a_slope_nobody_told_of_is_found_where_the_attitude_is_known(scene, came
     points[:, 2] -= (points[:, :2] - pose.center_m[:2]) @ slope
     known = np.diag([0.0, 0.0, 1e6, 1e10, 1e10, 1e10, 100.0, 100.0])
     belief = believed(pose, precision=known)
-    fit = refine(Picture(levels, camera.matrix), replace(samples, points_m=points), belief.pose, belief)
+    fit = refine(EnhancedFrame(levels, camera.matrix), replace(samples, points_m=points), belief.pose, belief)
     assert fit is not None
     np.testing.assert_allclose(fit.pose.slope, slope, atol=3e-3)
 
@@ -103,7 +103,7 @@ def test_the_covariance_knows_that_tilt_and_slope_look_alike(camera):
         precision = np.diag([0.0, 0.0, 1.0, *[np.radians(0.5) ** -2] * 3, slope_precision, slope_precision])
         belief = believed(pose, precision=precision)
         noisy = levels + np.random.default_rng(1).normal(0, 0.5, levels.shape).astype(np.float32)
-        fit = refine(Picture(noisy, camera.matrix), samples, belief.pose, belief)
+        fit = refine(EnhancedFrame(noisy, camera.matrix), samples, belief.pose, belief)
         assert fit is not None
         covariance = covariance_of(fit, belief)
         assert covariance is not None
@@ -121,7 +121,7 @@ def test_what_neighbours_share_widens_the_covariance(scene, camera):
     for name, radius_px in (("grain", 0.1), ("patches", 12.0)):
         noise = np.random.default_rng(1).normal(0, 1.0, levels.shape)
         noise = cv2.GaussianBlur(noise, (0, 0), radius_px)
-        picture = Picture((levels + 0.5 * noise / noise.std()).astype(np.float32), camera.matrix)
+        picture = EnhancedFrame((levels + 0.5 * noise / noise.std()).astype(np.float32), camera.matrix)
         fit = refine(picture, samples, belief.pose, belief)
         assert fit is not None
         covariance = covariance_of(fit, belief)
@@ -146,7 +146,7 @@ def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, fla
 
 def test_no_pose_from_samples_that_are_not_seen(scene, camera):
     pose, samples, levels = scene
-    picture = Picture(levels, camera.matrix)
+    picture = EnhancedFrame(levels, camera.matrix)
     away = believed(pose, moved_m=(1000.0, 0.0, 0.0))
     assert refine(picture, samples, away.pose, away) is None
     blind = replace(samples, weights=np.zeros(len(samples.weights)))
@@ -280,7 +280,7 @@ def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(flat
     samples = SampleMap(flat_site, prepared)
     window = Window(100, 60, 200, 160)
     first, second = samples.find(window, 0), samples.find(window, 0)
-    assert samples.made == 1
+    assert samples.created == 1
     np.testing.assert_array_equal(first.points_m, second.points_m)
     xy = flat_site.pixel_from_enu(first.points_m[:, :2])
     np.testing.assert_allclose(xy, np.round(xy), atol=1e-3)

@@ -18,7 +18,7 @@ from engine.methods.sift import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.pose import PoseOptions
 from engine.sim import plan_flight
-from engine.types import Reason
+from engine.values import Reason
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

@@ -19,7 +19,7 @@ from engine.sim.ekf import (
     STATES,
     TURN,
     VELOCITY,
-    Belief,
+    FilterState,
     begin,
     correct,
     fix_chi_square,
@@ -31,19 +31,19 @@ from engine.sim.ekf import (
 )
 from engine.sim.history import History
 from engine.sim.pilot import Pilot, plan_route
-from engine.sim.quadrotor import STEP_S, Air, Airframe, Felt, Wind, advance, hovering, shaken
+from engine.sim.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
 from engine.sim.rotations import rotation, rotation_vector
 from engine.sim.sensors import GpsSample, Instruments, SensorSuite
-from engine.types import Attitude, Fix, Timings, Window
+from engine.values import Attitude, Fix, Timings, Window
 
 SUITE = SensorSuite()
-SAMPLE = Felt(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
+SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
 
 
-def some_belief() -> Belief:
+def some_belief() -> FilterState:
     rng = np.random.default_rng(2)
     spread = rng.normal(0.0, 0.3, (STATES, STATES))
-    return Belief(
+    return FilterState(
         4.0,
         np.array([10.0, -5.0, 120.0]),
         np.array([6.0, 2.0, -0.5]),
@@ -56,7 +56,7 @@ def some_belief() -> Belief:
     )
 
 
-def moved(belief: Belief, error: np.ndarray) -> Belief:
+def moved(belief: FilterState, error: np.ndarray) -> FilterState:
     """The truth where the belief is off by an error."""
     return replace(
         belief,
@@ -70,7 +70,7 @@ def moved(belief: Belief, error: np.ndarray) -> Belief:
     )
 
 
-def apart(truth: Belief, belief: Belief) -> np.ndarray:
+def apart(truth: FilterState, belief: FilterState) -> np.ndarray:
     """The error (17,) of a belief."""
     return np.concatenate(
         [
@@ -168,7 +168,7 @@ def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     state, rng = hovering(np.array([0.0, 0.0, 100.0]), 200.0), np.random.default_rng(9)
     belief = replace(begin(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
-    air = Air(Wind(), rng)
+    air = WindField(Wind(), rng)
     for k in range(500):
         state, felt = advance(
             state, np.array([1.0, math.cos(k / 60), 0.1]), 200.0 + 0.1 * k, Airframe(), air.next()
@@ -185,7 +185,7 @@ def fly(seed, seconds, gps_until_s=math.inf):
     """A flight steered by the filter: every second its error (17,), covariance, and the sigma of the position."""
     route = plan_route(np.array([[-40.0, -40.0], [-40.0, 30.0], [30.0, 30.0]]))
     winds, sensors, start, shakes = np.random.default_rng(seed).spawn(4)
-    air, carried, pilot, frame = Air(Wind(), winds), Instruments(SUITE, sensors), Pilot(), Airframe()
+    air, carried, pilot, frame = WindField(Wind(), winds), Instruments(SUITE, sensors), Pilot(), Airframe()
     state = hovering(route.position_m[0], float(route.heading_deg[0]))
     off = start.standard_normal(8)
     state = replace(state, velocity_mps=0.1 * off[:3])
@@ -213,7 +213,7 @@ def fly(seed, seconds, gps_until_s=math.inf):
             history.fuse(partial(fuse_gps, sample=sample, suite=SUITE), sample.time_s)
         if k % 100 == 0:
             now = history.now
-            truth = Belief(
+            truth = FilterState(
                 state.time_s, state.position_m, state.velocity_mps, state.enu_from_body, carried.accel_bias_mps2,
                 carried.gyro_bias_rps, carried.baro_drift_m, math.radians(carried.compass_bias_deg),
                 np.eye(STATES),
@@ -262,7 +262,7 @@ def test_without_positions_the_sigma_grows_and_holds_the_error():
 
 def test_a_measurement_that_comes_late_does_what_it_would_have_done_in_time():
     rng = np.random.default_rng(6)
-    samples = [Felt(SAMPLE.force_mps2 + 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=3)) for _ in range(60)]
+    samples = [IdealImu(SAMPLE.force_mps2 + 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=3)) for _ in range(60)]
     fix = partial(fuse_fix, fix=a_fix(11.0, -4.0))
     prompt, late = (History(replace(some_belief(), time_s=0.0), SUITE) for _ in range(2))
     for k, sample in enumerate(samples):

@@ -87,9 +87,9 @@ class NodeOfNoRos:
     def __init__(self, name):
         from rosbags.typesys import Stores, get_typestore
 
-        from engine.formats.ros_messages import Maker
+        from engine.formats.ros.messages import MessageFactory
 
-        self.maker = Maker(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
+        self.maker = MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
         self.published, self.topics = [], None
         type(self).made = self
 

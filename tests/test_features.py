@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from engine.descriptors import _orient, normalise
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.features import Features, match, sift
+from engine.sift.descriptors import _orient, normalise
 
 LEVEL_RATIO = 2 ** (1 / 3)
 

@@ -34,7 +34,7 @@ from engine.formats.telemetry import (
 )
 from engine.formats.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from engine.formats.truth import interpolate_truth, read_truth, write_truth
-from engine.types import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
+from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}

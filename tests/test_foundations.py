@@ -37,7 +37,7 @@ from engine import (
 )
 from engine.budget import Deadline
 from engine.device import resolve, set_threads, synchronise
-from engine.types import Peak
+from engine.values import Peak
 
 IMAGE = np.zeros((4, 6), np.uint8)
 

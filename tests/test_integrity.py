@@ -17,14 +17,14 @@ from engine.integrity import (
     AssumedErrors,
     PeakRule,
     judge_peak,
+    misalignment_covariance_px2,
     ncc_covariance_m2,
     peak_covariance_px,
-    pull_px2,
     score_sigma,
-    told_by_map,
+    with_map_accuracy,
 )
 from engine.ncc_fft import find_peak, ncc
-from engine.types import Peak
+from engine.values import Peak
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 BLANK = np.zeros((300, 300), np.uint8)
@@ -218,11 +218,11 @@ def test_a_turned_patch_pulls_its_peak_only_where_its_parts_come_apart():
     """By hand: what 240 x 320 px move by when turned by 1 degree, against a peak 0.8 / 0.02 = 40 px^2 wide."""
     told = AssumedErrors(heading_deg=1.0, height_m=1e-9, height_share=1e-9)
     apart = math.radians(1.0) ** 2 * (240**2 + 320**2) / 24.0
-    pull = pull_px2(peak(0.8), (240, 320), 150.0, told)
+    pull = misalignment_covariance_px2(peak(0.8), (240, 320), 150.0, told)
     np.testing.assert_allclose(pull, apart**2 / (apart + 40.0) * np.eye(2), rtol=1e-9)
-    sharp = pull_px2(peak(0.8, bend=((-80.0, 0.0), (0.0, -80.0))), (240, 320), 150.0, told)
+    sharp = misalignment_covariance_px2(peak(0.8, bend=((-80.0, 0.0), (0.0, -80.0))), (240, 320), 150.0, told)
     assert sharp[0, 0] == pytest.approx(apart, rel=0.01)  # the parts cannot agree: anywhere between them
-    assert pull_px2(peak(0.8), (24, 32), 150.0, told)[0, 0] < 1e-3 * pull[0, 0]
+    assert misalignment_covariance_px2(peak(0.8), (24, 32), 150.0, told)[0, 0] < 1e-3 * pull[0, 0]
 
 
 def test_what_a_map_says_of_itself_counts_more_than_what_is_assumed_of_any():
@@ -231,6 +231,6 @@ def test_what_a_map_says_of_itself_counts_more_than_what_is_assumed_of_any():
     silent = OrthoMap.from_arrays(gray, grid, "EPSG:32633")
     frank = OrthoMap.from_arrays(gray, grid, "EPSG:32633", georeference_sigma_m=0.05, slope_sigma_deg=0.02)
     assumed = AssumedErrors(map_m=0.7, tilt_deg=0.2)
-    assert told_by_map(silent, assumed) == assumed
-    told = told_by_map(frank, assumed)
+    assert with_map_accuracy(silent, assumed) == assumed
+    told = with_map_accuracy(frank, assumed)
     assert (told.map_m, told.surface_slope_deg, told.tilt_deg) == (0.05, 0.02, 0.2)

@@ -9,10 +9,11 @@ import rasterio
 import torch
 from rasterio.transform import Affine
 
-from engine import OrthoMap, landmark_cache, landmarks
+from engine import OrthoMap
 from engine.features import sift
-from engine.landmarks import CELL_PX, MAX_PER_CELL, TILE_PX, LandmarkMap, as_picture
-from engine.types import Window
+from engine.indexes import landmark_cache, landmarks
+from engine.indexes.landmarks import CELL_PX, MAX_PER_CELL, TILE_PX, LandmarkMap, as_picture
+from engine.values import Window
 
 CPU = torch.device("cpu")
 
@@ -267,10 +268,10 @@ def test_what_was_prepared_is_not_given_up_in_flight(site, monkeypatch):
     monkeypatch.setattr(landmarks, "MAX_LANDMARKS", 300)
     marks = LandmarkMap(site, CPU)
     marks.prepare()
-    made = marks.made
+    made = marks.created
     for level in reversed(range(site.levels)):
         for upright in (False, True):
             for window in (Window(0, 0, 60, 60), whole(site, level)):
                 marks.find(window, level, upright=upright)
     assert sum(len(tile["rank"]) for tile in marks._tiles.values()) > 300
-    assert marks.made == made
+    assert marks.created == made

@@ -12,12 +12,13 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 from rich.console import Console
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher, metric_copy
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
 from engine.cli import console
 from engine.cli.app import run
 from engine.cli.checks import check_start
-from engine.rasters import GrayReader
-from engine.types import Window
+from engine.maps import metric_copy
+from engine.maps.rasters import GrayReader
+from engine.values import Window
 
 SIDE = 17_000
 CORNER = (12_288, 6_656)  # of the town on the large map: on its cells, so that the same landmarks are chosen
@@ -155,9 +156,9 @@ def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_to
         with rasterio.open(tmp_path / name, "w", dtype=data.dtype, **profile) as dataset:
             dataset.write(data, 1)
     kept = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
-    monkeypatch.setattr("engine.surface.SURFACE_LIMIT_PX", 10_000)
-    monkeypatch.setattr("engine.surface.TILE_PX", 100)
-    monkeypatch.setattr("engine.surface.MAX_PATCHES", 3)
+    monkeypatch.setattr("engine.maps.surface.SURFACE_LIMIT_PX", 10_000)
+    monkeypatch.setattr("engine.maps.surface.TILE_PX", 100)
+    monkeypatch.setattr("engine.maps.surface.MAX_PATCHES", 3)
     tiled = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
     xy = np.random.default_rng(4).uniform(-5.0, [columns + 5.0, rows + 5.0], (60, 40, 2))
     known = np.array([[150.0, 100.0]])
@@ -359,7 +360,7 @@ def test_a_large_file_is_hashed_again_when_it_changes(tmp_path, monkeypatch):
 
 
 def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):
-    from engine.rasters import open_source
+    from engine.maps.rasters import open_source
 
     path = tmp_path / "plain.tif"
     profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM}

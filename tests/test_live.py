@@ -10,7 +10,7 @@ import pytest
 
 from engine.errors import OptionError, StateError, TelemetryError
 from engine.live import Live, LiveOptions
-from engine.types import Fix, Frame, NoFix, Reason, Timings, Window
+from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 
 IMAGE = np.zeros((4, 4), np.uint8)
 

@@ -20,7 +20,7 @@ from engine.cli.app import run
 from engine.cli.demo import write_flight
 from engine.cli.track import Settings, run_track
 from engine.cli.watching import Watching
-from engine.formats.ros_messages import Maker
+from engine.formats.ros.messages import MessageFactory
 from engine.formats.track import read_track
 from engine.live import Answer
 from engine.navigator import NavigatorState
@@ -244,7 +244,7 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
 class SilentNode:
     """A node to which nobody listens."""
 
-    maker = Maker(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
+    maker = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
 
     def now_ns(self):
         return 1

@@ -14,7 +14,7 @@ from engine.sim.faults import Fault, ShiftedMap
 from engine.sim.loop import START_NS, LoopOptions, Mode, fly_closed_loop
 from engine.sim.pilot import plan_rounds
 from engine.sim.vehicle import FlightStyle
-from engine.types import Fix, Frame, NoFix, Prior, Reason, Timings, Window
+from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 SIGMA_M = 0.3
 

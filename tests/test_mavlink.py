@@ -22,7 +22,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.links import parse_connection
-from engine.adapters.mavlink import LEAST_HZ, Bridge
+from engine.adapters.mavlink import MIN_RATE_HZ, Bridge
 from engine.adapters.mavlink_in import WANTED, Clock, Telemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
@@ -41,11 +41,11 @@ from engine.adapters.mavlink_out import (
 from engine.adapters.packets import Decoder, Encoder, read_key, signing_time
 from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import replay
-from engine.adapters.vehicle import Origin, Series, Vehicle, north_east_m
+from engine.adapters.vehicle import Origin, RecentValues, Vehicle, north_east_m
 from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
-from engine.types import Fix, NoFix, Reason, Timings, Window
+from engine.values import Fix, NoFix, Reason, Timings, Window
 
 GOLDEN = Path(__file__).parent / "golden" / "mavlink"
 ORIGIN = Origin(33.6400000, 72.9900000, 510.0)
@@ -306,7 +306,7 @@ def test_the_date_is_the_autopilots_and_none_where_it_has_none():
 
 
 def test_series_go_the_shorter_way_round_and_grow_stale():
-    series = Series((True,))
+    series = RecentValues((True,))
     series.add(0, 350.0)
     series.add(100_000_000, 10.0)
     series.add(150_000_000, math.nan)
@@ -467,7 +467,7 @@ def test_minutes_of_the_hour_in_which_everything_goes_wrong():
     assert {name: flown[name] for name in nothing} == dict.fromkeys(nothing, 0)
     assert flown["steps"] == flown["resets"]
     assert flown["reconnections"] == 2
-    assert flown["least_hz"] >= LEAST_HZ
+    assert flown["least_hz"] >= MIN_RATE_HZ
     assert flown["stamp_off_ms"] < 12.5  # half of what the link may take
     assert flown["place_off_m"] < 0.01
     assert flown["heading_off_deg"] < 1.0
@@ -720,7 +720,7 @@ def test_fixes_come_at_4_hz_or_more(bridge_to):
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 20, every_s=0.1)
         got = pilot.of("VISION_POSITION_ESTIMATE")
     hz = (len(got) - 1) / ((got[-1][1] - got[0][1]) * 1e-9)
-    assert hz >= LEAST_HZ
+    assert hz >= MIN_RATE_HZ
 
 
 def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_to):

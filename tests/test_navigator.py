@@ -28,7 +28,7 @@ from engine import (
     Timings,
     Window,
 )
-from engine.navigator import BELIEVE_ALL
+from engine.navigator import ACCEPT_ALL
 
 IMAGE = np.zeros((8, 8), np.uint8)
 START = Prior(east_m=10.0, north_m=20.0, sigma_m=5.0)
@@ -327,7 +327,7 @@ def test_two_methods_that_disagree_for_a_second_are_unhealthy():
 
 def test_the_baseline_is_handed_out_as_it_comes():
     script = Script((10.0, 20.0), (400.0, 20.0), None, (10.0, 20.0))
-    navigator = Navigator(script, options=BELIEVE_ALL)
+    navigator = Navigator(script, options=ACCEPT_ALL)
     results = [navigator.update(at(0.2 * k, STILL)) for k in range(4)]
     assert reasons(results) == ["fix", "fix", "low_score", "fix"]
 
@@ -500,7 +500,7 @@ def fly(sim_site, flight, method, *, profile="engine", start=True, skip=0):
     matcher = SceneMatcher(sim_site, flight.camera, method, "cpu", MatcherOptions(profile=profile))
     first = flight.truth[skip]
     prior = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=10.0) if start else None
-    navigator = Navigator(matcher, prior, options=BELIEVE_ALL if profile == "paper" else None)
+    navigator = Navigator(matcher, prior, options=ACCEPT_ALL if profile == "paper" else None)
     return [navigator.update(frame) for frame in flight.frames[skip:]]
 
 

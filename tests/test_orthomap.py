@@ -18,9 +18,9 @@ from rasterio.warp import calculate_default_transform, reproject
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
 from engine.formats.geotiff import write_geotiff
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.orthomap import OrthoMap
-from engine.rasters import GEOREFERENCE_TAG, SLOPE_TAG
-from engine.types import Window
+from engine.values import Window
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 UTM = "EPSG:32636"
@@ -355,8 +355,8 @@ def test_map_too_large_for_memory_reads_the_same_from_the_file(tmp_path, monkeyp
     data[:, :, :20] = 0
     path = write(tmp_path / "map.tif", data, photometric="rgb")
     kept = OrthoMap.open(path)
-    monkeypatch.setattr("engine.pyramid.MEMORY_LIMIT_PX", 3000)
-    monkeypatch.setattr("engine.rasters.OVERVIEW_PX", 64)
+    monkeypatch.setattr("engine.maps.pyramid.MEMORY_LIMIT_PX", 3000)
+    monkeypatch.setattr("engine.maps.rasters.OVERVIEW_PX", 64)
     streamed = OrthoMap.open(path)
     assert streamed.levels == kept.levels
     for level in range(kept.levels):
@@ -708,5 +708,5 @@ def test_what_stands_at_a_wall_is_not_to_be_relied_on():
     heights[20:40, 20:40] = 10.0
     site = OrthoMap.from_arrays(noise(60, 60), CENTRED, UTM, surface_m=heights)
     at = np.array([[5.0, 5.0], [30.0, 30.0], [20.0, 30.0], [18.0, 30.0], [17.0, 30.0]])
-    np.testing.assert_allclose(site.steadiness_at(at, 2.0), [1.0, 1.0, 1 / 101, 1 / 101, 1.0], rtol=1e-9)
-    assert OrthoMap.from_arrays(noise(60, 60), CENTRED, UTM).steadiness_at(at, 2.0).tolist() == [1.0] * 5
+    np.testing.assert_allclose(site.roughness_weight_at(at, 2.0), [1.0, 1.0, 1 / 101, 1 / 101, 1.0], rtol=1e-9)
+    assert OrthoMap.from_arrays(noise(60, 60), CENTRED, UTM).roughness_weight_at(at, 2.0).tolist() == [1.0] * 5

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from engine import OrthoMap, prepared
+from engine import OrthoMap
 from engine.align import enhance
+from engine.indexes import prepared
+from engine.indexes.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
-from engine.prepared import PreparedMap, Region
-from engine.types import Window
+from engine.values import Window
 
 RADIUS_PX = 8
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])

@@ -10,7 +10,7 @@ import pytest
 from engine.errors import OptionError
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.sim.pilot import Gains, Pilot, plan_rounds, plan_route
-from engine.sim.quadrotor import GRAVITY, STEP_S, Air, Airframe, Wind, advance, aim, hovering, shaken
+from engine.sim.quadrotor import GRAVITY, STEP_S, Airframe, Wind, WindField, advance, aim, hovering, shaken
 from engine.sim.rotations import cross_matrix, rotation, rotation_vector
 from engine.sim.vehicle import GRAVITY_MPS2, FlightStyle
 
@@ -85,7 +85,7 @@ def test_drag_ends_where_the_air_and_the_push_balance():
 def test_an_imu_that_is_integrated_gives_the_path():
     rng = np.random.default_rng(3)
     state = hovering(np.array([0.0, 0.0, 100.0]), 40.0)
-    air = Air(Wind(), rng)
+    air = WindField(Wind(), rng)
     place, speed, attitude = state.position_m, state.velocity_mps, state.enu_from_body
     for k in range(1000):
         if k % 250 == 0:
@@ -112,7 +112,7 @@ def test_a_shake_swings_to_its_size_and_dies_away():
 
 def test_gusts_have_their_size_and_their_length():
     wind = Wind(mean_east_mps=3.0, mean_north_mps=-1.0, gust_sd_mps=2.0, gust_time_s=0.5)
-    air = Air(wind, np.random.default_rng(1))
+    air = WindField(wind, np.random.default_rng(1))
     blown = np.array([air.next() for _ in range(60000)])
     np.testing.assert_allclose(blown.mean(axis=0), [3.0, -1.0, 0.0], atol=0.3)
     np.testing.assert_allclose(blown.std(axis=0), [2.0, 2.0, 1.0], rtol=0.12)
@@ -158,7 +158,7 @@ def test_beyond_its_ends_a_route_hovers(clock_s):
 
 def test_the_pilot_keeps_the_route_in_gusts_and_shakes():
     route, rng = plan_route(SQUARE), np.random.default_rng(5)
-    state, air, pilot = hovering(route.position_m[0], float(route.heading_deg[0])), Air(Wind(), rng), Pilot()
+    state, air, pilot = hovering(route.position_m[0], float(route.heading_deg[0])), WindField(Wind(), rng), Pilot()
     off, tilts, kicks = [], [], list(route.kicks_s)
     for k in range(round(route.duration_s / STEP_S)):
         target = route.at(k * STEP_S)

@@ -12,7 +12,7 @@ from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, errors_en_m, summarise
-from engine.types import Truth
+from engine.values import Truth
 
 HERE = LocalFrame(32.79, 34.99)
 SECOND_NS = 1_000_000_000

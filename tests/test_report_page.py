@@ -17,15 +17,15 @@ from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.integrity import PeakRule
 from engine.matcher import MatcherOptions
-from engine.methods.laid import NccOptions
+from engine.methods.hypothesis import NccOptions
 from engine.methods.sift import SiftOptions
 from engine.report.charts import Plot, ticks
 from engine.report.explain import choose_frames
 from engine.report.metrics import Errors, Ground, summarise
-from engine.report.page import Flown, write_page
+from engine.report.page import FinishedTrack, write_page
 from engine.report.verdict import MEANINGS, verdict_of
 from engine.sim import plan_flight
-from engine.types import Reason, Window
+from engine.values import Reason, Window
 
 FRAMES = 8
 DARK = 5  # a frame that shows nothing
@@ -273,7 +273,7 @@ def test_without_truth_nothing_is_claimed(flown, tmp_path):
     )
     summary = summarise(rows) | {"settings": record["settings"] | {"truth": None}}
     site = OrthoMap.open(record["settings"]["map"])
-    write_page(tmp_path / "report.html", Flown(rows, None, site, Ground(), summary, None))
+    write_page(tmp_path / "report.html", FinishedTrack(rows, None, site, Ground(), summary, None))
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Without truth nobody can say" in text
     assert "median error" not in text
@@ -284,7 +284,9 @@ def test_a_track_without_a_single_fix_has_a_page(flown, tmp_path, count):
     record = json.loads((flown / "summary.json").read_text(encoding="utf-8"))["settings"]
     rows = [TrackRow(timestamp_ns=None, frame=str(i), status="no_fix", reason="late") for i in range(count)]
     summary = summarise(rows) | {"settings": record}
-    write_page(tmp_path / "report.html", Flown(rows, None, OrthoMap.open(record["map"]), Ground(), summary, None))
+    write_page(
+        tmp_path / "report.html", FinishedTrack(rows, None, OrthoMap.open(record["map"]), Ground(), summary, None)
+    )
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert ("None of" in text, "has no frames" in text) == (count > 0, count == 0)
     assert "nan" not in re.sub(r'data:image[^"]*', "", text).lower()

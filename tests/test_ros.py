@@ -21,9 +21,9 @@ from engine.adapters.vehicle import Origin, Vehicle
 from engine.camera import Camera
 from engine.cli.app import run as main
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
-from engine.formats.ros_messages import (
+from engine.formats.ros.messages import (
     NO_POSITION,
-    Maker,
+    MessageFactory,
     attitude_of,
     camera_of,
     picture_of,
@@ -33,7 +33,7 @@ from engine.formats.ros_messages import (
     stamp_ns,
 )
 from engine.live import LiveOptions
-from engine.types import Attitude, Fix, NoFix, Reason, Timings, Window
+from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.conftest import body_axes
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
@@ -41,7 +41,7 @@ NOW_NS = 1_700_000_000_123_456_789
 
 
 def maker_of(name):
-    return Maker(STORES[name].types.__getitem__, name == "ros1")
+    return MessageFactory(STORES[name].types.__getitem__, name == "ros1")
 
 
 def wired(name, message):

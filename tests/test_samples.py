@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from engine import OrthoMap, prepared
+from engine import OrthoMap
 from engine.dense import Samples
-from engine.methods import samples
-from engine.methods.samples import BLOCK_PX, CELL_PX, SampleMap
-from engine.prepared import PreparedMap
-from engine.types import Window
+from engine.indexes import prepared, samples
+from engine.indexes.prepared import PreparedMap
+from engine.indexes.samples import BLOCK_PX, CELL_PX, SampleMap
+from engine.values import Window
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
 

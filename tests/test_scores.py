@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from engine import Fix, Frame, MatcherOptions, OptionError, OrthoMap, SceneMatcher
-from engine import prepared as prepared_map
 from engine.align import SCORES, enhance
 from engine.budget import Budget, Deadline
+from engine.indexes import prepared as prepared_map
+from engine.indexes.prepared import PreparedMap
 from engine.methods import ncc
-from engine.methods.laid import NccOptions
+from engine.methods.hypothesis import NccOptions
 from engine.methods.query import Query, Stopwatch
-from engine.prepared import PreparedMap
-from engine.types import Window
+from engine.values import Window
 
 CPU = torch.device("cpu")
 NADIR = np.array([310.0, 305.0])

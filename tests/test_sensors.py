@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from engine.errors import OptionError
-from engine.sim.quadrotor import STEP_S, Felt, hovering
+from engine.sim.quadrotor import STEP_S, IdealImu, hovering
 from engine.sim.sensors import (
     Barometer,
     Compass,
@@ -20,7 +20,7 @@ from engine.sim.sensors import (
 )
 
 STILL = hovering(np.array([10.0, -20.0, 120.0]), 359.5)
-NOTHING = Felt(np.zeros(3), np.zeros(3))
+NOTHING = IdealImu(np.zeros(3), np.zeros(3))
 
 
 def instruments(seed=0, **sensors):
@@ -54,7 +54,7 @@ def test_the_imus_biases_walk_as_far_as_they_should():
 
 
 def test_the_imu_adds_its_errors_to_what_is_felt():
-    felt = Felt(np.array([1.0, 2.0, -9.0]), np.array([0.1, 0.2, 0.3]))
+    felt = IdealImu(np.array([1.0, 2.0, -9.0]), np.array([0.1, 0.2, 0.3]))
     with_motion, without = instruments(4).imu(felt), instruments(4).imu(NOTHING)
     np.testing.assert_allclose(with_motion.force_mps2 - without.force_mps2, felt.force_mps2, atol=1e-12)
     np.testing.assert_allclose(with_motion.rates_rps - without.rates_rps, felt.rates_rps, atol=1e-12)

@@ -11,7 +11,7 @@ import pytest
 from engine import Camera, Fix, Frame, OrthoMap, Prior, SceneMatcher
 from engine.formats.flight import Flight, open_flight
 from engine.formats.truth import interpolate_truth, read_truth
-from engine.types import Truth
+from engine.values import Truth
 
 WRONG_M = 10.0
 

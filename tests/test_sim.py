@@ -24,7 +24,7 @@ from engine.sim import (
 from engine.sim.light import LIGHTS, sun_visibility
 from engine.sim.render import grid_from_enu, transformer
 from engine.sim.vehicle import STEP_S, fly, leg_accelerations
-from engine.types import Attitude
+from engine.values import Attitude
 
 EPSG = 32633
 GSD = 0.25

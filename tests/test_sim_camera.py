@@ -8,10 +8,10 @@ from test_sim import CAMERA, ORIGIN, TO_CRS, centre_of_bright, patch_world, proj
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.sim import FlightStyle, Optics, Sway, build_town, plan_flight, render_frame, take_picture
+from engine.sim import ExposureMotion, FlightStyle, Optics, build_town, plan_flight, render_frame, take_picture
 from engine.sim.flight import DRONE_SENSOR
 from engine.sim.optics import Sensor
-from engine.types import Attitude
+from engine.values import Attitude
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
 IDEAL = Sensor(
@@ -42,7 +42,7 @@ def test_an_ideal_camera_changes_nothing(town):
     where, attitude = tuple(town.pixel_to_crs @ (350.0, 350.0, 1.0)), Attitude(3.0, -4.0, 110.0)
     seen = render_frame(town.world, CAMERA, where, 150.0, attitude)
     expected = DRONE_SENSOR.develop(seen, np.random.default_rng(1)).tobytes()
-    fast = Sway((8.0, 3.0, 0.0), (5.0, 5.0, 5.0))
+    fast = ExposureMotion((8.0, 3.0, 0.0), (5.0, 5.0, 5.0))
     for optics, sway in ((None, None), (Optics(), None), (Optics(), fast), (Optics(exposure_ms=8.0), None)):
         assert snap(town.world, CAMERA, optics, sway, attitude, DRONE_SENSOR, where).tobytes() == expected
 
@@ -50,11 +50,11 @@ def test_an_ideal_camera_changes_nothing(town):
 def test_motion_blur_is_as_long_as_the_way_flown():
     world = patch_world(600, 600, 0.0)
     sharp, optics = snap(world), Optics(exposure_ms=50.0, looks=15)
-    blurred = snap(world, optics=optics, sway=Sway((50.0, 0.0, 0.0)))  # 2.5 m east: 4.33 px
+    blurred = snap(world, optics=optics, sway=ExposureMotion((50.0, 0.0, 0.0)))  # 2.5 m east: 4.33 px
     np.testing.assert_allclose(centre_of_bright(blurred), centre_of_bright(sharp), atol=0.05)
     length = 259.81 * 2.5 / 150.0
     np.testing.assert_allclose(spread(blurred) - spread(sharp), (length**2 / 12.0, 0.0), atol=0.3)
-    turned = snap(world, optics=optics, sway=Sway(turn_dps=(0.0, 20.0, 0.0)))  # nose up by 1 degree
+    turned = snap(world, optics=optics, sway=ExposureMotion(turn_dps=(0.0, 20.0, 0.0)))  # nose up by 1 degree
     length = 259.81 * np.radians(1.0)
     np.testing.assert_allclose(spread(turned) - spread(sharp), (0.0, length**2 / 12.0), atol=0.35)
 
@@ -63,7 +63,7 @@ def test_motion_blur_is_as_long_as_the_way_flown():
 def test_each_row_of_a_rolling_shutter_is_seen_from_where_the_camera_then_is(row):
     world = patch_world(600, row, 0.0)
     position = np.array([ORIGIN[0] + 6.3, ORIGIN[1] - 11.7])
-    sway, optics = Sway((30.0, -20.0, 4.0), (20.0, -10.0, 40.0)), Optics(readout_ms=60.0)
+    sway, optics = ExposureMotion((30.0, -20.0, 4.0), (20.0, -10.0, 40.0)), Optics(readout_ms=60.0)
     seen = centre_of_bright(snap(world, CAMERA, optics, sway, Attitude(2.0, -1.0, 5.0), grid=tuple(position)))
     after_s = (seen[1] / 299.0 - 0.5) * 0.06
     # East and north of the camera at that moment, on a grid that is turned by 1.08 degrees.

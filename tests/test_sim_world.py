@@ -29,8 +29,8 @@ from engine.sim.canvas import ASPHALT, CANOPY, GRASS
 from engine.sim.conditions import dress
 from engine.sim.light import LIGHTS, illuminate
 from engine.sim.raster_world import bare_ground
-from engine.sim.render import Air, Glint
-from engine.types import Attitude
+from engine.sim.render import Atmosphere, Glint
+from engine.values import Attitude
 
 TINY = {"width_px": 64, "height_px": 64}
 MIDDLING = {"width_px": 700, "height_px": 720}
@@ -136,7 +136,7 @@ def test_lamps_and_the_open_sky_light_what_they_can_reach():
 
 def test_haze_is_koschmieders():
     clear = patch_world(600, 600, 0.0)
-    air = Air(visibility_m=700.0, rgb=(180.0, 190.0, 200.0))
+    air = Atmosphere(visibility_m=700.0, rgb=(180.0, 190.0, 200.0))
     hazy = dataclasses.replace(clear, air=air)
     before, after = (render_frame(w, CAMERA, ORIGIN, 150.0, LEVEL).astype(float) for w in (clear, hazy))
     rays = np.linalg.inv(CAMERA.matrix) @ np.array([[150, 0, 299], [150, 0, 150], [1, 1, 1.0]])

@@ -11,10 +11,10 @@ from rasterio.enums import Resampling
 from rasterio.shutil import copy
 
 from engine.errors import MapError
+from engine.maps.rasters import GEOREFERENCE_TAG
+from engine.maps.tiles import vrt_of_folder
 from engine.orthomap import OrthoMap
-from engine.rasters import GEOREFERENCE_TAG
-from engine.tiles import vrt_of_folder
-from engine.types import Window
+from engine.values import Window
 
 UTM, WEST, NORTH, STEP_M = "EPSG:32633", 607400.0, 5345369.0, 0.5
 SIDE, TILE = 300, 128

@@ -14,9 +14,9 @@ from rasterio.shutil import copy
 
 from engine import OrthoMap
 from engine.errors import MapError
-from engine.rasters import open_source, stored_levels
-from engine.types import Window
-from engine.xyz import is_tile_cache
+from engine.maps.rasters import open_source, stored_levels
+from engine.maps.xyz_tiles import is_tile_cache
+from engine.values import Window
 
 ZOOM, TILE = 18, 64
 FIRST = (143_000, 90_500)  # column and row, from the north, of the first tile: near Vienna
@@ -90,7 +90,7 @@ def tiny_limits(monkeypatch):
     """A map of a few tiles is too large for memory, and for its coarsest level."""
     for module in ("metric_copy", "pyramid"):
         monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
-    monkeypatch.setattr("engine.metric_copy.COARSEST_PX", 200)
+    monkeypatch.setattr("engine.maps.metric_copy.COARSEST_PX", 200)
 
 
 def there():
@@ -205,7 +205,7 @@ def test_opening_reads_one_tile_and_a_large_map_only_its_coarse_ones(
     source = open_source(folder)
     assert len(opened) == 1
     assert stored_levels(source) == (0, 1, 2)
-    monkeypatch.setattr("engine.rasters.OVERVIEW_PX", 80)
+    monkeypatch.setattr("engine.maps.rasters.OVERVIEW_PX", 80)
     site = OrthoMap.open(folder)
     assert site.is_large
     assert {place[0] for place in opened[2:]} == {"16"}

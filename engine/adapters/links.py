@@ -16,7 +16,7 @@ Sender = tuple[str, int] | None
 """Who sent a datagram; None on a link with one other end."""
 
 _DATAGRAM_BYTES = 65535
-_MOST_AT_ONCE = 256  # datagrams, so that a flood cannot keep the reader from its other work
+_MAX_AT_ONCE = 256  # datagrams, so that a flood cannot keep the reader from its other work
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
@@ -131,7 +131,7 @@ class _Udp:
         if _wait(self._socket, timeout_s):
             # Refused means that nobody listens there yet.
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
-                while len(got) < _MOST_AT_ONCE:
+                while len(got) < _MAX_AT_ONCE:
                     data, sender = self._socket.recvfrom(_DATAGRAM_BYTES)
                     got.append((data, sender[:2] if self._listens else None))
         return got

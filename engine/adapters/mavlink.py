@@ -34,11 +34,11 @@ from engine.adapters.packets import Decoder, Encoder
 from engine.adapters.vehicle import Origin
 from engine.live import Answer, Live, LiveOptions
 from engine.navigator import Navigator
-from engine.types import Fix, NoFix, Prior
+from engine.values import Fix, NoFix, Prior
 
 _log = logging.getLogger("scenematch")
 
-LEAST_HZ = 4.0
+MIN_RATE_HZ = 4.0
 """Slower than this ArduPilot's estimator does not hold on to external navigation."""
 
 _POLL_S = 0.02

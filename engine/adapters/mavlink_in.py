@@ -12,7 +12,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.vehicle import ANGLES, Origin, Series, Vehicle, only
+from engine.adapters.vehicle import ANGLES, Origin, RecentValues, Vehicle, only
 
 FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 STREAMS_HZ = {
@@ -95,9 +95,9 @@ class Telemetry:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._clock = Clock()
-        self._attitude, self._velocity = Series(ANGLES), Series()
-        self._range, self._clearance, self._relative = Series(), Series(), Series()
-        self._alt_amsl, self._down = Series(), Series()
+        self._attitude, self._velocity = RecentValues(ANGLES), RecentValues()
+        self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
+        self._alt_amsl, self._down = RecentValues(), RecentValues()
         self._unix_offset_ns: int | None = None
         self._stale_stamps = 0
         self.origin: Origin | None = None

@@ -19,7 +19,7 @@ from engine.adapters.parameters import MAX_DELAY_MS
 from engine.adapters.vehicle import ANGLE_VARIANCE, Origin, Vehicle, north_east_m
 from engine.errors import OptionError
 from engine.geo import enu_from_body
-from engine.types import Fix, check_positive
+from engine.values import Fix, check_positive
 
 MESSAGES = {
     "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),

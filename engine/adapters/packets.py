@@ -17,8 +17,8 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 BRIDGE = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
-_MOST_BYTES = 65536  # of a stream that never makes a packet
-_MOST_FAILED = 64  # beginnings in a datagram that are none, after which the rest is noise: a flood must stay cheap
+_MAX_BYTES = 65536  # of a stream that never makes a packet
+_MAX_FAILED = 64  # beginnings in a datagram that are none, after which the rest is noise: a flood must stay cheap
 _SIGNING_EPOCH_S = 1420070400  # 1 January 2015, from which signatures count
 _STREAM_AGE = 60 * 100_000  # how far behind our clock a new signed stream may begin, in 10 us
 
@@ -105,7 +105,7 @@ class Decoder:
             if message is None:
                 self.dropped += 1
                 failed += 1
-                if failed > _MOST_FAILED and not self._is_stream:
+                if failed > _MAX_FAILED and not self._is_stream:
                     break
                 at += 1  # no packet begins here, or none of which anybody knows where it ends
                 continue
@@ -116,7 +116,7 @@ class Decoder:
                 else:
                     self.dropped += 1
         del self._buffer[: at if self._is_stream else None]
-        if len(self._buffer) > _MOST_BYTES:
+        if len(self._buffer) > _MAX_BYTES:
             self._buffer.clear()
         return messages
 

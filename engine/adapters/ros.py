@@ -16,14 +16,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from engine.adapters.ros_out import RosOptions, diagnostics, is_finite, pose, window_picture
-from engine.adapters.vehicle import ANGLES, Series, Vehicle, only
+from engine.adapters.vehicle import ANGLES, RecentValues, Vehicle, only
 from engine.errors import EngineError
-from engine.formats import bags
-from engine.formats.ros_messages import Maker, attitude_of, picture_of, range_of, stamp_ns
+from engine.formats.ros import bags
+from engine.formats.ros.messages import MessageFactory, attitude_of, picture_of, range_of, stamp_ns
 from engine.live import Answer, Counts, Live, LiveOptions
 from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
-from engine.types import Fix, NoFix, Prior
+from engine.values import Fix, NoFix, Prior
 
 OUTPUTS = {
     "pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -43,7 +43,7 @@ Handler = Callable[[Any], None]
 class RosNode(Protocol):
     """What a node of either ROS does for the bridge."""
 
-    maker: Maker
+    maker: MessageFactory
 
     def now_ns(self) -> int:
         """The time of ROS, simulated where it is."""
@@ -110,8 +110,8 @@ class RosTelemetry:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._attitude, self._compass, self._velocity = Series(ANGLES), Series((True,)), Series()
-        self._range, self._height = Series(), Series()
+        self._attitude, self._compass, self._velocity = RecentValues(ANGLES), RecentValues((True,)), RecentValues()
+        self._range, self._height = RecentValues(), RecentValues()
 
     def imu(self, message: Any) -> None:
         """Take a sensor_msgs/Imu."""
@@ -160,7 +160,7 @@ class RosTelemetry:
             down_m=None if height_m is None else -height_m,
         )
 
-    def _add(self, series: Series, time_ns: int, *values: float) -> None:
+    def _add(self, series: RecentValues, time_ns: int, *values: float) -> None:
         with self._lock:
             if series.last_ns is not None and time_ns < series.last_ns - _BACK_NS:
                 series.clear()

@@ -9,7 +9,7 @@ from typing import Any
 
 from engine.adapters.ros import OUTPUTS, Handler, find_class
 from engine.errors import BackendError
-from engine.formats.ros_messages import Maker
+from engine.formats.ros.messages import MessageFactory
 
 _IMAGE_BUFFER_BYTES = 2**24  # by rospy's default of 64 kB pictures queue up in the socket, and grow old there
 
@@ -37,7 +37,7 @@ class Node:
             raise BackendError(f"bridge: expected a ROS master at {rosgraph.get_master_uri()}, got no answer")
         self._rospy = rospy
         rospy.init_node(name)
-        self.maker = Maker(find_class, True, genpy.Time, octets=lambda values: values.tobytes())
+        self.maker = MessageFactory(find_class, True, genpy.Time, octets=lambda values: values.tobytes())
         self._publishers = {
             output: rospy.Publisher(_topic(output), find_class(kind), queue_size=10, tcp_nodelay=True)
             for output, kind in OUTPUTS.items()

@@ -10,7 +10,7 @@ from typing import Any
 
 from engine.adapters.ros import OUTPUTS, Handler, find_class
 from engine.errors import BackendError
-from engine.formats.ros_messages import Maker
+from engine.formats.ros.messages import MessageFactory
 
 _LOOPBACK = {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}  # up to Humble; from Iron on
 
@@ -36,7 +36,7 @@ class Node:
         rclpy.init()
         self._rclpy, self._quality = rclpy, qos_profile_sensor_data
         self._node = rclpy.create_node(name)
-        self.maker = Maker(
+        self.maker = MessageFactory(
             find_class,
             False,
             octets=lambda values: array.array("B", values.tobytes()),  # a list would be checked byte by byte

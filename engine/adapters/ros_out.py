@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from engine.adapters.vehicle import ANGLE_VARIANCE, Origin, Vehicle, north_east_m
 from engine.errors import OptionError
-from engine.formats.ros_messages import Maker
+from engine.formats.ros.messages import MessageFactory
 from engine.geo import LocalFrame
 from engine.orthomap import OrthoMap
-from engine.types import Fix, Window
+from engine.values import Fix, Window
 
 FIRMWARES = ("none", "ardupilot", "px4")
 """For whom a pose is: an autopilot behind MAVROS has its own projection, and its own way with covariances."""
@@ -49,7 +49,9 @@ def is_finite(fix: Fix) -> bool:
     return all(map(math.isfinite, numbers))
 
 
-def pose(maker: Maker, fix: Fix, vehicle: Vehicle, captured_ns: int, site: OrthoMap, options: RosOptions) -> Any:
+def pose(
+    maker: MessageFactory, fix: Fix, vehicle: Vehicle, captured_ns: int, site: OrthoMap, options: RosOptions
+) -> Any:
     """A fix as geometry_msgs/PoseWithCovarianceStamped: east, north and up about the origin.
 
     Up is the vehicle's own height above take-off, else above the ground, else the fix's above the map's ground.
@@ -111,7 +113,7 @@ def pose_covariance(
     return covariance
 
 
-def diagnostics(maker: Maker, time_ns: int, level: int, text: str, values: dict[str, str]) -> Any:
+def diagnostics(maker: MessageFactory, time_ns: int, level: int, text: str, values: dict[str, str]) -> Any:
     """A diagnostic_msgs/DiagnosticArray of one status."""
     pairs = [maker.make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
     status = maker.make(

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.types import Frame
+from engine.values import Frame
 
 ANGLES = (True, True, True)
-"""Roll, pitch and heading, as :class:`Series` takes them."""
+"""Roll, pitch and heading, as :class:`RecentValues` takes them."""
 ANGLE_VARIANCE = math.radians(10.0) ** 2
 """Square radians that an attitude is sent with: it is the vehicle's own, and nothing to learn from."""
 
@@ -67,7 +67,7 @@ class Vehicle:
         )
 
 
-class Series:
+class RecentValues:
     """Values over time, the newest few.
 
     Args:

@@ -12,9 +12,8 @@ from engine import device as devices
 from engine.budget import Budget
 from engine.cli import console
 from engine.errors import EngineError, OptionError
-from engine.motion import WIDEST_M
 from engine.orthomap import OrthoMap
-from engine.types import Prior
+from engine.values import MAX_SIGMA_M, Prior
 
 START_SIGMA_M = 15.0
 """Uncertainty of a position that was given without one."""
@@ -30,8 +29,8 @@ def parse_position(name: str, text: str | None) -> Prior | None:
         return None
     numbers = _numbers(name, text, "LAT,LON[,SIGMA_M]", (2, 3))
     sigma_m = numbers[2] if numbers[2:] else START_SIGMA_M
-    if sigma_m > WIDEST_M:
-        raise OptionError(f"{name}: expected a SIGMA_M of at most {WIDEST_M:g} m, got {sigma_m:g}")
+    if sigma_m > MAX_SIGMA_M:
+        raise OptionError(f"{name}: expected a SIGMA_M of at most {MAX_SIGMA_M:g} m, got {sigma_m:g}")
     try:
         return Prior(lat_deg=numbers[0], lon_deg=numbers[1], sigma_m=sigma_m)
     except OptionError as error:
@@ -139,9 +138,9 @@ def open_map(
     Raises:
         OptionError: the last is not above 0, or wider than any map.
     """
-    if sigma_m is not None and not 0.0 < sigma_m <= WIDEST_M:
-        raise OptionError(f"--map-sigma-m: expected a number above 0 and at most {WIDEST_M:g}, got {sigma_m:g}")
-    with console.told_progress("copying the map into the cache") as tell:
+    if sigma_m is not None and not 0.0 < sigma_m <= MAX_SIGMA_M:
+        raise OptionError(f"--map-sigma-m: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {sigma_m:g}")
+    with console.progress_callback("copying the map into the cache") as tell:
         return OrthoMap.open(path, surface=surface, georeference_sigma_m=sigma_m, on_copy=tell)
 
 

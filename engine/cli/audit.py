@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.audit import Audit, Route, gather, predict
-from engine.audit_plan import AuditOptions, Part, Plan, plan_audit
+from engine.audit.availability import Audit, RouteAvailability, gather, predict
+from engine.audit.plan import AuditOptions, AuditPlan, MapPart, plan_audit
+from engine.audit.self_match import SelfMatchStatistics, measure
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_folder, named_as_typed, open_map, parse_circle, prepare_folder
@@ -19,7 +20,6 @@ from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
 from engine.orthomap import SEARCH_LIMIT_PX, OrthoMap
-from engine.self_match import Evidence, measure
 
 OWNED = ("matchability.tif", "audit.png", "summary.json")
 NODATA = -1.0
@@ -28,7 +28,7 @@ PAPER_CAMERA, PAPER_HEIGHT_M = (300, 300, 60.0), 150.0
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class AuditFiles:
     """The files of an audit, the height, and what part of the map it is of; None where not given.
 
     Attributes:
@@ -46,7 +46,7 @@ class Inputs:
     corridor_m: float | None = None
 
 
-def run_audit(inputs: Inputs, out: Path, *, sigma_m: float, force: bool, as_json: bool) -> dict[str, Any]:
+def run_audit(inputs: AuditFiles, out: Path, *, sigma_m: float, force: bool, as_json: bool) -> dict[str, Any]:
     """Audit, write raster, picture and summary, and print the summary."""
     check_folder(out, force)
     around = parse_circle("--around", inputs.around)
@@ -83,7 +83,7 @@ def _part(
     waypoints: NDArray[np.float64] | None,
     corridor_m: float | None,
     site: OrthoMap,
-) -> Part | None:
+) -> MapPart | None:
     """The part of the map that was asked for; None is all of it, which a huge map is never audited as.
 
     Raises:
@@ -95,9 +95,9 @@ def _part(
             raise OptionError(
                 f"--around: expected a place on the map {site.name}, got {around[0]:g},{around[1]:g}"
             )
-        return Part(around=around, route=waypoints, corridor_m=corridor_m)
+        return MapPart(around=around, route=waypoints, corridor_m=corridor_m)
     if waypoints is not None and (corridor_m is not None or not site.is_searchable):
-        return Part(route=waypoints, corridor_m=corridor_m)
+        return MapPart(route=waypoints, corridor_m=corridor_m)
     if not site.is_searchable:
         raise OptionError(
             f"--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of {site.size_km} is not "
@@ -106,7 +106,7 @@ def _part(
     return None
 
 
-def _check_size(plan: Plan, part: Part | None) -> None:
+def _check_size(plan: AuditPlan, part: MapPart | None) -> None:
     """Refuse a part so large that its places would say nothing of what lies between them.
 
     Raises:
@@ -138,7 +138,7 @@ def _check_route(waypoints: NDArray[np.float64], site: OrthoMap) -> None:
         )
 
 
-def _write(out: Path, audit: Audit, route: Route | None, title: str) -> None:
+def _write(out: Path, audit: Audit, route: RouteAvailability | None, title: str) -> None:
     from engine.report.audit import draw_audit
 
     raster = np.nan_to_num(audit.availability, nan=NODATA).astype(np.float32)
@@ -161,7 +161,7 @@ def _cells_to_crs(audit: Audit) -> tuple[NDArray[np.float64], int]:
     return np.column_stack([right - origin, below - origin, origin]), epsg
 
 
-def summary(audit: Audit, route: Route | None, inputs: Inputs) -> dict[str, Any]:
+def summary(audit: Audit, route: RouteAvailability | None, inputs: AuditFiles) -> dict[str, Any]:
     """What summary.json holds."""
     plan = audit.plan
     known = np.isfinite(audit.availability)
@@ -180,12 +180,14 @@ def summary(audit: Audit, route: Route | None, inputs: Inputs) -> dict[str, Any]
         "spacing_m": (plan.spacing_px * plan.site.gsd_m_per_px).tolist(),
         "availability": float(audit.availability[known].mean()) if known.any() else None,
         "shares": audit.shares,
-        "evidence_median": {one.name: _median(getattr(audit.evidence, one.name)) for one in fields(Evidence)},
+        "evidence_median": {
+            one.name: _median(getattr(audit.evidence, one.name)) for one in fields(SelfMatchStatistics)
+        },
         "route": None if route is None else _route_facts(route, str(inputs.route)),
     }
 
 
-def _part_facts(plan: Plan, inputs: Inputs) -> dict[str, Any] | None:
+def _part_facts(plan: AuditPlan, inputs: AuditFiles) -> dict[str, Any] | None:
     """What part of the map was audited; None for all of it."""
     if plan.looked.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
         return None
@@ -202,7 +204,7 @@ def _median(values: NDArray[np.float64]) -> float | None:
     return float(np.median(known)) if known.size else None
 
 
-def _route_facts(route: Route, path: str) -> dict[str, Any]:
+def _route_facts(route: RouteAvailability, path: str) -> dict[str, Any]:
     return {
         "path": path,
         "length_m": route.length_m,
@@ -211,7 +213,7 @@ def _route_facts(route: Route, path: str) -> dict[str, Any]:
     }
 
 
-def _pairs(audit: Audit, route: Route | None) -> list[tuple[str, str]]:
+def _pairs(audit: Audit, route: RouteAvailability | None) -> list[tuple[str, str]]:
     plan = audit.plan
     footprint = " x ".join(f"{n * 2.0**plan.level * plan.site.gsd_m_per_px:.0f}" for n in plan.view.footprint_px)
     pairs = [

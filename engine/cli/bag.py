@@ -9,8 +9,8 @@ from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_choice
 from engine.errors import OptionError
-from engine.formats.bag_writer import KINDS, check_place, write_bag
 from engine.formats.flight import open_flight
+from engine.formats.ros.bag_writer import KINDS, check_place, write_bag
 from engine.formats.truth import read_truth
 
 
@@ -20,7 +20,7 @@ def run_bag(directory: Path, out: Path, kind: str | None, *, force: bool = False
     Args:
         directory: the flight folder.
         out: the bag.
-        kind: one of :data:`engine.formats.bag_writer.KINDS`; None is ros1 for a name that ends in .bag, else
+        kind: one of :data:`engine.formats.ros.bag_writer.KINDS`; None is ros1 for a name that ends in .bag, else
             ros2-mcap.
         force: whether the bag may be there already; it stays until the new one is whole.
 

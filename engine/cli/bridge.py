@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 _SAY_EVERY_S = 5.0
 _HEAR_S = 10.0
-_MOST_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
-_MOST_GRAB_MS = 10_000.0
+_MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
+_MAX_GRAB_MS = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class BridgeFiles:
     """The map, the camera, and where pictures come from: files or a camera, one of the two."""
 
     map: Path
@@ -63,9 +63,9 @@ class Inputs:
             refuse_given({"--exposure-to-grab-ms": self.exposure_to_grab_ms}, "--camera-source")
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
             raise OptionError(f"--rate-hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
-        if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MOST_GRAB_MS:
+        if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MAX_GRAB_MS:
             raise OptionError(
-                f"--exposure-to-grab-ms: expected 0 to {_MOST_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
+                f"--exposure-to-grab-ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
             )
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[Picture]:
@@ -77,7 +77,7 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wire:
+class LinkSettings:
     """How the autopilot is reached and what it is told, as the command line has it.
 
     Raises:
@@ -98,14 +98,14 @@ class Wire:
     def __post_init__(self) -> None:
         if not self.set_origin:
             refuse_given({"--origin-alt-m": self.origin_alt_m}, "--set-origin")
-        if self.origin_alt_m is not None and not abs(self.origin_alt_m) <= _MOST_ALT_M:
+        if self.origin_alt_m is not None and not abs(self.origin_alt_m) <= _MAX_ALT_M:
             raise OptionError(
-                f"--origin-alt-m: expected {-_MOST_ALT_M:g} to {_MOST_ALT_M:g}, got {self.origin_alt_m:g}"
+                f"--origin-alt-m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Matching:
+class MatchSettings:
     """How frames are matched, as the command line has it.
 
     Raises:
@@ -131,7 +131,9 @@ class Matching:
             return LiveOptions(deadline_ms=self.deadline_ms)
 
 
-def run_bridge(inputs: Inputs, wire: Wire, matching: Matching, *, as_json: bool, watching: Watching) -> None:
+def run_bridge(
+    inputs: BridgeFiles, wire: LinkSettings, matching: MatchSettings, *, as_json: bool, watching: Watching
+) -> None:
     """Bridge until the pictures end, the time is over or somebody interrupts, and print what was done."""
     _need_pymavlink()
     watching.check()
@@ -193,7 +195,7 @@ def _outgoing(firmware: str, message: str, max_sigma_m: float) -> Outgoing:
         return Outgoing(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
 
 
-def _origin(site: OrthoMap, wire: Wire) -> Origin | None:
+def _origin(site: OrthoMap, wire: LinkSettings) -> Origin | None:
     """The map's, at the height of its ground where none is told."""
     if not wire.set_origin:
         return None
@@ -241,9 +243,9 @@ def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
 
 
 def _line(status: Status) -> str:
-    from engine.adapters.mavlink import LEAST_HZ
+    from engine.adapters.mavlink import MIN_RATE_HZ
 
     reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"
     heard = "autopilot heard" if status.connected else "no autopilot"
-    slow = f" (below {LEAST_HZ:g} Hz an estimator may let go)" if status.rate_hz < LEAST_HZ else ""
+    slow = f" (below {MIN_RATE_HZ:g} Hz an estimator may let go)" if status.rate_hz < MIN_RATE_HZ else ""
     return f"{heard}; sent {status.sent}, {status.rate_hz:.1f} Hz{slow}; not sent: {reasons}"

@@ -97,17 +97,17 @@ def mavlink(
     Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
     played at their own pace, until they end.
     """
-    from engine.cli.bridge import Inputs, Matching, Wire, run_bridge
+    from engine.cli.bridge import BridgeFiles, LinkSettings, MatchSettings, run_bridge
     from engine.cli.watching import Watching
 
     use_threads(threads)
-    inputs = Inputs(map_path, surface, camera, frames, telemetry, source, rate, grab, map_sigma)
-    wire = Wire(
+    inputs = BridgeFiles(map_path, surface, camera, frames, telemetry, source, rate, grab, map_sigma)
+    wire = LinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
         message=message, max_sigma_m=max_sigma, set_origin=set_origin, origin_alt_m=origin_alt,
         use_velocity=use_velocity,
     )  # fmt: skip
-    matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
+    matching = MatchSettings(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
     run_bridge(inputs, wire, matching, as_json=as_json, watching=Watching(rerun, rerun_connect))
 
 
@@ -183,8 +183,8 @@ def ros(
     An empty name of a topic leaves it out.
     """
     from engine.adapters.ros import Topics
-    from engine.cli.bridge import Matching
-    from engine.cli.bridge_ros import Inputs, run_bridge_ros
+    from engine.cli.bridge import MatchSettings
+    from engine.cli.bridge_ros import RosFiles, run_bridge_ros
     from engine.cli.watching import Watching
 
     use_threads(threads)
@@ -192,7 +192,7 @@ def ros(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
         velocity=velocity,
     )  # fmt: skip
-    matching = Matching(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
-    inputs = Inputs(map_path, surface, camera, topics, map_sigma)
+    matching = MatchSettings(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
+    inputs = RosFiles(map_path, surface, camera, topics, map_sigma)
     watching = Watching(rerun, rerun_connect)
     run_bridge_ros(version, inputs, matching, firmware, origin, as_json=as_json, watching=watching)

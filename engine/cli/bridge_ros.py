@@ -11,18 +11,18 @@ from engine.adapters.vehicle import Origin
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import named_as_typed, open_map, parse_position
-from engine.cli.bridge import Matching
+from engine.cli.bridge import MatchSettings
 from engine.cli.checks import check_place
 from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError
-from engine.formats.ros_messages import camera_of
+from engine.formats.ros.messages import camera_of
 from engine.matcher import SceneMatcher
 
 _PATIENCE_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class RosFiles:
     """The map, the calibration where a file has it, and the topics."""
 
     map: Path
@@ -38,8 +38,8 @@ class Inputs:
 
 def run_bridge_ros(
     version: int,
-    inputs: Inputs,
-    matching: Matching,
+    inputs: RosFiles,
+    matching: MatchSettings,
     firmware: str,
     origin: str | None,
     *,

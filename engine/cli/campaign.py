@@ -11,7 +11,7 @@ from pathlib import Path
 
 from engine.cli import console
 from engine.cli.arguments import check_folder
-from engine.cli.campaign_plan import RUNS, WORKSHOP, Plan, plan_campaign
+from engine.cli.campaign_plan import RUNS, WORKSHOP, CampaignPlan, plan_campaign
 from engine.cli.executors import Execute, in_processes, on_ray
 from engine.cli.jobs import Job, do, read_result
 from engine.errors import OptionError
@@ -60,7 +60,7 @@ def run_campaign(
     return lines
 
 
-def _left(plan: Plan, force: bool) -> dict[str, Job]:
+def _left(plan: CampaignPlan, force: bool) -> dict[str, Job]:
     """The jobs that are not finished, by name; those that others were finished in place of are named.
 
     Raises:

@@ -14,13 +14,13 @@ from pathlib import Path
 from engine.cli.arguments import check_choice
 from engine.cli.compare import Run, parse_runs
 from engine.cli.jobs import Draw, Follow, Job
-from engine.cli.simulate import Scene
-from engine.cli.track import Inputs, folder_inputs
+from engine.cli.simulate import WorldSettings
+from engine.cli.track import FlightFiles, folder_inputs
 from engine.errors import OptionError
 from engine.formats.datasets.recording import ABOUT
-from engine.formats.logs import AS_LOGGED, LogClock
+from engine.formats.logs.readers import AS_LOGGED, LogClock
 from engine.formats.settings import read_settings
-from engine.rasters import GEOREFERENCE_TAG, stated_sigma
+from engine.maps.rasters import GEOREFERENCE_TAG, stated_sigma
 from engine.sim import CONDITIONS
 from engine.sim.town import RELIEF_MAX_M
 
@@ -69,7 +69,7 @@ class RecordedFlight:
             raise OptionError(f"log_{error}") from None
         stated_sigma(self.map_sigma_m, None, GEOREFERENCE_TAG, "map_sigma_m")
 
-    def inputs(self, name: str, base: Path) -> Inputs:
+    def inputs(self, name: str, base: Path) -> FlightFiles:
         """The files as `track` takes them.
 
         Raises:
@@ -91,7 +91,7 @@ class RecordedFlight:
 
         stamps = optional("frame_stamps")
         try:
-            return Inputs(
+            return FlightFiles(
                 map=needed("map"),
                 surface=optional("surface"),
                 camera=needed("camera"),
@@ -163,7 +163,7 @@ class Campaign:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CampaignPlan:
     """All the jobs of a campaign.
 
     Attributes:
@@ -177,7 +177,7 @@ class Plan:
     groups: dict[str, str]
 
 
-def plan_campaign(path: Path, out: Path) -> Plan:
+def plan_campaign(path: Path, out: Path) -> CampaignPlan:
     """Read a campaign's file, and find every input.
 
     Raises:
@@ -190,9 +190,9 @@ def plan_campaign(path: Path, out: Path) -> Plan:
         raise OptionError(f"{path}: {error}") from None
 
 
-def _planned(campaign: Campaign, base: Path, out: Path) -> Plan:
+def _planned(campaign: Campaign, base: Path, out: Path) -> CampaignPlan:
     runs = _runs(campaign, base)
-    drawn, inputs, groups, prints = [], dict[str, Inputs](), dict[str, str](), dict[str, dict[str, str]]()
+    drawn, inputs, groups, prints = [], dict[str, FlightFiles](), dict[str, str](), dict[str, dict[str, str]]()
     for name, scene in _scenes(campaign.simulated):
         if name in campaign.flights:
             raise OptionError(f"flights.{name}: expected another name, this is a simulated flight's")
@@ -216,7 +216,7 @@ def _planned(campaign: Campaign, base: Path, out: Path) -> Plan:
         for run in runs:
             name, made_of = f"{flight_name}/{run.name}", prints[flight_name] | _settings_print(run)
             jobs.append(Job(name, out / RUNS / name, out / WORKSHOP, made_of, Follow(files, run.settings)))
-    return Plan(drawn, jobs, groups)
+    return CampaignPlan(drawn, jobs, groups)
 
 
 def _dataset(folder: Path) -> str | None:
@@ -244,13 +244,16 @@ def _runs(campaign: Campaign, base: Path) -> list[Run]:
     ]
 
 
-def _scenes(simulated: SimulatedFlights) -> Iterator[tuple[str, Scene]]:
+def _scenes(simulated: SimulatedFlights) -> Iterator[tuple[str, WorldSettings]]:
     for condition in simulated.conditions:
         for seed in simulated.seeds:
-            yield f"town-{seed}-{condition}", Scene(seed=seed, condition=condition, relief_m=simulated.relief_m)
+            yield (
+                f"town-{seed}-{condition}",
+                WorldSettings(seed=seed, condition=condition, relief_m=simulated.relief_m),
+            )
 
 
-def _drawing(name: str, scene: Scene, frames: int | None, out: Path) -> Job:
+def _drawing(name: str, scene: WorldSettings, frames: int | None, out: Path) -> Job:
     made_of = {"simulation": json.dumps(scene.facts() | {"frames": frames}), "engine": version("scenematch")}
     return Job(name, out / FLIGHTS / name, out / WORKSHOP, made_of, Draw(scene, frames))
 
@@ -263,7 +266,7 @@ def _settings_print(run: Run) -> dict[str, str]:
     }
 
 
-def _fingerprints(inputs: Inputs) -> dict[str, str]:
+def _fingerprints(inputs: FlightFiles) -> dict[str, str]:
     """A hash of the content of each input; no stamp of a file has to be trusted."""
     files = {name: getattr(inputs, name) for name in ("map", "surface", "camera", "frames", "telemetry", "truth")}
     clock = inputs.clock or AS_LOGGED

@@ -10,7 +10,7 @@ from engine.errors import CalibrationError, OptionError, TelemetryError
 from engine.formats.flight import Flight
 from engine.formats.frames import PictureFolder
 from engine.orthomap import OrthoMap
-from engine.types import Prior
+from engine.values import Prior
 
 
 def check_pictures(flight: Flight, camera: Camera) -> None:

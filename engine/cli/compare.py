@@ -10,9 +10,9 @@ from typing import Any
 
 from engine.cli import console
 from engine.cli.arguments import check_folder, prepare_folder
-from engine.cli.track import Inputs, Settings, open_inputs, run_track, settings_from
+from engine.cli.track import FlightFiles, Settings, open_inputs, run_track, settings_from
 from engine.errors import OptionError
-from engine.formats.logs import open_truth
+from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
 from engine.matcher import METHODS
 from engine.report.comparison import draw_comparison
@@ -62,7 +62,7 @@ def _run(text: str, given: Mapping[str, Any]) -> Run:
     return Run(Path(text).stem, settings_from(Path(text), **given))
 
 
-def run_compare(inputs: Inputs, out: Path, runs: Sequence[Run], *, force: bool) -> dict[str, dict[str, Any]]:
+def run_compare(inputs: FlightFiles, out: Path, runs: Sequence[Run], *, force: bool) -> dict[str, dict[str, Any]]:
     """Follow the flight once for each run; every run's folder is as ``track`` writes it.
 
     The inputs are read and held against every run's settings before the first run begins and before a folder is

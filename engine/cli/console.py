@@ -34,7 +34,7 @@ def progress(items: Iterable[T], total: int, description: str) -> Iterator[T]:
 
 
 @contextmanager
-def told_progress(description: str) -> Iterator[Callable[[int, int], None]]:
+def progress_callback(description: str) -> Iterator[Callable[[int, int], None]]:
     """A function to be told how much is done and how much there is: a bar on a terminal from then on.
 
     So what turns out to take no time shows nothing, as everything does in a pipe.

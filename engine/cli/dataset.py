@@ -17,8 +17,8 @@ from engine.formats.datasets.ortholoc import find_ortholoc, read_ortholoc
 from engine.formats.datasets.recording import (
     ABOUT,
     OWNED,
+    ImportOptions,
     Recording,
-    Told,
     check_complete,
     clear_frames,
     write_recording,
@@ -30,7 +30,7 @@ from engine.formats.datasets.wildnav import read_wildnav
 from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
 from engine.formats.truth_checks import Finding, check_truth
-from engine.rasters import open_source
+from engine.maps.rasters import open_source
 
 FLIGHTS, SINGLES = ("uav-visloc", "wildnav", "vpair", "alto"), ("anyvisloc", "ortholoc")
 KINDS = (*FLIGHTS, *SINGLES)
@@ -39,7 +39,7 @@ _MAPS = "map"
 
 
 def run_import(
-    kind: str, root: Path, out: Path, told: Told, *, part: str | None, gsd_m: float | None, force: bool
+    kind: str, root: Path, out: Path, told: ImportOptions, *, part: str | None, gsd_m: float | None, force: bool
 ) -> dict[str, Any]:
     """Turn a download into a flight folder, and look at its truth.
 

@@ -68,7 +68,7 @@ def import_dataset(
     truth. Single photographs become flights of one frame each, with a campaign's file that lists them.
     """
     from engine.cli.dataset import SINGLES, Choice, run_import, run_import_singles
-    from engine.formats.datasets.recording import Told
+    from engine.formats.datasets.recording import ImportOptions
 
     of_singles = {"reference": reference, "max_tilt_deg": max_tilt, "limit": limit}
     added = {
@@ -89,7 +89,7 @@ def import_dataset(
     else:
         if (camera is None) == (hfov is None):
             raise OptionError("--camera, --hfov-deg: expected one of the two")
-        told = Told(
+        told = ImportOptions(
             camera=camera if camera is not None else float(hfov or 0.0),
             map=map_path,
             surface=surface,

@@ -8,11 +8,11 @@ from typing import Any
 from engine.cli import console
 from engine.cli.arguments import check_device, check_folder, prepare_folder
 from engine.cli.compare import CHART, COLUMNS, TABLE, USUAL, cells, parse_runs, run_compare
-from engine.cli.track import Inputs, folder_inputs
+from engine.cli.track import FlightFiles, folder_inputs
 from engine.formats.flight import write_flight_folder
-from engine.sim import Plan, plan_flight
+from engine.sim import FlightPlan, plan_flight
 from engine.sim.town import EXACT
-from engine.types import Prior
+from engine.values import Prior
 
 PAPER_TABLE = {"ncc": (2.4, 40.0), "sift": (2.1, 121.0)}
 """Table I of the paper: RMS error in metres and execution time in milliseconds."""
@@ -40,7 +40,7 @@ def run_demo(
     return results
 
 
-def write_flight(directory: Path, plan: Plan) -> Inputs:
+def write_flight(directory: Path, plan: FlightPlan) -> FlightFiles:
     """Put the simulated flight on disk as any other flight is; it is then read back like one."""
     truth = plan.truth_rows()
     start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)

@@ -10,7 +10,7 @@ from engine.cli.arguments import check_choice
 from engine.cli.record import read_record
 from engine.errors import OptionError, TelemetryError
 from engine.formats.export import WRITERS, segments
-from engine.formats.logs import open_truth
+from engine.formats.logs.readers import open_truth
 from engine.formats.track import TrackRow, read_track
 from engine.formats.truth import interpolate_truth
 from engine.geo import LocalFrame

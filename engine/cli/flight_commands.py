@@ -111,13 +111,13 @@ def track(
     Writes track.csv (one row a frame), summary.json and figures into the output folder. Without --start the
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
-    from engine.cli.track import Inputs, camera_or_bag, parse_clock, run_track, settings_from
+    from engine.cli.track import FlightFiles, camera_or_bag, parse_clock, run_track, settings_from
     from engine.cli.watching import Watching
 
     use_threads(threads)
     clock = parse_clock(frame_stamps, log_offset)
     calibration = camera_or_bag(camera, frames)
-    inputs = Inputs(map_path, surface, calibration, frames, telemetry, truth, clock, image_topic, map_sigma)
+    inputs = FlightFiles(map_path, surface, calibration, frames, telemetry, truth, clock, image_topic, map_sigma)
     settings = settings_from(
         settings_path, method=method, profile=profile, device=device, start=start, budget_ms=budget_ms
     )
@@ -160,12 +160,12 @@ def compare(
     and one chart.
     """
     from engine.cli.compare import parse_runs, print_comparison, run_compare
-    from engine.cli.track import Inputs, parse_clock
+    from engine.cli.track import FlightFiles, parse_clock
 
     use_threads(threads)
     wanted = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
     clock = parse_clock(frame_stamps, log_offset)
-    inputs = Inputs(map_path, surface, camera, frames, telemetry, truth, clock, image_topic, map_sigma)
+    inputs = FlightFiles(map_path, surface, camera, frames, telemetry, truth, clock, image_topic, map_sigma)
     results = run_compare(inputs, out, wanted, force=force)
     if as_json:
         console.print_json(results)
@@ -271,11 +271,11 @@ def simulate(
     folder holds its track, estimate, figures and summary too.
     """
     from engine.cli.arguments import refuse_given
-    from engine.cli.simulate import Loop, Scene, run_closed_loop, run_simulate
+    from engine.cli.simulate import LoopSettings, WorldSettings, run_closed_loop, run_simulate
     from engine.cli.watching import Watching
 
     use_threads(threads)
-    scene = Scene(seed=seed, condition=condition, relief_m=relief, map=map_path, surface=surface)
+    scene = WorldSettings(seed=seed, condition=condition, relief_m=relief, map=map_path, surface=surface)
     given = {
         "--minutes": minutes, "--method": method, "--fault": fault, "--rerun": rerun,
         "--rerun-connect": rerun_connect, "--device": device,
@@ -286,7 +286,9 @@ def simulate(
         raise OptionError("--frames: expected without --closed-loop, which has --minutes")
     if closed_loop:
         minutes = 5.0 if minutes is None else minutes
-        loop = Loop(minutes=minutes, method=method or "auto", fault=fault or "none", device=device or "auto")
+        loop = LoopSettings(
+            minutes=minutes, method=method or "auto", fault=fault or "none", device=device or "auto"
+        )
         facts = run_closed_loop(out, scene, loop, force=force, watching=Watching(rerun, rerun_connect))
     else:
         facts = run_simulate(out, scene, frames=frames, force=force)

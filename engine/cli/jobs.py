@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.cli.simulate import Scene, run_simulate
-from engine.cli.track import Inputs, Settings, run_track
+from engine.cli.simulate import WorldSettings, run_simulate
+from engine.cli.track import FlightFiles, Settings, run_track
 from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
 from engine.report.campaign import are_figures, are_times
@@ -27,7 +27,7 @@ _TIMES = ("latency_ms", "deadlines_missed", "settings")
 class Draw:
     """A simulated flight, drawn into its folder."""
 
-    scene: Scene
+    scene: WorldSettings
     frames: int | None
 
     def work(self, folder: Path) -> dict[str, Any]:
@@ -39,7 +39,7 @@ class Draw:
 class Follow:
     """A flight that is followed by one method with its settings."""
 
-    inputs: Inputs
+    inputs: FlightFiles
     settings: Settings
 
     def work(self, folder: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from engine.cli.checks import check_place
 from engine.errors import OptionError
 from engine.formats.frames import read_image
 from engine.matcher import METHODS, SceneMatcher
-from engine.types import Fix, Frame, NoFix
+from engine.values import Fix, Frame, NoFix
 
 
 @dataclass(frozen=True, slots=True)

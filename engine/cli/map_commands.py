@@ -69,8 +69,8 @@ def audit(
     availability along it is predicted, and its poor stretches are listed. A huge map is audited in part: around a
     place, along the route, or both.
     """
-    from engine.cli.audit import Inputs, run_audit
+    from engine.cli.audit import AuditFiles, run_audit
 
     use_threads(threads)
-    inputs = Inputs(map_path, surface, camera, route, other, height_agl, around, corridor)
+    inputs = AuditFiles(map_path, surface, camera, route, other, height_agl, around, corridor)
     run_audit(inputs, out, sigma_m=sigma, force=force, as_json=as_json)

@@ -34,7 +34,7 @@ from engine.sim.loop import START_NS, ClosedLoop
 from engine.sim.pilot import plan_rounds
 from engine.sim.quadrotor import State
 from engine.sim.town import EXACT, RELIEF_MAX_M, generator
-from engine.types import Frame, Prior, Truth
+from engine.values import Frame, Prior, Truth
 
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView
@@ -51,12 +51,12 @@ _FILES = {
     "telemetry": "telemetry.csv",
     "truth": "truth.csv",
 }
-_SHORTEST_M = 10.0  # half of a side of the rounds
+_MIN_HALF_SIDE_M = 10.0  # half of a side of the rounds
 _EDGE_M = 6.0  # that a level footprint keeps from the map's edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class WorldSettings:
     """What is flown over, as the command line has it.
 
     Raises:
@@ -93,7 +93,7 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Loop:
+class LoopSettings:
     """How the loop is closed, as the command line has it.
 
     Raises:
@@ -119,7 +119,7 @@ class Loop:
         return Fault(kind=self.fault, start_s=start_s, duration_s=math.inf if self.fault == "shifted" else 10.0)
 
 
-def run_simulate(out: Path, scene: Scene, *, frames: int | None, force: bool) -> dict[str, Any]:
+def run_simulate(out: Path, scene: WorldSettings, *, frames: int | None, force: bool) -> dict[str, Any]:
     """Fly the built-in flight and write its folder; returns facts about it."""
     check_folder(out, force)
     console.say("drawing the world and the flight over it")
@@ -136,7 +136,7 @@ def run_simulate(out: Path, scene: Scene, *, frames: int | None, force: bool) ->
 
 
 def run_closed_loop(
-    out: Path, scene: Scene, loop: Loop, *, force: bool, watching: Watching | None = None
+    out: Path, scene: WorldSettings, loop: LoopSettings, *, force: bool, watching: Watching | None = None
 ) -> dict[str, Any]:
     """Fly by the engine's fixes, and write the flight's folder with its track and figures; returns the figures."""
     check_folder(out, force)
@@ -186,16 +186,18 @@ def _summarise(out: Path, rows: list[TrackRow], site: OrthoMap, record: dict[str
     return summary
 
 
-def close_loop(town: Town, camera: Camera, matcher: SceneMatcher, seed: int, loop: Loop) -> ClosedLoop:
+def close_loop(town: Town, camera: Camera, matcher: SceneMatcher, seed: int, loop: LoopSettings) -> ClosedLoop:
     """The flight that ``loop`` asks for, not begun yet: rounds of the town, 150 m above its ground."""
     site = matcher.site
     style = FlightStyle()
     corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
     reach_m = style.height_agl_m * math.hypot(corner[0], corner[1]) + _EDGE_M
     half_m = [0.5 * n * site.gsd_m_per_px - reach_m for n in (site.width_px, site.height_px)]
-    if min(half_m) < _SHORTEST_M:
+    if min(half_m) < _MIN_HALF_SIDE_M:
         sides = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
-        raise OptionError(f"--map: expected {2.0 * (reach_m + _SHORTEST_M):.0f} m or more a side, got {sides} m")
+        raise OptionError(
+            f"--map: expected {2.0 * (reach_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
+        )
     style = replace(style, height_agl_m=style.height_agl_m + site.ground_m)
     route = plan_rounds((half_m[0], half_m[1]), 60.0 * loop.minutes, style)
     rng = generator(seed, 0xCA)
@@ -226,7 +228,7 @@ def _write_folder(
     town: Town,
     camera: Camera,
     site: OrthoMap,
-    loop: Loop,
+    loop: LoopSettings,
     view: LiveView | None,
 ) -> None:
     """Fly, and write the folder as it goes: pictures, telemetry by the filter, truth, camera and map."""
@@ -268,7 +270,9 @@ def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Trut
         )
 
 
-def _record(out: Path, scene: Scene, loop: Loop, site: OrthoMap, town: Town, device: str) -> dict[str, Any]:
+def _record(
+    out: Path, scene: WorldSettings, loop: LoopSettings, site: OrthoMap, town: Town, device: str
+) -> dict[str, Any]:
     """What a run was made of, in the words of ``track``, so that ``evaluate`` reads it."""
     files = {name: str((out / file).resolve()) for name, file in _FILES.items()}
     return files | {

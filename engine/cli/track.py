@@ -26,24 +26,24 @@ from engine.cli.checks import check_needs, check_pictures, check_place, check_st
 from engine.cli.record import Record, read_record
 from engine.cli.watching import Watching, watched
 from engine.errors import EngineError, OptionError, TelemetryError
-from engine.formats.bags import is_bag, read_bag_camera
 from engine.formats.flight import Flight, FlightFrame, open_flight
-from engine.formats.logs import LogClock, is_log, open_truth
+from engine.formats.logs.readers import LogClock, is_log, open_truth
 from engine.formats.notes import note_of, read_notes, write_notes
+from engine.formats.ros.bags import is_bag, read_bag_camera
 from engine.formats.settings import changed, nested, options_from_mapping, read_settings
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
 from engine.matcher import METHODS, PROFILES, MatcherOptions, SceneMatcher
-from engine.methods.laid import NccOptions
+from engine.methods.hypothesis import NccOptions
 from engine.methods.sift import SiftOptions
-from engine.navigator import BELIEVE_ALL, Navigator, NavigatorOptions
+from engine.navigator import ACCEPT_ALL, Navigator, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from engine.report.explain import choose_frames, explain_frames
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
-from engine.report.page import Flown, write_page
-from engine.types import Fix, NoFix, Prior, Truth
+from engine.report.page import FinishedTrack, write_page
+from engine.values import Fix, NoFix, Prior, Truth
 
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView
@@ -55,7 +55,7 @@ OWNED = ("track.csv", "summary.json", NOTES, PAGE, *FIGURES)
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class FlightFiles:
     """The files of one flight."""
 
     map: Path
@@ -92,9 +92,9 @@ class Inputs:
         return beside if beside.is_file() else None
 
 
-def folder_inputs(directory: Path) -> Inputs:
+def folder_inputs(directory: Path) -> FlightFiles:
     """The files of a flight folder that has all of them, by their usual names."""
-    return Inputs(
+    return FlightFiles(
         map=directory / "map.tif",
         surface=directory / "dsm.tif",
         camera=directory / "camera.yaml",
@@ -195,7 +195,7 @@ class Replay:
 
 
 def run_track(
-    inputs: Inputs,
+    inputs: FlightFiles,
     out: Path,
     settings: Settings,
     *,
@@ -220,7 +220,7 @@ def run_track(
     matcher.warmup()
     prepare_folder(out, force, OWNED)
     navigator = Navigator(
-        matcher, start, budget, BELIEVE_ALL if settings.profile == "paper" else settings.navigator
+        matcher, start, budget, ACCEPT_ALL if settings.profile == "paper" else settings.navigator
     )
     what = f"{settings.method}, {settings.profile} profile"
     with watched(matcher, watching) as view:
@@ -237,7 +237,7 @@ def _matcher(site: OrthoMap, camera: Camera, settings: Settings) -> SceneMatcher
     return SceneMatcher(site, camera, settings.method, settings.device, options)
 
 
-def open_inputs(inputs: Inputs, wanted: Sequence[Settings]) -> Opened:
+def open_inputs(inputs: FlightFiles, wanted: Sequence[Settings]) -> Opened:
     """Read what runs of one flight with the settings that are wanted need.
 
     Raises:
@@ -268,7 +268,7 @@ def open_inputs(inputs: Inputs, wanted: Sequence[Settings]) -> Opened:
 
 
 def _record(
-    inputs: Inputs,
+    inputs: FlightFiles,
     settings: Settings,
     opened: Opened,
     device: str,
@@ -380,11 +380,11 @@ def conclude(
     title = f"{record.method} ({record.profile} profile)"
     draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
     notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
-    _write_page(out / PAGE, Flown(rows, truth, site, ground, summary, notes), replay or Replay())
+    _write_page(out / PAGE, FinishedTrack(rows, truth, site, ground, summary, notes), replay or Replay())
     return summary
 
 
-def _write_page(path: Path, flown: Flown, replay: Replay) -> None:
+def _write_page(path: Path, flown: FinishedTrack, replay: Replay) -> None:
     """The report, with some frames matched again where that can be done."""
     if replay.flight is None or replay.matcher is None:
         return write_page(path, flown, why_not=f"No frames are shown: {replay.why_not}")
@@ -436,7 +436,7 @@ def _reopened(record: Record, rows: list[TrackRow], site: OrthoMap) -> Replay:
         return Replay(why_not=f"{error}.")
 
 
-def _recorded(record: Record) -> Inputs:
+def _recorded(record: Record) -> FlightFiles:
     """The files of a run that is over.
 
     Raises:
@@ -447,7 +447,7 @@ def _recorded(record: Record) -> Inputs:
         raise TelemetryError("the record of the run lacks its camera or its frames")
     stamps, offset_s = record.frame_stamps, record.log_offset_s
     told = stamps is not None or offset_s is not None
-    return Inputs(
+    return FlightFiles(
         Path(record.map),
         None,
         Path(record.camera),

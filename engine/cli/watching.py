@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from engine.errors import BackendError, OptionError
 from engine.matcher import SceneMatcher
 from engine.navigator import Navigator
-from engine.types import Prior
+from engine.values import Prior
 
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView, Watcher

@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.formats.bags import BagFrames, is_bag
 from engine.formats.frames import FrameSource, VideoFile, exif_telemetry, open_frames
 from engine.formats.geotiff import write_geotiff
-from engine.formats.logs import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
+from engine.formats.logs.readers import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
 from engine.formats.resampling import telemetry_at
+from engine.formats.ros.bags import BagFrames, is_bag
 from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
 from engine.formats.truth import write_truth
 from engine.geo import wrap_heading_deg
-from engine.rasters import GEOREFERENCE_TAG, SLOPE_TAG
-from engine.types import Frame, Prior, Truth
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.values import Frame, Prior, Truth
 
 _JPEG_QUALITY = 95
 

@@ -35,7 +35,7 @@ def write_geotiff(
         pixel_to_crs: affine map, (2, 3).
         crs_epsg: EPSG code of the CRS.
         nodata: the value that stands for nothing.
-        tags: metadata items, such as :data:`engine.rasters.GEOREFERENCE_TAG` and what it says.
+        tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG` and what it says.
 
     Raises:
         ShapeError: an argument has another shape.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from engine.formats.telemetry import cell_text, read_table, write_table
-from engine.types import Fix, NoFix
+from engine.values import Fix, NoFix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

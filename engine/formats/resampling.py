@@ -20,7 +20,7 @@ from engine.errors import TelemetryError
 from engine.formats.telemetry import TelemetryRow
 from engine.formats.truth import truth_at
 from engine.geo import wrap_heading_deg
-from engine.types import Truth
+from engine.values import Truth
 
 MAX_GAP_NS = 2_000_000_000
 """Neighbouring samples further apart than this say nothing of the time between them."""

@@ -14,7 +14,7 @@ from engine.errors import TelemetryError
 _PLACES = (16, 17, 18, 19, 21, 22, 31, 82)  # MAVLink commands that go to the latitude and longitude they carry
 _RETURN = 20
 _DEGREES_BELOW = 1e9
-_LARGEST_BYTES = 64 << 20
+_MAX_FILE_BYTES = 64 << 20
 
 
 def read_route(path: str | Path) -> NDArray[np.float64]:
@@ -29,8 +29,8 @@ def read_route(path: str | Path) -> NDArray[np.float64]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise TelemetryError(f"route: {path}: expected at most {_LARGEST_BYTES >> 20} MiB")
+        if path.stat().st_size > _MAX_FILE_BYTES:
+            raise TelemetryError(f"route: {path}: expected at most {_MAX_FILE_BYTES >> 20} MiB")
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise TelemetryError(f"route: no such file: {path}") from None

@@ -19,8 +19,7 @@ from typing import Any
 
 from engine.errors import TelemetryError
 from engine.geo import wrap_heading_deg
-from engine.motion import WIDEST_M
-from engine.types import Prior
+from engine.values import MAX_SIGMA_M, Prior
 
 DEFAULT_PRIOR_SIGMA_M = 15.0
 """Standard deviation, per axis, of a prior whose ``sigma_m`` is blank: a poor single-frequency GPS position."""
@@ -51,7 +50,7 @@ QUARTER_TURN = Bounds(-90.0, 90.0, "degrees from -90 to 90")
 LONGITUDE = Bounds(-180.0, 360.0, "degrees from -180 to 360")
 POSITIVE = Bounds(math.ulp(0.0), math.inf, "a finite number above 0")
 NOT_NEGATIVE = Bounds(0.0, math.inf, "a finite number of 0 or more")
-SIGMA = Bounds(0.0, WIDEST_M, f"a number from 0 to {WIDEST_M:g}")
+SIGMA = Bounds(0.0, MAX_SIGMA_M, f"a number from 0 to {MAX_SIGMA_M:g}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from typing import TextIO
 
 from engine.errors import TelemetryError
 from engine.formats.telemetry import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, Cells, cell_text, read_table
-from engine.types import Fix, NoFix, Reason
+from engine.values import Fix, NoFix, Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +23,7 @@ class TrackRow:
         timestamp_ns: capture time of the frame.
         frame: name of the frame.
         status: "fix" or "no_fix".
-        reason: value of :class:`engine.types.Reason` where refused.
+        reason: value of :class:`engine.values.Reason` where refused.
         lat_deg: WGS84 latitude of the camera.
         lon_deg: WGS84 longitude of the camera.
         east_m: east of the map's origin.

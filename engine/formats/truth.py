@@ -21,7 +21,7 @@ from engine.formats.telemetry import (
     write_table,
 )
 from engine.geo import wrap_heading_deg
-from engine.types import Truth
+from engine.values import Truth
 
 MAX_GAP_NS = 5_000_000_000
 """Neighbours further apart than this do not say where the vehicle was in between."""

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from engine.formats.telemetry import TelemetryRow
 from engine.formats.truth import interpolate_truth
 from engine.geo import LocalFrame
-from engine.grids import wgs84
-from engine.rasters import Source
-from engine.types import Truth
+from engine.maps.grids import wgs84
+from engine.maps.rasters import Source
+from engine.values import Truth
 
 Array = NDArray[np.float64]
 

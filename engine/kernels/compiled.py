@@ -1,8 +1,8 @@
 """SIFT's loops for the CPU, compiled by numba: the steps of the tensor ops, without their detours through memory.
 
 A processor's cache holds a few rows of a picture and not all its levels, so each step walks rows and keeps at
-hand what it needs of them. ``buffer`` is the flat scale space of :mod:`engine.scalespace`, ``table`` its layout:
-for every octave height, width, offset, and the strides of level, row and image.
+hand what it needs of them. ``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`, ``table`` its
+layout: for every octave height, width, offset, and the strides of level, row and image.
 """
 
 from __future__ import annotations
@@ -439,7 +439,7 @@ def descriptors(buffer, table, where, places, angle, step, tent):
                 gx = patch[row + 1, x + 2] - patch[row + 1, x]
                 gy = patch[row + 2, x + 1] - patch[row, x + 1]
                 diagonal, anti = half * (gx + gy), half * (gy - gx)
-                # w_k = max(0, min(p_(k-1), p_(k+1))), see engine.descriptors
+                # w_k = max(0, min(p_(k-1), p_(k+1))), see engine.sift.descriptors
                 p[0, x] = max(zero, min(-anti, diagonal))
                 p[1, x] = max(zero, min(gx, gy))
                 p[2, x] = max(zero, min(diagonal, anti))

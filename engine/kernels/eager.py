@@ -21,7 +21,7 @@ _FLAT_SHARE = 1e-12
 # Windows of more pixels than this are cut into blocks where the templates are small against them.
 _WORTH_BLOCKS_PX = 1 << 21
 # Blocks of windows that are larger than the templates have at least this side.
-_LEAST_BLOCK_PX = 256
+_MIN_BLOCK_PX = 256
 _SMALL_PX = 1 << 16
 # The norm of a template of zeros, which scores 0.
 _TINY = 1e-12
@@ -137,7 +137,7 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
     small enough to stay in the cache.
     """
     (H, W), (h, w) = search.shape, templates.shape[-2:]
-    block = fast_length(max(_LEAST_BLOCK_PX, 3 * max(h, w)))
+    block = fast_length(max(_MIN_BLOCK_PX, 3 * max(h, w)))
     if max(_WORTH_BLOCKS_PX, 2 * block * block) < H * W:
         return _correlate_blocks(search, templates, min(block, fast_length(H)), min(block, fast_length(W)))
     rows, columns = fast_length(H), fast_length(W)

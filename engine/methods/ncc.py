@@ -6,28 +6,28 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from engine.evidence import Evidence, Expected, evidence_of, expected_of, probability
+from engine.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
+from engine.indexes.prepared import PreparedMap
 from engine.integrity import (
     PeakRule,
-    judge_evidence,
+    judge_confidence,
     judge_peak,
+    misalignment_covariance_px2,
     ncc_covariance_m2,
     peak_covariance_px,
-    pull_px2,
     score_sigma,
 )
-from engine.methods import bank
-from engine.methods.laid import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
+from engine.methods import hypothesis_search
+from engine.methods.hypothesis import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
 from engine.methods.query import Query
-from engine.prepared import PreparedMap
-from engine.types import Attitude, Fix, NoFix, Peak, Reason, Window
+from engine.values import Attitude, Fix, NoFix, Peak, Reason, Window
 
 WIDE_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class PeakCandidate:
     """A peak that is not judged yet.
 
     Attributes:
@@ -43,11 +43,11 @@ class Found:
     aligned: Aligned
     fix: Fix
     trusted: bool
-    expected: Expected | None
-    evidence: Evidence | None
+    expected: PriorAgreement | None
+    evidence: PeakFeatures | None
 
 
-def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Found | NoFix:
+def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> PeakCandidate | NoFix:
     """The highest peak of one frame with its evidence, or a refusal where there is none. As :func:`locate`."""
     frame = query.frame
     if frame.height_agl_m is None:
@@ -66,15 +66,15 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     window = window_about(query, aligned, options)
     if window is None:
         return query.refuse_outside(METHOD)
-    trusted = bank.is_trusted(frame, options)
+    trusted = hypothesis_search.is_trusted(frame, options)
     wide = query.site.is_large and window.area_px >> 2 * aligned.level > WIDE_PX
-    if wide and bank.coarse_px(query, aligned, window, options) > WIDE_PX:
+    if wide and hypothesis_search.coarse_px(query, aligned, window, options) > WIDE_PX:
         detail = f"a window of {window.width_px} x {window.height_px} px is not searched; a better prior is needed"
         return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
     if trusted and query.prior is not None and not wide:
         peak = search(query, prepared, aligned, window, options)
     else:
-        peak, aligned = bank.search(query, prepared, aligned, window, options)
+        peak, aligned = hypothesis_search.search(query, prepared, aligned, window, options)
     if peak is None:
         detail = "the map does not cover the frame anywhere in the window"
         return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
@@ -85,11 +85,11 @@ def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: i
     evidence = None
     if trusted and expected is not None:
         sigma = score_sigma(aligned.template.numel())
-        evidence = evidence_of(peak, sigma, expected)
+        evidence = peak_features(peak, sigma, expected)
         if probability(evidence) < options.rule.sure:
             peak = _against_turned(query, prepared, aligned, window, peak, options)
-            evidence = evidence_of(peak, sigma, expected)
-    return Found(peak, aligned, fix, trusted, expected, evidence)
+            evidence = peak_features(peak, sigma, expected)
+    return PeakCandidate(peak, aligned, fix, trusted, expected, evidence)
 
 
 def _against_turned(
@@ -118,23 +118,23 @@ def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser:
     return found if isinstance(found, NoFix) else judge(query, found, options.rule)
 
 
-def judge(query: Query, found: Found, rule: PeakRule) -> Fix | NoFix:
+def judge(query: Query, found: PeakCandidate, rule: PeakRule) -> Fix | NoFix:
     """The fix with its probability of being right where its peak is believed, else a refusal."""
     evidence, pixels = found.evidence, found.aligned.template.numel()
     # A place that contradicts the prior is vouched for by the match alone, as on a search of the whole map.
-    unexpected = found.expected is None or found.expected.off_prior > rule.max_prior_chi_square
+    unexpected = found.expected is None or found.expected.prior_chi_square > rule.max_prior_chi_square
     refusal = judge_peak(found.peak, pixels, rule, whole_map=unexpected, searched=not found.trusted)
     if refusal is None and evidence is not None:
-        refusal = judge_evidence(evidence, rule.min_confidence)
+        refusal = judge_confidence(evidence, rule.min_confidence)
     if refusal is not None:
         return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
     return found.fix if evidence is None else replace(found.fix, confidence=probability(evidence))
 
 
-def _expected(query: Query, fix: Fix) -> Expected | None:
+def _expected(query: Query, fix: Fix) -> PriorAgreement | None:
     if query.prior is None or query.prior_px is None:
         return None
-    return expected_of(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+    return prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
 
 
 def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions, *, trusted: bool) -> Fix:
@@ -146,7 +146,7 @@ def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: Nc
     assert frame.height_agl_m is not None  # asked for before
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
-    peak_px2 = peak_px2 + pull_px2(peak, (rows, columns), frame.height_agl_m, options.errors)
+    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), frame.height_agl_m, options.errors)
     covariance = ncc_covariance_m2(peak_px2, frame, query.camera, aligned.jacobian, options.errors)
     attitude = Attitude(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)
     return Fix(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
 from engine.methods.query import Query
-from engine.types import Attitude, Fix, NoFix, Reason, Window
+from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from engine.budget import Deadline
 from engine.camera import Camera
-from engine.costs import Costs
 from engine.device import synchronise
+from engine.methods.costs import Costs
 from engine.orthomap import OrthoMap
-from engine.types import Attitude, Frame, NoFix, Prior, Reason, Timings, Window
+from engine.values import Attitude, Frame, NoFix, Prior, Reason, Timings, Window
 from engine.window import SPREAD_SIGMAS, place_window, window_size_px
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ class Stopwatch:
         return self._costs.expected_ms(rung, work) <= self.deadline.remaining_ms
 
     def give_up(self, rung: str, *, price: bool) -> None:
-        """Note that not even the least of a rung was affordable, see :meth:`engine.costs.Costs.doubt`."""
+        """Note that not even the least of a rung was affordable, see :meth:`engine.methods.costs.Costs.doubt`."""
         self._costs.doubt(rung, price=price)
 
     @contextmanager

@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from engine.confidence import PoseFeatures, prior_agreement, probability
 from engine.errors import OptionError
-from engine.evidence import PoseEvidence, expected_of, probability
 from engine.features import match, sift
 from engine.geo import attitude_from_rotation, enu_from_body
-from engine.integrity import AssumedErrors, judge_evidence
-from engine.landmarks import LandmarkMap, Landmarks, as_picture
+from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
+from engine.integrity import AssumedErrors, judge_confidence
 from engine.learned import PairMatcher
 from engine.methods.query import Query
-from engine.methods.views import LOWEST_M, Belief, MapView, turn_deg, view_in, views_of
+from engine.methods.views import MIN_HEIGHT_M, MapView, TelemetryHypothesis, turn_deg, view_in, views_of
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
-from engine.types import Attitude, Fix, NoFix, Reason, Window
+from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class SiftOptions:
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
         use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
             features alone can hardly tell a tilt from a displacement.
-        min_confidence: probability of :func:`engine.evidence.probability` below which a pose is not believed.
+        min_confidence: probability of :func:`engine.confidence.probability` below which a pose is not believed.
         pose: settings of PnP and RANSAC.
         errors: what is assumed of the telemetry and the map.
     """
@@ -100,7 +100,7 @@ class SiftOptions:
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
         for name, least in (
-            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", LOWEST_M), ("max_tilt_deg", 0.0)
+            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M), ("max_tilt_deg", 0.0)
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > least:
@@ -144,7 +144,7 @@ class _Reduced:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class PoseCandidate:
     """A pose that is not judged yet.
 
     Attributes:
@@ -153,7 +153,7 @@ class Found:
     """
 
     fix: Fix
-    evidence: PoseEvidence
+    evidence: PoseFeatures
 
 
 def locate(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Fix | NoFix:
@@ -162,42 +162,44 @@ def locate(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Fix | 
     return found if isinstance(found, NoFix) else judge(query, found, options)
 
 
-def find(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> Found | NoFix:
+def find(query: Query, landmarks: LandmarkMap, options: SiftOptions) -> PoseCandidate | NoFix:
     """The pose of one frame with its evidence, or a refusal where there is none. As :func:`locate`."""
     flat = query.refuse_flat(METHOD, options.min_deviation)
     if flat is not None:
         return flat
     height_m, factor = query.frame.height_agl_m, options.height_factor
-    unknown = (LOWEST_M, options.max_height_m)
-    told = Belief(unknown if height_m is None else (height_m, height_m), turn_deg(query))
+    unknown = (MIN_HEIGHT_M, options.max_height_m)
+    told = TelemetryHypothesis(unknown if height_m is None else (height_m, height_m), turn_deg(query))
     first = _look(query, landmarks, told, options)
-    if isinstance(first, Found):
+    if isinstance(first, PoseCandidate):
         if not doubtful(first, options):
             return first
     elif first.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
         return first
-    doubted = Belief(unknown if height_m is None else (height_m / factor, height_m * factor), None)
+    doubted = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
     deadline = query.watch.deadline
     if not options.second_look or doubted == told or deadline.remaining_ms < deadline.elapsed_ms:
         return first
     second = _look(query, landmarks, doubted, options)
-    return second if isinstance(second, Found) and not doubtful(second, options) else first
+    return second if isinstance(second, PoseCandidate) and not doubtful(second, options) else first
 
 
-def doubtful(found: Found, options: SiftOptions) -> bool:
+def doubtful(found: PoseCandidate, options: SiftOptions) -> bool:
     """Whether a pose is not probable enough."""
-    return judge_evidence(found.evidence, options.min_confidence) is not None
+    return judge_confidence(found.evidence, options.min_confidence) is not None
 
 
-def judge(query: Query, found: Found, options: SiftOptions) -> Fix | NoFix:
+def judge(query: Query, found: PoseCandidate, options: SiftOptions) -> Fix | NoFix:
     """The fix where its pose is believed, else a refusal."""
-    refusal = judge_evidence(found.evidence, options.min_confidence)
+    refusal = judge_confidence(found.evidence, options.min_confidence)
     if refusal is None:
         return found.fix
     return query.refuse(*refusal, METHOD, score=found.fix.score, window=found.fix.window)
 
 
-def _look(query: Query, landmarks: LandmarkMap, belief: Belief, options: SiftOptions) -> Found | NoFix:
+def _look(
+    query: Query, landmarks: LandmarkMap, belief: TelemetryHypothesis, options: SiftOptions
+) -> PoseCandidate | NoFix:
     """Match, lift and solve, with what is believed of the telemetry."""
     watch = query.watch
     with watch.stage("window"):
@@ -235,7 +237,7 @@ def matches_in(
     """
     height_m = query.frame.height_agl_m
     assert height_m is not None  # without one there is no single view
-    belief = Belief((height_m, height_m), turn_deg(query))
+    belief = TelemetryHypothesis((height_m, height_m), turn_deg(query))
     views = [view_in(query, window, height_m, options.scale)]
     if options.matcher is not None:
         found = _by_matcher(query, views, options.matcher, options)[0]
@@ -246,7 +248,7 @@ def matches_in(
 
 
 def _by_features(
-    query: Query, views: list[MapView], landmarks: LandmarkMap, belief: Belief, options: SiftOptions
+    query: Query, views: list[MapView], landmarks: LandmarkMap, belief: TelemetryHypothesis, options: SiftOptions
 ) -> list[_Matched]:
     """Features of the frame among those of the map, view by view."""
     turn = belief.turn_deg
@@ -273,7 +275,7 @@ def _by_features(
             scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
             weights = 1.0 / (1.0 + (scale_px / _BLUNT_PX) ** 2)
             points_m = known.points_m[pairs[:, 1]]
-            matched.append(_Matched(view, points_px, points_m, weights * _steadiness(query.site, points_m)))
+            matched.append(_Matched(view, points_px, points_m, weights * _roughness_weights(query.site, points_m)))
     return matched
 
 
@@ -287,7 +289,9 @@ def _by_matcher(query: Query, views: list[MapView], matcher: PairMatcher, option
             points, places = (found.cpu().numpy() for found in matcher(reduced.picture, crop))
             map_px = query.site.full_from_level(places + view.corner_px, view.level)
             ground_m = _lifted(query.site, map_px)
-            matched.append(_Matched(view, reduced.full(points), ground_m, _steadiness(query.site, ground_m)))
+            matched.append(
+                _Matched(view, reduced.full(points), ground_m, _roughness_weights(query.site, ground_m))
+            )
     return matched
 
 
@@ -324,9 +328,9 @@ def _lifted(site: OrthoMap, map_px: Array) -> Array:
     return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
 
 
-def _steadiness(site: OrthoMap, points_m: Array) -> Array:
+def _roughness_weights(site: OrthoMap, points_m: Array) -> Array:
     """Weights (N,) of landmarks: where the surface is rough, what they show may stand higher or lower."""
-    return site.steadiness_at(site.pixel_from_enu(points_m[:, :2]), _ROUGH_REACH_PX)
+    return site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGH_REACH_PX)
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
@@ -336,7 +340,7 @@ def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -
     return np.diag([horizontal, horizontal, errors.map_m**2])
 
 
-def _pose(query: Query, found: _Matched, belief: Belief, options: SiftOptions) -> PoseStats | None:
+def _pose(query: Query, found: _Matched, belief: TelemetryHypothesis, options: SiftOptions) -> PoseStats | None:
     """The pose that the matches agree on and the attitude allows.
 
     Few matches can hardly tell a tilt from a displacement. What is known of the tilt weighs in also where the
@@ -364,20 +368,24 @@ def _attitude_prior(query: Query, heading_deg: float, sigma_deg: float, errors: 
     return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(frame), sigma_deg), axes=mount)
 
 
-def _weighed(query: Query, fix: Fix, stats: PoseStats, belief: Belief, options: SiftOptions) -> Found:
+def _weighed(
+    query: Query, fix: Fix, stats: PoseStats, belief: TelemetryHypothesis, options: SiftOptions
+) -> PoseCandidate:
     """A pose with what speaks for it; telemetry that is doubted is not asked."""
     errors, height_m = options.errors, query.frame.height_agl_m
-    off_height = None
+    height_chi_square = None
     if height_m is not None and belief.height_m == height_m:
         assert fix.up_m is not None
         variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2])
         ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
-        off_height = (fix.up_m - ground_m - height_m) ** 2 / variance
-    off_prior = None
+        height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
+    prior_chi_square = None
     if query.prior is not None and query.prior_px is not None:
-        off_prior = expected_of(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m).off_prior
-    evidence = PoseEvidence(stats.log10_nfa, off_prior, off_height)
-    return Found(replace(fix, confidence=probability(evidence)), evidence)
+        prior_chi_square = prior_agreement(
+            fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m
+        ).prior_chi_square
+    evidence = PoseFeatures(stats.log10_nfa, prior_chi_square, height_chi_square)
+    return PoseCandidate(replace(fix, confidence=probability(evidence)), evidence)
 
 
 def _fix(query: Query, stats: PoseStats, window: Window, options: SiftOptions) -> Fix | NoFix:

@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from engine.align import view_of
 from engine.geo import enu_from_body
-from engine.landmarks import PREPARED_PX
+from engine.indexes.landmarks import PREPARED_PX
 from engine.methods.query import Query, level_crop, level_for
-from engine.types import Attitude, NoFix, Window
+from engine.values import Attitude, NoFix, Window
 
-LOWEST_M = 1.0
+MIN_HEIGHT_M = 1.0
 """The lowest height that is looked for where the height is unknown."""
 _CROP_STEP_PX = 32
 _LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class TelemetryHypothesis:
     """What of the telemetry is believed in one look at a frame.
 
     Attributes:
@@ -72,7 +72,9 @@ def turn_deg(query: Query) -> float | None:
     return math.degrees(math.atan2(y, x))
 
 
-def views_of(query: Query, belief: Belief, method: str, *, margin: float, scale: float) -> list[MapView] | NoFix:
+def views_of(
+    query: Query, belief: TelemetryHypothesis, method: str, *, margin: float, scale: float
+) -> list[MapView] | NoFix:
     """The windows to look at, one a level; a level that is too large to be searched gives way to a coarser one.
 
     Args:

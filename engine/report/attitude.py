@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.types import Fix, Frame, NoFix
+from engine.values import Fix, Frame, NoFix
 
 Array = NDArray[np.float64]
 AttitudeRow = tuple[float, float, float, float, float]
@@ -17,9 +17,9 @@ AttitudeRow = tuple[float, float, float, float, float]
 
 _REACH_S = 0.5  # lags up to this are looked for
 _STEP_S = 0.01
-_LEAST_FRAMES = 20
-_LEAST_MOTION_DEG = 0.7  # deviation of roll or pitch below which a flight says nothing of a lag
-_LONGEST_INTERVAL_S = 0.25  # between frames; with longer ones the attitude in between is not known
+_MIN_FRAMES = 20
+_MIN_MOTION_DEG = 0.7  # deviation of roll or pitch below which a flight says nothing of a lag
+_MAX_INTERVAL_S = 0.25  # between frames; with longer ones the attitude in between is not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def check_attitude(rows: Sequence[AttitudeRow]) -> AttitudeCheck | None:
     series = np.array(rows, dtype=np.float64).reshape(-1, 5)
     time_s, told, measured_deg = series[:, 0] - series[:1, 0], series[:, 1:3], series[:, 3:]
     known = np.isfinite(measured_deg[:, 0])
-    if np.count_nonzero(known) < _LEAST_FRAMES:
+    if np.count_nonzero(known) < _MIN_FRAMES:
         return None
     lag_s = _lag_s(time_s, told, measured_deg, known)
     at_lag = _shifted(time_s, told, time_s[known], lag_s or 0.0)
@@ -75,10 +75,10 @@ def _shifted(time_s: Array, told_deg: Array, at_s: Array, lag_s: float) -> Array
 def _lag_s(time_s: Array, told_deg: Array, measured_deg: Array, known: NDArray[np.bool_]) -> float | None:
     """The lag at which told and measured angles differ least, but for an offset; None where none is found."""
     known = known & (time_s > time_s[0] + _REACH_S) & (time_s < time_s[-1] - _REACH_S)
-    if np.count_nonzero(known) < _LEAST_FRAMES or np.median(np.diff(time_s)) > _LONGEST_INTERVAL_S:
+    if np.count_nonzero(known) < _MIN_FRAMES or np.median(np.diff(time_s)) > _MAX_INTERVAL_S:
         return None
     measured_deg = measured_deg[known]
-    if measured_deg.std(axis=0).max() < _LEAST_MOTION_DEG:
+    if measured_deg.std(axis=0).max() < _MIN_MOTION_DEG:
         return None
     lags_s = np.arange(-_REACH_S, _REACH_S + _STEP_S / 2.0, _STEP_S)
     spread = [

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from engine.audit import SUITABLE, Audit, Flag, Route
+from engine.audit.availability import SUITABLE, Audit, Flag, RouteAvailability
 from engine.report.figures import DPI, TRUTH
-from engine.types import Window
+from engine.values import Window
 
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
 
 _MAP_PX = 1600  # longer side of the map as drawn; more would not show
-_WIDTH_IN, _LONGEST_IN = 9.0, 11.0
-_MOST_MARKS_PX = 7.0
+_WIDTH_IN, _MAX_INTERVAL = 9.0, 11.0
+_MAX_MARKS_PX = 7.0
 # Apart by shape, and by colours that stay apart under every common colour blindness (Okabe and Ito).
 _MARKS = {
     Flag.FLAT: ("o", "#56B4E9", "flat, such as water"),
@@ -29,7 +29,7 @@ _MARKS = {
 }
 
 
-def draw_audit(path: str | Path, audit: Audit, route: Route | None = None, *, title: str = "") -> Path:
+def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None = None, *, title: str = "") -> Path:
     """Draw an audit as a picture file.
 
     Args:
@@ -44,7 +44,7 @@ def draw_audit(path: str | Path, audit: Audit, route: Route | None = None, *, ti
     scale = site.gsd_m_per_px
     right, bottom = part.x0 + part.width_px, part.y0 + part.height_px
     extent = (part.x0 * scale, right * scale, bottom * scale, part.y0 * scale)
-    height_in = float(np.clip((_WIDTH_IN - 2.0) * part.height_px / part.width_px, 3.0, _LONGEST_IN))
+    height_in = float(np.clip((_WIDTH_IN - 2.0) * part.height_px / part.width_px, 3.0, _MAX_INTERVAL))
     figure = Figure(figsize=(_WIDTH_IN, height_in + 1.6), layout="constrained")
     ax = figure.subplots()
     ax.imshow(_background(site, part), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
@@ -89,7 +89,7 @@ def _background(site: OrthoMap, part: Window) -> Any:
 
 def _draw_marks(ax: Any, audit: Audit) -> None:
     scale = audit.plan.site.gsd_m_per_px
-    size = float(np.clip(220.0 / max(audit.flags.shape), 1.5, _MOST_MARKS_PX))
+    size = float(np.clip(220.0 / max(audit.flags.shape), 1.5, _MAX_MARKS_PX))
     for flag, (marker, colour, label) in _MARKS.items():
         places = (audit.plan.places_px[audit.flags == flag] + 0.5) * scale
         if len(places):
@@ -98,7 +98,7 @@ def _draw_marks(ax: Any, audit: Audit) -> None:
             )
 
 
-def _draw_route(ax: Any, route: Route, scale: float) -> None:
+def _draw_route(ax: Any, route: RouteAvailability, scale: float) -> None:
     x, y = (route.xy_px + 0.5).T * scale
     ax.plot(x, y, color="white", linewidth=3.4, alpha=0.9, zorder=4)
     ax.plot(x, y, color=TRUTH, linewidth=1.4, label="route", zorder=5)
@@ -107,7 +107,7 @@ def _draw_route(ax: Any, route: Route, scale: float) -> None:
         ax.plot(x, poor, color="#D55E00", linewidth=4.0, label="poor stretch", zorder=6, solid_capstyle="round")
 
 
-def _figures(audit: Audit, route: Route | None) -> str:
+def _figures(audit: Audit, route: RouteAvailability | None) -> str:
     parts = [f"{audit.shares['good']:.0%} of the places suitable"]
     if route is not None:
         parts.append(f"{route.availability:.0%} predicted along {route.length_m:,.0f} m of route")

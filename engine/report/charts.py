@@ -15,7 +15,7 @@ Limits = tuple[float, float]
 
 WIDTH, HEIGHT = 720.0, 230.0
 _TOP, _RIGHT, _BOTTOM = 12.0, 14.0, 44.0
-_MOST_POINTS = 4000  # of a line; more would not show
+_MAX_POINTS = 4000  # of a line; more would not show
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Plot:
         """The area between two lines, broken where one of them is NaN."""
         parts = []
         for run in _runs(np.isfinite(low) & np.isfinite(high)):
-            part = run[:: max(1, len(run) // _MOST_POINTS)]
+            part = run[:: max(1, len(run) // _MAX_POINTS)]
             there, back = (self.places(x[part], np.clip(y[part], *self.y_limits)) for y in (high, low))
             parts.append(f"M{_joined(there)}L{_joined(back[::-1])}Z")
         return f'<path class="{kind}" d="{"".join(parts)}"/>' if parts else ""
@@ -179,7 +179,7 @@ def crosses(places: Array, kind: str, size: float) -> str:
 def line(places: Array, kind: str) -> str:
     """A line through (N, 2), broken where a place is NaN."""
     runs = _runs(np.asarray(np.isfinite(places).all(axis=1), bool))
-    thin = max(1, sum(map(len, runs)) // _MOST_POINTS)
+    thin = max(1, sum(map(len, runs)) // _MAX_POINTS)
     marks = "".join(f"M{_joined(places[run[::thin]])}" for run in runs)
     return f'<path class="line {kind}" d="{marks}"/>' if marks else ""
 

@@ -12,8 +12,8 @@ from engine.formats.telemetry import cell_text, write_table
 from engine.geo import attitude_from_rotation
 from engine.report.figures import DPI, FIX, GRID, REFUSED, TRUTH
 from engine.sim.faults import Fault
-from engine.sim.loop import START_NS, Flown, Instant, Mode
-from engine.types import Fix
+from engine.sim.loop import START_NS, LoopResult, LoopSample, Mode
+from engine.values import Fix
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ _COLUMNS = (
 _SETTLED_S = 5.0  # after which the start's error is gone
 
 
-def write_record(path: Path, flown: Flown) -> None:
+def write_record(path: Path, flown: LoopResult) -> None:
     """Write loop.csv: plan, truth and estimate ten times a second, metres about the map's origin.
 
     Raises:
@@ -39,7 +39,7 @@ def write_record(path: Path, flown: Flown) -> None:
     write_table(path, _COLUMNS, (_cells(row) for row in flown.record))
 
 
-def _cells(row: Instant) -> list[str]:
+def _cells(row: LoopSample) -> list[str]:
     sigmas = np.sqrt(np.diag(row.belief.covariance)[:3])
     true = row.truth.attitude
     numbers = [*row.plan_m, *row.truth.position_m, *row.belief.position_m, *sigmas]
@@ -48,7 +48,7 @@ def _cells(row: Instant) -> list[str]:
     return [stamp, row.mode.value, cell_text(row.healthy, 0), *(cell_text(float(v), 3) for v in numbers)]
 
 
-def summarise_loop(flown: Flown) -> dict[str, Any]:
+def summarise_loop(flown: LoopResult) -> dict[str, Any]:
     """Figures of merit of a closed loop, as JSON can hold them.
 
     Returns:
@@ -87,7 +87,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _off_path(flown: Flown) -> Array:
+def _off_path(flown: LoopResult) -> Array:
     """(N,) horizontal distance of the true places from the nearest place of the path."""
     path = np.array([row.plan_m[:2] for row in flown.record])
     true = np.array([row.truth.position_m[:2] for row in flown.record])
@@ -100,7 +100,7 @@ def _off_path(flown: Flown) -> Array:
     return np.array(nearest)
 
 
-def draw_loop(directory: Path, flown: Flown, title: str, fault: Fault | None = None) -> list[Path]:
+def draw_loop(directory: Path, flown: LoopResult, title: str, fault: Fault | None = None) -> list[Path]:
     """Draw loop-path.png (plan, truth and estimate from above) and loop.png (errors and health over time).
 
     Args:
@@ -128,7 +128,7 @@ def _axes(figure: Any, *shape: int, **how: Any) -> list[Any]:
     return axes
 
 
-def _path(flown: Flown, title: str) -> Any:
+def _path(flown: LoopResult, title: str) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 7.0), layout="constrained")
@@ -147,7 +147,7 @@ def _path(flown: Flown, title: str) -> Any:
     return figure
 
 
-def _in_time(flown: Flown, title: str, fault: Fault) -> Any:
+def _in_time(flown: LoopResult, title: str, fault: Fault) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
@@ -174,7 +174,7 @@ def _in_time(flown: Flown, title: str, fault: Fault) -> Any:
     return figure
 
 
-def _draw_health(ax: Any, flown: Flown, time: Array) -> None:
+def _draw_health(ax: Any, flown: LoopResult, time: Array) -> None:
     """Fixes that were taken in, refusals, ill health and holding, one line each."""
     used = set(flown.used)
     taken = [answer.truth.time_s for answer in flown.answers if answer.timestamp_ns in used]

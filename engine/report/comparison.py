@@ -13,7 +13,7 @@ from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
 from engine.report.figures import DPI, GRID
 from engine.report.metrics import errors_en_m
-from engine.types import Truth
+from engine.values import Truth
 
 Array = NDArray[np.float64]
 

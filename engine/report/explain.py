@@ -16,27 +16,27 @@ from engine.formats.flight import Flight, FlightFrame
 from engine.formats.notes import Note
 from engine.formats.track import TrackRow
 from engine.matcher import SceneMatcher
-from engine.methods.explained import Explanation, Matches, Surface
+from engine.methods.explanation import Explanation, PointMatches, ScoreSurface
 from engine.methods.query import level_crop
 from engine.orthomap import OrthoMap
 from engine.report.metrics import WRONG_M, Errors
-from engine.types import Frame, Window
+from engine.values import Frame, Window
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-MOST_FRAMES = 60
+MAX_FRAMES = 60
 """Frames that are shown of a longer flight."""
 SIDE_PX = 360
 """Longer side of a picture."""
-_MOST_REMARKABLE = 40  # of these wrong ones and refusals, so that ordinary ones stay beside them
-_MOST_BYTES = 32_000  # of one, so that a report of 60 frames stays below 15 MB
+_MAX_REMARKABLE = 40  # of these wrong ones and refusals, so that ordinary ones stay beside them
+_MAX_BYTES = 32_000  # of one, so that a report of 60 frames stays below 15 MB
 _QUALITIES = (82, 70, 55, 40, 25)
 _AGREE, _OTHER = (0, 158, 115), (200, 200, 200)
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class Panel:
     """A picture of the slider.
 
     Attributes:
@@ -57,18 +57,18 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class SliderFrame:
     """One frame of the slider: its index in the track, and its pictures from left to right."""
 
     index: int
-    pictures: list[Picture]
+    pictures: list[Panel]
 
 
-def choose_frames(rows: Sequence[TrackRow], errors: Errors, most: int = MOST_FRAMES) -> list[int]:
+def choose_frames(rows: Sequence[TrackRow], errors: Errors, most: int = MAX_FRAMES) -> list[int]:
     """Which frames are shown: wrong ones before refusals before evenly spaced others, in the order of time."""
     if len(rows) <= most:
         return list(range(len(rows)))
-    remarkable = most * _MOST_REMARKABLE // MOST_FRAMES
+    remarkable = most * _MAX_REMARKABLE // MAX_FRAMES
     refused, wrong = np.array([not row.fixed for row in rows]), errors.distance_m > WRONG_M
     chosen: list[int] = []
     for kind, limit in (
@@ -96,7 +96,7 @@ def explain_frames(
     notes: Sequence[Note],
     chosen: Sequence[int],
     errors: Errors,
-) -> list[Shown]:
+) -> list[SliderFrame]:
     """Match chosen frames again, each in the window of its run, and draw what comes out.
 
     Args:
@@ -111,10 +111,10 @@ def explain_frames(
         TelemetryError: a frame cannot be read any more.
     """
     drawer = _Drawer(matcher, errors)
-    return [Shown(i, drawer.pictures(i, flight.read(i), rows[i], notes[i])) for i in chosen]
+    return [SliderFrame(i, drawer.pictures(i, flight.read(i), rows[i], notes[i])) for i in chosen]
 
 
-def encode(image: Image, most_bytes: int = _MOST_BYTES) -> str:
+def encode(image: Image, most_bytes: int = _MAX_BYTES) -> str:
     """A picture (H, W) or (H, W, 3) RGB as a data URI, as good a JPEG as fits."""
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     for quality in _QUALITIES:
@@ -151,7 +151,7 @@ class _Drawer:
     matcher: SceneMatcher
     errors: Errors
 
-    def pictures(self, index: int, item: FlightFrame, row: TrackRow, note: Note) -> list[Picture]:
+    def pictures(self, index: int, item: FlightFrame, row: TrackRow, note: Note) -> list[Panel]:
         """The frame, its rectified form, the window, and the surface or the matches, as far as they exist."""
         image = item.frame.image
         assert isinstance(image, np.ndarray)  # read from a file
@@ -171,7 +171,7 @@ class _Drawer:
             out.append(_matches(found, found.matches, self.matcher.site, window))
         return out
 
-    def _map(self, index: int, window: Window, found: Explanation, row: TrackRow) -> Picture:
+    def _map(self, index: int, window: Window, found: Explanation, row: TrackRow) -> Panel:
         """The window, with the place that was found, the fix and the truth."""
         crop, per_px = draw_window(self.matcher.site, window)
         marks = [] if found.surface is None else [_tried(found.surface, window, per_px)]
@@ -235,16 +235,16 @@ def _mark(place: Array, name: str) -> str:
     return f'<path class="rim" {arms}<path class="fix" {arms}'
 
 
-def _picture(image: Image, caption: str, alt: str) -> Picture:
+def _picture(image: Image, caption: str, alt: str) -> Panel:
     """Reduced to what is shown."""
     scale = min(1.0, SIDE_PX / max(image.shape[:2]))
     if scale < 1.0:
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return Picture(encode(image), image.shape[1], image.shape[0], caption, alt)
+    return Panel(encode(image), image.shape[1], image.shape[0], caption, alt)
 
 
-def draw_surface(surface: Surface) -> tuple[Image, Array]:
+def draw_surface(surface: ScoreSurface) -> tuple[Image, Array]:
     """The correlation at each place of the patch's middle in colour (H, W, 3), and where (2,) its peak is in that.
 
     What correlates negatively is as dark as nothing.
@@ -262,12 +262,12 @@ def draw_surface(surface: Surface) -> tuple[Image, Array]:
     return np.asarray(coloured, np.uint8), (np.array(surface.peak_px) + 0.5) * scale
 
 
-def lowest_shown(surface: Surface) -> float:
+def lowest_shown(surface: ScoreSurface) -> float:
     """The correlation that is drawn as dark as can be."""
     return min(max(0.0, float(surface.scores.min())), surface.score)
 
 
-def _surface(surface: Surface) -> Picture:
+def _surface(surface: ScoreSurface) -> Panel:
     image, (x, y) = draw_surface(surface)
     low, high = lowest_shown(surface), surface.score
     caption = f"correlation in the dotted area, {low:.2f} (dark) to {high:.2f} (bright)"
@@ -275,7 +275,7 @@ def _surface(surface: Surface) -> Picture:
     return replace(picture, overlay=f'<circle class="peak" cx="{x:.1f}" cy="{y:.1f}" r="10"/>')
 
 
-def _tried(surface: Surface, window: Window, per_px: float) -> str:
+def _tried(surface: ScoreSurface, window: Window, per_px: float) -> str:
     """The area of the window in which the patch's middle was tried."""
     x, y = within_window(surface.corner_px - surface.step_px / 2.0, window, per_px)
     height, width = (n * surface.step_px * per_px for n in surface.scores.shape)
@@ -288,7 +288,7 @@ def stretched(gray: Image) -> Image:
     return np.asarray(np.clip((gray - low) * (255.0 / max(high - low, 24.0)), 0.0, 255.0), np.uint8)
 
 
-def draw_matches(found: Explanation, matches: Matches, site: OrthoMap, window: Window) -> Image:
+def draw_matches(found: Explanation, matches: PointMatches, site: OrthoMap, window: Window) -> Image:
     """Frame and window (H, W, 3) side by side, a line for each match."""
     right, per_px = draw_window(site, window)
     scale = min(SIDE_PX / max(found.gray.shape), right.shape[0] / found.gray.shape[0])
@@ -305,12 +305,12 @@ def draw_matches(found: Explanation, matches: Matches, site: OrthoMap, window: W
     return rgb
 
 
-def _matches(found: Explanation, matches: Matches, site: OrthoMap, window: Window) -> Picture:
+def _matches(found: Explanation, matches: PointMatches, site: OrthoMap, window: Window) -> Panel:
     rgb = draw_matches(found, matches, site, window)
     count, agree = len(matches.agree), int(matches.agree.sum())
     caption = f"{count} matches" + (f", {agree} agree with the pose (green)" if agree else "")
-    uri = encode(rgb, 2 * _MOST_BYTES)
-    return Picture(uri, rgb.shape[1], rgb.shape[0], caption, f"Frame and window with lines for {caption}.")
+    uri = encode(rgb, 2 * _MAX_BYTES)
+    return Panel(uri, rgb.shape[1], rgb.shape[0], caption, f"Frame and window with lines for {caption}.")
 
 
 def _fixed(point: Array) -> tuple[int, int]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M, Errors, Ground, errors_en_m, height_pairs_m, summarise
-from engine.types import Truth, Window
+from engine.values import Truth, Window
 
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
@@ -32,7 +32,7 @@ _GAP_S = 5.0  # a line of truth is broken where it says nothing for this long
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class TrackPlotData:
     """What every plot needs of a track, worked out once.
 
     Attributes:
@@ -105,7 +105,7 @@ def _first_place(rows: Sequence[TrackRow], truth: Sequence[Truth] | None) -> Loc
 
 def scene_of(
     rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: LocalFrame, ground: Ground, title: str
-) -> Scene:
+) -> TrackPlotData:
     """Work out what plots need of a track."""
     stamps = [row.timestamp_ns for row in rows]
     known = [stamp for stamp in stamps if stamp is not None]
@@ -115,7 +115,7 @@ def scene_of(
         time, label = np.arange(len(rows), dtype=np.float64), "frame"
     errors = errors_en_m(rows, truth, frame)
     refused = np.array([not row.fixed for row in rows], dtype=bool)
-    return Scene(
+    return TrackPlotData(
         time=time,
         time_label=label,
         errors=errors,
@@ -150,7 +150,7 @@ def _metres(value: float) -> str:
     return f"{value:.2f} m" if abs(value) < 1e5 else f"{value:.1e} m"
 
 
-def _new_figure(scene: Scene, size_in: tuple[float, float], panels: int = 1) -> tuple[Any, list[Any]]:
+def _new_figure(scene: TrackPlotData, size_in: tuple[float, float], panels: int = 1) -> tuple[Any, list[Any]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size_in, layout="constrained")
@@ -201,7 +201,7 @@ def _draw_refused(ax: Any, x: Array, y: Array) -> None:
 # ------------------------------------------------------------------------------------------------ Fig. 7, 9
 
 
-def _path(scene: Scene, site: OrthoMap | None) -> Any:
+def _path(scene: TrackPlotData, site: OrthoMap | None) -> Any:
     low, high = _view(scene)
     span = high - low
     width_in = 8.0
@@ -241,7 +241,7 @@ def _note_outside(ax: Any, outside: NDArray[np.bool_]) -> None:
         )
 
 
-def _view(scene: Scene) -> tuple[Array, Array]:
+def _view(scene: TrackPlotData) -> tuple[Array, Array]:
     """The corners of what is shown: the flight with a margin; one fix that is far off does not shrink it."""
     truth = scene.errors.truth_en_m
     shown = truth if np.isfinite(truth).any() else scene.errors.fix_en_m
@@ -304,7 +304,7 @@ def _crop(site: OrthoMap, low: Array, high: Array) -> tuple[Window, int] | None:
 # ----------------------------------------------------------------------------------------------- Fig. 8, 10
 
 
-def _position(scene: Scene) -> Any:
+def _position(scene: TrackPlotData) -> Any:
     figure, axes = _new_figure(scene, (9.0, 6.0), panels=2)
     for axis, (ax, name) in enumerate(zip(axes, ("east (m)", "north (m)"), strict=True)):
         fix, truth = scene.errors.fix_en_m[:, axis], scene.errors.truth_en_m[:, axis]
@@ -341,7 +341,7 @@ def _clip(ax: Any, low: float, high: float, points: Array) -> None:
 # -------------------------------------------------------------------------------------------------- Fig. 11
 
 
-def _height(scene: Scene) -> Any:
+def _height(scene: TrackPlotData) -> Any:
     figure, (ax,) = _new_figure(scene, (9.0, 4.2))
     fix, truth = scene.heights.T
     _draw_series(ax, scene.time, fix, truth)
@@ -360,7 +360,7 @@ def _height(scene: Scene) -> Any:
     return figure
 
 
-def _draw_rug(ax: Any, scene: Scene) -> None:
+def _draw_rug(ax: Any, scene: TrackPlotData) -> None:
     """Refusals as ticks along the lower edge, where there is no value to mark them at."""
     if scene.refused.any():
         time = scene.time[scene.refused]
@@ -371,7 +371,7 @@ def _draw_rug(ax: Any, scene: Scene) -> None:
 # -------------------------------------------------------------------------------------------- error in time
 
 
-def _error(scene: Scene) -> Any:
+def _error(scene: TrackPlotData) -> Any:
     figure, (ax,) = _new_figure(scene, (9.0, 4.2))
     distance = scene.errors.distance_m
     sigma = np.sqrt(_larger_axis_m2(scene.errors.covariance_en_m2))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from engine.orthomap import OrthoMap
 from engine.report.explain import SIDE_PX
-from engine.types import Window
+from engine.values import Window
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -23,7 +23,7 @@ from engine.formats.resampling import EPOCH_NS
 from engine.formats.track import track_row
 from engine.live import Answer
 from engine.matcher import SceneMatcher
-from engine.methods.explained import Explanation
+from engine.methods.explanation import Explanation
 from engine.navigator import Navigator, NavigatorState
 from engine.report.explain import (
     SIDE_PX,
@@ -46,7 +46,7 @@ from engine.report.live_shapes import (
     outline,
     scaled,
 )
-from engine.types import Fix, Frame, NoFix, Window
+from engine.values import Fix, Frame, NoFix, Window
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

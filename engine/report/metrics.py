@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from engine.formats.track import TrackRow
 from engine.formats.truth import interpolate_truth
 from engine.geo import LocalFrame
-from engine.types import Truth
+from engine.values import Truth
 
 Array = NDArray[np.float64]
 

@@ -19,13 +19,13 @@ import torch
 from engine.formats.notes import Note
 from engine.formats.track import TrackRow
 from engine.orthomap import OrthoMap
-from engine.report.explain import Shown
-from engine.report.figures import Scene, scene_of
+from engine.report.explain import SliderFrame
+from engine.report.figures import TrackPlotData, scene_of
 from engine.report.metrics import WRONG_M, Ground
 from engine.report.page_charts import draw_charts
 from engine.report.page_map import TrackMap, draw_map, map_of
 from engine.report.verdict import MEANINGS, metres, verdict_of
-from engine.types import Reason, Truth, Window
+from engine.values import Reason, Truth, Window
 
 _FACTS = {
     "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
@@ -36,7 +36,7 @@ _FACTS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
+class FinishedTrack:
     """A finished track with what is known of it.
 
     Attributes:
@@ -55,12 +55,12 @@ class Flown:
     summary: Mapping[str, Any]
     notes: Sequence[Note] | None
 
-    def scene(self) -> Scene:
+    def scene(self) -> TrackPlotData:
         """What is drawn of it."""
         return scene_of(self.rows, self.truth, self.site.frame, self.ground, "")
 
 
-def write_page(path: Path, flown: Flown, shown: Sequence[Shown] = (), why_not: str = "") -> None:
+def write_page(path: Path, flown: FinishedTrack, shown: Sequence[SliderFrame] = (), why_not: str = "") -> None:
     """Write the page; equal inputs give equal bytes.
 
     Args:
@@ -114,7 +114,7 @@ def _sigma_m(rows: Sequence[TrackRow]) -> float | None:
     return float(np.median(sigmas)) if sigmas else None
 
 
-def _headings(flown: Flown, scene: Scene) -> tuple[str, str]:
+def _headings(flown: FinishedTrack, scene: TrackPlotData) -> tuple[str, str]:
     """The flight's name, and how it was followed."""
     record = flown.summary["settings"]
     frames = Path(record.get("frames") or record["map"])
@@ -127,7 +127,7 @@ def _headings(flown: Flown, scene: Scene) -> tuple[str, str]:
     return name or "flight", text
 
 
-def _tiles(flown: Flown) -> list[tuple[str, str]]:
+def _tiles(flown: FinishedTrack) -> list[tuple[str, str]]:
     """Key figures, each with its name; those that are not known are left out."""
     summary = flown.summary
     share = summary["availability"]
@@ -152,7 +152,7 @@ def _tiles(flown: Flown) -> list[tuple[str, str]]:
     return tiles
 
 
-def _map_legend(scene: Scene, track_map: TrackMap, slider: bool) -> str:
+def _map_legend(scene: TrackPlotData, track_map: TrackMap, slider: bool) -> str:
     true = bool(np.isfinite(scene.errors.truth_en_m).any())
     wrong = bool((scene.errors.distance_m > WRONG_M).any())
     cross = "M6 2l10 10M16 2l-10 10"
@@ -182,7 +182,7 @@ def _map_legend(scene: Scene, track_map: TrackMap, slider: bool) -> str:
     )
 
 
-def _states_legend(flown: Flown) -> str:
+def _states_legend(flown: FinishedTrack) -> str:
     """The colours of the navigator's states, as far as they occurred."""
     seen = {note.state for note in flown.notes or ()} - {"tracking"}
     names = {"coasting": "on dead reckoning", "searching": "searching for a first fix", "lost": "lost"}
@@ -194,7 +194,7 @@ def _states_legend(flown: Flown) -> str:
     return f'\n<ul class="legend states">{items}</ul>' if items else ""
 
 
-def _refusals(flown: Flown, shown: Sequence[Shown]) -> str:
+def _refusals(flown: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
     """A row for each reason, the most frequent first, with what one of its refusals said."""
     if not flown.summary["reasons"]:
         return "<p>No frame was refused.</p>" if flown.rows else "<p>There are no frames.</p>"
@@ -214,7 +214,7 @@ def _refusals(flown: Flown, shown: Sequence[Shown]) -> str:
     return f'<table class="reasons"><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table>'
 
 
-def _slider(flown: Flown, scene: Scene, shown: Sequence[Shown], why_not: str) -> str:
+def _slider(flown: FinishedTrack, scene: TrackPlotData, shown: Sequence[SliderFrame], why_not: str) -> str:
     if not shown:
         return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
     text = f"All {len(shown)} frames."
@@ -235,7 +235,7 @@ def _slider(flown: Flown, scene: Scene, shown: Sequence[Shown], why_not: str) ->
     )
 
 
-def _told(indices: Sequence[int], shown: Sequence[Shown], what: str) -> str:
+def _told(indices: Sequence[int], shown: Sequence[SliderFrame], what: str) -> str:
     """How many of these frames are shown; nothing where there are none."""
     count = len({one.index for one in shown} & set(indices))
     return (
@@ -247,7 +247,7 @@ def _told(indices: Sequence[int], shown: Sequence[Shown], what: str) -> str:
     )
 
 
-def _frame(shown: Shown, flown: Flown, scene: Scene, track_map: TrackMap) -> dict[str, Any]:
+def _frame(shown: SliderFrame, flown: FinishedTrack, scene: TrackPlotData, track_map: TrackMap) -> dict[str, Any]:
     """What the page's script knows of one frame."""
     i = shown.index
     row, note = flown.rows[i], flown.notes[i] if flown.notes else None
@@ -279,7 +279,7 @@ def _frame(shown: Shown, flown: Flown, scene: Scene, track_map: TrackMap) -> dic
     }
 
 
-def _facts(i: int, row: TrackRow, note: Note | None, scene: Scene) -> list[tuple[str, str]]:
+def _facts(i: int, row: TrackRow, note: Note | None, scene: TrackPlotData) -> list[tuple[str, str]]:
     sigma = (
         None if row.sigma_east_m is None or row.sigma_north_m is None else (row.sigma_east_m, row.sigma_north_m)
     )

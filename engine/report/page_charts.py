@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from engine.formats.notes import Note
 from engine.formats.track import TrackRow
 from engine.report.charts import Limits, Plot, dots
-from engine.report.figures import Scene
+from engine.report.figures import TrackPlotData
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 
 Array = NDArray[np.float64]
@@ -20,7 +20,7 @@ _ROOM = 1.08  # above the highest value
 
 
 def draw_charts(
-    rows: Sequence[TrackRow], notes: Sequence[Note] | None, scene: Scene, budget_ms: float | None
+    rows: Sequence[TrackRow], notes: Sequence[Note] | None, scene: TrackPlotData, budget_ms: float | None
 ) -> list[tuple[str, str]]:
     """The charts, each with its caption; what there is nothing of is left out."""
     if not rows:
@@ -41,7 +41,7 @@ def _column(rows: Sequence[TrackRow], name: str) -> Array:
     return np.array([np.nan if (value := getattr(row, name)) is None else value for row in rows], np.float64)
 
 
-def _error(scene: Scene, time: Limits) -> tuple[str, str]:
+def _error(scene: TrackPlotData, time: Limits) -> tuple[str, str]:
     """The error with one and three of the stated sigmas; without truth the sigma alone."""
     errors, known = scene.errors, np.isfinite(scene.errors.distance_m)
     covariance = errors.covariance_en_m2
@@ -73,7 +73,7 @@ def _error(scene: Scene, time: Limits) -> tuple[str, str]:
 
 
 def _answers(
-    rows: Sequence[TrackRow], notes: Sequence[Note] | None, scene: Scene, time: Limits
+    rows: Sequence[TrackRow], notes: Sequence[Note] | None, scene: TrackPlotData, time: Limits
 ) -> tuple[str, str]:
     """Fix or reason of each frame, on the state of the navigator."""
     kinds = ["fix", *sorted({row.reason or "unknown" for row in rows if not row.fixed})]
@@ -89,7 +89,7 @@ def _answers(
     return "Answers, on the state of the navigator" if notes else "Answers", chart
 
 
-def _height(scene: Scene, time: Limits) -> tuple[str, str]:
+def _height(scene: TrackPlotData, time: Limits) -> tuple[str, str]:
     found, true = scene.heights.T
     known = scene.heights[np.isfinite(scene.heights)]
     low, high = np.percentile(known, [1, 99])
@@ -102,7 +102,7 @@ def _height(scene: Scene, time: Limits) -> tuple[str, str]:
     return what, plot.svg(what, scene.time_label, marks, timed=True)
 
 
-def _score(rows: Sequence[TrackRow], scene: Scene, time: Limits) -> tuple[str, str]:
+def _score(rows: Sequence[TrackRow], scene: TrackPlotData, time: Limits) -> tuple[str, str]:
     score, methods = _column(rows, "score"), [row.method for row in rows]
     plot = Plot(time, (min(0.0, float(np.nanmin(score))), 1.0))
     fixed = np.array([row.fixed for row in rows])
@@ -116,7 +116,7 @@ def _score(rows: Sequence[TrackRow], scene: Scene, time: Limits) -> tuple[str, s
     return what, plot.svg(what, scene.time_label, marks, timed=True)
 
 
-def _latency(latency_ms: Array, scene: Scene, time: Limits, budget_ms: float | None) -> tuple[str, str]:
+def _latency(latency_ms: Array, scene: TrackPlotData, time: Limits, budget_ms: float | None) -> tuple[str, str]:
     plot = Plot(time, (0.0, _top_ms(latency_ms, budget_ms)))
     marks = [
         plot.dots(scene.time, latency_ms, "fix"),

@@ -12,9 +12,9 @@ from engine.methods.query import level_crop
 from engine.orthomap import OrthoMap
 from engine.report.charts import crosses, dots, line, ticks
 from engine.report.explain import encode
-from engine.report.figures import Scene
+from engine.report.figures import TrackPlotData
 from engine.report.metrics import WRONG_M
-from engine.types import Window
+from engine.values import Window
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ _MAP_PX = 1500  # longer side as drawn
 _MAP_BYTES = 900_000
 _MARGIN_SHARE, _MARGIN_PX = 0.12, 40.0
 _ASPECTS = (0.62, 0.95)  # of height over width, as far as the map goes
-_MOST_ELLIPSES = 400
+_MAX_ELLIPSES = 400
 _SIGMAS = 3.0
 _SPEEDY_M = 60.0  # a line of fixes is broken where the next is farther than this, or than a few usual steps
 
@@ -58,7 +58,7 @@ class TrackMap:
         return (round(x, 1), round(y, 1), window.width_px / 2.0**self.level, window.height_px / 2.0**self.level)
 
 
-def map_of(site: OrthoMap, scene: Scene) -> TrackMap:
+def map_of(site: OrthoMap, scene: TrackPlotData) -> TrackMap:
     """The part of the map that holds fixes, refusals and truth, with some ground around; all of it without any."""
     places_m = np.concatenate([scene.errors.fix_en_m, scene.errors.truth_en_m, scene.refused_en_m])
     places = site.pixel_from_enu(places_m[np.isfinite(places_m).all(axis=1)])
@@ -79,7 +79,7 @@ def map_of(site: OrthoMap, scene: Scene) -> TrackMap:
     return TrackMap(site, Window(x0, y0, width, height), level)
 
 
-def draw_map(track_map: TrackMap, scene: Scene) -> str:
+def draw_map(track_map: TrackMap, scene: TrackPlotData) -> str:
     """The map as SVG, from below upwards: ground, way, ellipses, fixes, refusals, wrong fixes, the frame shown."""
     _, _, width, height = track_map.box
     crop = level_crop(track_map.site, track_map.window, track_map.level)
@@ -106,7 +106,7 @@ def draw_map(track_map: TrackMap, scene: Scene) -> str:
     return f'{head} aria-label="{escape(label, quote=True)}">{"".join(marks)}</svg>'
 
 
-def _way(track_map: TrackMap, scene: Scene) -> str:
+def _way(track_map: TrackMap, scene: TrackPlotData) -> str:
     """The true way, and without truth that of the fixes."""
     truth = scene.errors.truth_en_m
     kind, places_m = ("truth", truth) if np.isfinite(truth).any() else ("way", scene.errors.fix_en_m)
@@ -117,12 +117,12 @@ def _way(track_map: TrackMap, scene: Scene) -> str:
     return line(places, "halo") + line(places, kind)
 
 
-def _ellipses(track_map: TrackMap, scene: Scene) -> str:
+def _ellipses(track_map: TrackMap, scene: TrackPlotData) -> str:
     """Three sigmas of the fixes, or of evenly spaced ones where there are many."""
     errors = scene.errors
     known = np.flatnonzero(np.isfinite(errors.fix_en_m[:, 0]) & np.isfinite(errors.covariance_en_m2[:, 0, 0]))
-    if known.size > _MOST_ELLIPSES:
-        known = known[np.round(np.linspace(0, known.size - 1, _MOST_ELLIPSES)).astype(int)]
+    if known.size > _MAX_ELLIPSES:
+        known = known[np.round(np.linspace(0, known.size - 1, _MAX_ELLIPSES)).astype(int)]
     parts = []
     for i in known:
         x, y = track_map.places(errors.fix_en_m[i])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from engine.report.metrics import WRONG_M
-from engine.types import Reason
+from engine.values import Reason
 
 MEANINGS = {
     Reason.NO_TEXTURE: "The picture is almost flat, or covers next to nothing of the map.",

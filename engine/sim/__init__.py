@@ -1,9 +1,9 @@
 """The software-in-the-loop flight: a simulated town, the camera over it, the vehicle and its sensors."""
 
 from engine.sim.conditions import CONDITIONS, Condition
-from engine.sim.flight import Plan, SimulatedFlight, paper_flight, picture_at, plan_flight
+from engine.sim.flight import FlightPlan, SimulatedFlight, paper_flight, picture_at, plan_flight
 from engine.sim.light import LIGHTS, Light
-from engine.sim.optics import Optics, Sway, take_picture
+from engine.sim.optics import ExposureMotion, Optics, take_picture
 from engine.sim.raster_world import world_from_map
 from engine.sim.render import World, render_frame
 from engine.sim.town import Town, build_town
@@ -13,14 +13,14 @@ __all__ = [
     "CONDITIONS",
     "LIGHTS",
     "Condition",
+    "ExposureMotion",
+    "FlightPlan",
     "FlightStyle",
     "Light",
     "Motion",
     "Optics",
-    "Plan",
     "SensorNoise",
     "SimulatedFlight",
-    "Sway",
     "Town",
     "World",
     "build_town",

@@ -15,7 +15,7 @@ from engine.errors import OptionError
 from engine.sim.canvas import CANOPY, CROP, GRASS
 from engine.sim.light import LIGHTS, Array, Float32, Image, Light
 from engine.sim.optics import Sensor
-from engine.sim.render import Air
+from engine.sim.render import Atmosphere
 
 _SNOW: tuple[float, ...] = (0.92, 0.18, 0.45, 0.72, 0.92, 0.0, 0.35)
 """Share of each material, in the canvas's order, that lies under a closed cover of snow; streets are cleared."""
@@ -64,9 +64,9 @@ class Condition:
                 raise OptionError(f"{name}: expected above 0, got {getattr(self, name)}")
 
     @property
-    def air(self) -> Air | None:
+    def air(self) -> Atmosphere | None:
         """What is looked through, None where it is perfectly clear."""
-        return None if math.isinf(self.visibility_m) else Air(self.visibility_m, self.air_rgb)
+        return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
 
     @property
     def dresses(self) -> bool:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import enu_from_body
-from engine.sim.quadrotor import GRAVITY, STEP_S, Felt, next_time_s
+from engine.sim.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s
 from engine.sim.rotations import cross_matrix, rotation
 from engine.sim.sensors import GpsSample, SensorSuite
-from engine.types import Attitude, Fix
+from engine.values import Attitude, Fix
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ START_TILT_DEG = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class FilterState:
     """What the filter believes of one moment.
 
     Attributes:
@@ -62,7 +62,7 @@ class Belief:
         return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
 
 
-def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> Belief:
+def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> FilterState:
     """The belief of a vehicle at rest that was levelled: its heading is known as well as by its compass.
 
     Args:
@@ -82,7 +82,7 @@ def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSu
     # The heading is the compass's: as far as that reads too far clockwise, the nose lies anticlockwise of it.
     up = TURN.start + 2
     covariance[up, COMPASS] = covariance[COMPASS, up] = math.radians(suite.compass.bias_deg) ** 2
-    return Belief(
+    return FilterState(
         0.0,
         np.asarray(position_m, float),
         np.zeros(3),
@@ -95,7 +95,7 @@ def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSu
     )
 
 
-def predict(belief: Belief, sample: Felt, suite: SensorSuite) -> Belief:
+def predict(belief: FilterState, sample: IdealImu, suite: SensorSuite) -> FilterState:
     """The belief one step later, by what the IMU measured meanwhile."""
     rates, dt = sample.rates_rps - belief.gyro_bias_rps, STEP_S
     half = belief.enu_from_body @ rotation(0.5 * dt * rates)
@@ -107,7 +107,7 @@ def predict(belief: Belief, sample: Felt, suite: SensorSuite) -> Belief:
     F = _motion(half, force, keep_accel, keep_gyro, keep_baro)
     covariance = F @ belief.covariance @ F.T
     covariance[_DIAGONAL] += _process_noise(suite)
-    return Belief(
+    return FilterState(
         next_time_s(belief.time_s),
         belief.position_m + dt * belief.velocity_mps + 0.5 * dt**2 * acceleration,
         belief.velocity_mps + dt * acceleration,
@@ -144,7 +144,7 @@ def _process_noise(suite: SensorSuite) -> Array:
     return STEP_S * np.concatenate([np.repeat(drive, 3), [drift, 0.0]]) ** 2
 
 
-def correct(belief: Belief, residual: Array, H: Array, R: Array) -> Belief:
+def correct(belief: FilterState, residual: Array, H: Array, R: Array) -> FilterState:
     """The belief after a measurement (Joseph's form, which keeps the covariance positive definite).
 
     Args:
@@ -159,7 +159,7 @@ def correct(belief: Belief, residual: Array, H: Array, R: Array) -> Belief:
     covariance = kept @ P @ kept.T + gain @ R @ gain.T
     error = gain @ residual
     # Taking the turn into the attitude moves the others' frame by half of it (Solà, eq. 287): too little to keep.
-    return Belief(
+    return FilterState(
         belief.time_s,
         belief.position_m + error[POSITION],
         belief.velocity_mps + error[VELOCITY],
@@ -172,7 +172,7 @@ def correct(belief: Belief, residual: Array, H: Array, R: Array) -> Belief:
     )
 
 
-def fuse_height(belief: Belief, height_m: float, suite: SensorSuite) -> Belief:
+def fuse_height(belief: FilterState, height_m: float, suite: SensorSuite) -> FilterState:
     """Takes in the barometer."""
     H = np.zeros((1, STATES))
     H[0, 2] = H[0, BARO] = 1.0
@@ -180,7 +180,7 @@ def fuse_height(belief: Belief, height_m: float, suite: SensorSuite) -> Belief:
     return correct(belief, residual, H, np.array([[suite.barometer.noise_m**2]]))
 
 
-def fuse_heading(belief: Belief, heading_deg: float, suite: SensorSuite) -> Belief:
+def fuse_heading(belief: FilterState, heading_deg: float, suite: SensorSuite) -> FilterState:
     """Takes in the compass; a body that points straight up or down has no heading."""
     east, north, up = belief.enu_from_body[:, 0].tolist()
     flat2 = east**2 + north**2
@@ -195,7 +195,7 @@ def fuse_heading(belief: Belief, heading_deg: float, suite: SensorSuite) -> Beli
     return correct(belief, residual, H, np.array([[math.radians(suite.compass.noise_deg) ** 2]]))
 
 
-def fuse_gps(belief: Belief, sample: GpsSample, suite: SensorSuite) -> Belief:
+def fuse_gps(belief: FilterState, sample: GpsSample, suite: SensorSuite) -> FilterState:
     """Takes in position and velocity of the receiver, at the moment that they are of."""
     gps = suite.gps
     variances = np.array([gps.noise_m] * 2 + [gps.height_noise_m] + [gps.velocity_noise_mps] * 3) ** 2
@@ -203,7 +203,7 @@ def fuse_gps(belief: Belief, sample: GpsSample, suite: SensorSuite) -> Belief:
     return correct(belief, residual, np.eye(6, STATES), np.diag(variances))
 
 
-def fuse_fix(belief: Belief, fix: Fix) -> Belief:
+def fuse_fix(belief: FilterState, fix: Fix) -> FilterState:
     """Takes in a fix of the engine with its covariance, at its capture; its height too where it has one.
 
     Args:
@@ -216,7 +216,7 @@ def fuse_fix(belief: Belief, fix: Fix) -> Belief:
     return correct(belief, np.array(place) - belief.position_m[:count], np.eye(count, STATES), spread)
 
 
-def fix_chi_square(belief: Belief, fix: Fix) -> float:
+def fix_chi_square(belief: FilterState, fix: Fix) -> float:
     """Squared horizontal distance of a fix from the belief, in units of both covariances: 2 degrees of freedom."""
     apart = np.array([fix.east_m, fix.north_m]) - belief.position_m[:2]
     spread = belief.covariance[:2, :2] + fix.covariance_m2[:2, :2]

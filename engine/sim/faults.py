@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from engine.budget import Budget
 from engine.errors import OptionError
 from engine.navigator import Matcher
-from engine.types import Fix, Frame, NoFix, Prior
+from engine.values import Fix, Frame, NoFix, Prior
 
 KINDS = ("none", "killed", "shifted", "frozen")
 

@@ -17,11 +17,11 @@ from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.sim.conditions import Condition
 from engine.sim.light import Image
-from engine.sim.optics import Optics, Sensor, Sway, take_picture
+from engine.sim.optics import ExposureMotion, Optics, Sensor, take_picture
 from engine.sim.render import transformer
 from engine.sim.town import Town, build_town, generator
 from engine.sim.vehicle import STEP_S, FlightStyle, Motion, SensorNoise, fly, measure
-from engine.types import Attitude, Frame, Truth
+from engine.values import Attitude, Frame, Truth
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def picture_at(
     *,
     sensor: Sensor | None = None,
     optics: Optics | None = None,
-    sway: Sway | None = None,
+    sway: ExposureMotion | None = None,
 ) -> Image:
     """The picture (H, W, 3) RGB that a camera at a place delivers.
 
@@ -81,7 +81,7 @@ def picture_at(
 
 
 @dataclass(frozen=True)
-class Plan:
+class FlightPlan:
     """A flight before its pictures are drawn.
 
     Attributes:
@@ -104,7 +104,7 @@ class Plan:
     timestamps_ns: tuple[int, ...]
     seed: int
     optics: Optics | None = None
-    sways: tuple[Sway, ...] = ()
+    sways: tuple[ExposureMotion, ...] = ()
 
     def __len__(self) -> int:
         return len(self.timestamps_ns)
@@ -195,7 +195,7 @@ def _check_frames(frames: int | None, rate_hz: float) -> None:
         raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
 
 
-def _sways(motion: Motion, time_s: Array) -> tuple[Sway, ...]:
+def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
     """Velocity and turn at each time, from the motion a hundredth of a second before and after."""
     before, now, after = (motion.at(time_s + step) for step in (-STEP_S, 0.0, STEP_S))
 
@@ -205,7 +205,7 @@ def _sways(motion: Motion, time_s: Array) -> tuple[Sway, ...]:
     angles = ("roll_deg", "pitch_deg", "heading_deg")
     turns = np.column_stack([rate((getattr(before, name), getattr(after, name))) for name in angles])
     return tuple(
-        Sway((float(v[0]), float(v[1]), float(v[2])), (float(w[0]), float(w[1]), float(w[2])))
+        ExposureMotion((float(v[0]), float(v[1]), float(v[2])), (float(w[0]), float(w[1]), float(w[2])))
         for v, w in zip(now.velocity_mps, turns, strict=True)
     )
 
@@ -226,8 +226,8 @@ def plan_flight(
     river: bool = False,
     changed: float = 0.0,
     optics: Optics | None = None,
-) -> Plan:
-    """Plan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
+) -> FlightPlan:
+    """FlightPlan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
 
     Args:
         seed: of town, path, sensors and camera.
@@ -270,7 +270,7 @@ def plan_flight(
     truth = motion.at(stamps * 1e-9)
     told = measure(truth, noise or SensorNoise(), generator(seed, 0x5E))
     sways = () if optics is None else _sways(motion, stamps * 1e-9)
-    return Plan(
+    return FlightPlan(
         town, camera, origin, truth, told, tuple((START_NS + stamps).tolist()), seed, optics=optics, sways=sways
     )
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from engine.errors import StateError
-from engine.sim.ekf import Belief, predict
-from engine.sim.quadrotor import STEP_S, Felt
+from engine.sim.ekf import FilterState, predict
+from engine.sim.quadrotor import STEP_S, IdealImu
 from engine.sim.sensors import SensorSuite
 
-Correction = Callable[[Belief], Belief]
+Correction = Callable[[FilterState], FilterState]
 """A measurement: the belief before it in, the belief after it out."""
 
 
@@ -19,8 +19,8 @@ Correction = Callable[[Belief], Belief]
 class _Step:
     """What led from one belief to the next, and that belief."""
 
-    sample: Felt
-    belief: Belief
+    sample: IdealImu
+    belief: FilterState
     corrections: list[Correction] = field(default_factory=list)
 
 
@@ -35,24 +35,24 @@ class History:
         keep_s: how far back a measurement may lie.
     """
 
-    def __init__(self, start: Belief, suite: SensorSuite, keep_s: float = 2.0) -> None:
+    def __init__(self, start: FilterState, suite: SensorSuite, keep_s: float = 2.0) -> None:
         self._suite = suite
         self._before = start
         self._steps: deque[_Step] = deque()
         self._most = round(keep_s / STEP_S)
 
     @property
-    def now(self) -> Belief:
+    def now(self) -> FilterState:
         """The newest belief."""
         return self._steps[-1].belief if self._steps else self._before
 
-    def advance(self, sample: Felt) -> None:
+    def advance(self, sample: IdealImu) -> None:
         """One step on, by what the IMU measured."""
         self._steps.append(_Step(sample, predict(self.now, sample, self._suite)))
         if len(self._steps) > self._most:
             self._before = self._steps.popleft().belief
 
-    def at(self, time_s: float) -> Belief:
+    def at(self, time_s: float) -> FilterState:
         """The belief of a moment as it stands by now.
 
         Raises:

@@ -27,7 +27,7 @@ from engine.geo import attitude_from_rotation
 from engine.navigator import Matcher, Navigator, NavigatorState
 from engine.sim.ekf import (
     START_TILT_DEG,
-    Belief,
+    FilterState,
     begin,
     fix_chi_square,
     fuse_fix,
@@ -38,9 +38,9 @@ from engine.sim.ekf import (
 from engine.sim.faults import Fault, ShiftedMap
 from engine.sim.history import History
 from engine.sim.pilot import Gains, Pilot, Route, Setpoint
-from engine.sim.quadrotor import STEP_S, Air, Airframe, State, Wind, advance, hovering, shaken
+from engine.sim.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
 from engine.sim.sensors import GpsSample, Instruments, SensorSuite, steps_between
-from engine.types import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
+from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -105,7 +105,7 @@ class LoopOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Instant:
+class LoopSample:
     """One row of the flight's record.
 
     Attributes:
@@ -119,14 +119,14 @@ class Instant:
 
     time_s: float
     truth: State
-    belief: Belief
+    belief: FilterState
     plan_m: Array
     mode: Mode
     healthy: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class LoopAnswer:
     """What became of one frame.
 
     Attributes:
@@ -145,7 +145,7 @@ class Answer:
 
 
 @dataclass
-class Flown:
+class LoopResult:
     """A flight that was flown.
 
     Attributes:
@@ -156,8 +156,8 @@ class Flown:
         resets: how often the engine took up its position anew.
     """
 
-    record: list[Instant]
-    answers: list[Answer]
+    record: list[LoopSample]
+    answers: list[LoopAnswer]
     used: list[int]
     start_m: Array
     resets: int = 0
@@ -182,7 +182,7 @@ def fly_closed_loop(
     seconds: float | None = None,
     fault: Fault | None = None,
     options: LoopOptions | None = None,
-) -> Flown:
+) -> LoopResult:
     """Fly a route by the engine's fixes.
 
     Args:
@@ -227,7 +227,7 @@ class ClosedLoop:
         air, sensors, start, self._shakes = np.random.default_rng(np.random.SeedSequence([seed, 0xC1])).spawn(4)
         self._route, self._camera, self.fault, self.options = route, camera, fault, options
         self._map = ShiftedMap(matcher)
-        self._air, self._pilot = Air(options.wind, air), Pilot(options.gains)
+        self._air, self._pilot = WindField(options.wind, air), Pilot(options.gains)
         self._instruments = Instruments(options.sensors, sensors)
         self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
         keep_s = 1.0 + max(options.latency_s, options.sensors.gps.latency_s)
@@ -236,14 +236,14 @@ class ClosedLoop:
         self._clock_s, self._pace, self._plan = 0.0, 1.0, route.at(0.0)
         self._kicks = deque(route.kicks_s)
         self._picture: Image | None = None
-        self._on_its_way: deque[Answer] = deque()
+        self._on_its_way: deque[LoopAnswer] = deque()
         self._receiver: deque[GpsSample] = deque()
         self._contradictions = 0  # in a row
         self._last_fix_s = -math.inf
         self._mode = Mode.FOLLOW
-        self.flown = Flown([], [], [], self._history.now.position_m)
+        self.flown = LoopResult([], [], [], self._history.now.position_m)
 
-    def _first_belief(self, rng: np.random.Generator) -> Belief:
+    def _first_belief(self, rng: np.random.Generator) -> FilterState:
         """At rest, with an error of each that the filter expects."""
         sigma, wrong = self.options.start_sigma_m, rng.standard_normal(5)
         heading = self._instruments.heading_deg(self._state)
@@ -321,7 +321,7 @@ class ClosedLoop:
             result = self._navigator.update(frame)
             self.flown.resets += self._navigator.reset_count - before
         state = None if self._navigator is None else self._navigator.state
-        answer = Answer(stamp_ns, self._state, result, state, time_s + self.options.latency_s)
+        answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.options.latency_s)
         self.flown.answers.append(answer)
         self._on_its_way.append(answer)
         return frame
@@ -363,7 +363,7 @@ class ClosedLoop:
         elif sigma_m < 0.5 * options.hold_sigma_m and off_m < options.resume_m:
             self._mode = Mode.FOLLOW
 
-    def _judge(self, fix: Fix, answer: Answer) -> None:
+    def _judge(self, fix: Fix, answer: LoopAnswer) -> None:
         """A fix that agrees is taken in, any other is counted."""
         captured_s = answer.truth.time_s
         self._last_fix_s = captured_s
@@ -378,5 +378,5 @@ class ClosedLoop:
         """One row of the record."""
         state, options = self._state, self.options
         healthy = state.time_s - self._last_fix_s - options.latency_s <= options.healthy_s
-        row = Instant(state.time_s, state, self._history.now, self._plan.position_m, self._mode, healthy)
+        row = LoopSample(state.time_s, state, self._history.now, self._plan.position_m, self._mode, healthy)
         self.flown.record.append(row)

@@ -20,11 +20,11 @@ from engine.errors import OptionError
 from engine.geo import enu_from_body
 from engine.sim.light import Array, Float32, Image
 from engine.sim.render import World, render_frame
-from engine.types import Attitude
+from engine.values import Attitude
 
 GAIN_LIMITS = (0.25, 8.0)
 """What automatic exposure can do."""
-LARGEST_VIEW = 4.0
+MAX_VIEW = 4.0
 """Sides of the pinhole picture that a lens is drawn from, as a multiple of the camera's."""
 
 
@@ -100,7 +100,7 @@ class Optics:
 
 
 @dataclass(frozen=True)
-class Sway:
+class ExposureMotion:
     """How the vehicle moves and turns while a picture is taken.
 
     Attributes:
@@ -122,7 +122,7 @@ def take_picture(
     *,
     sensor: Sensor,
     optics: Optics | None = None,
-    sway: Sway | None = None,
+    sway: ExposureMotion | None = None,
 ) -> Image:
     """The picture (H, W, 3) RGB that a real camera delivers.
 
@@ -145,8 +145,8 @@ def take_picture(
         OptionError: the camera looks above the horizon, is not above the highest roof, or its lens sees farther
             to the side than a pinhole can show.
     """
-    optics, sway = optics or Optics(), sway or Sway()
-    if camera.distorts or (optics.moves and sway != Sway()):
+    optics, sway = optics or Optics(), sway or ExposureMotion()
+    if camera.distorts or (optics.moves and sway != ExposureMotion()):
         height_m = up_m - world.ground_at(grid_m)
         looks = _looks(camera, attitude, height_m, optics, sway)
         seen = _looked_up(world, camera, grid_m, up_m, attitude, looks)
@@ -180,7 +180,9 @@ def lens_rays(camera: Camera) -> Float32:
     return np.dstack([flat.reshape(camera.height_px, camera.width_px, 2), np.ones(x.shape)]).astype(np.float32)
 
 
-def _looks(camera: Camera, attitude: Attitude, height_m: float, optics: Optics, sway: Sway) -> list[Float32]:
+def _looks(
+    camera: Camera, attitude: Attitude, height_m: float, optics: Optics, sway: ExposureMotion
+) -> list[Float32]:
     """For each moment of the exposure the rays (H, W, 2), x / z and y / z, of the pose of the stamp.
 
     A ray d of a camera displaced by s meets the ground where d - s d_z / h of the undisplaced one does.
@@ -195,7 +197,7 @@ def _looks(camera: Camera, attitude: Attitude, height_m: float, optics: Optics, 
 
     rays, half_s = lens_rays(camera), 0.5e-3 * optics.readout_ms
     share = np.linspace(0.0, 1.0, camera.height_px)[:, None, None]
-    count = optics.looks if optics.exposure_ms > 0.0 and sway != Sway() else 1
+    count = optics.looks if optics.exposure_ms > 0.0 and sway != ExposureMotion() else 1
     moments_s = ((np.arange(count) + 0.5) / count - 0.5) * optics.exposure_ms * 1e-3
     found = []
     for moment_s in moments_s.tolist():
@@ -221,7 +223,7 @@ def _looked_up(
     low = np.floor(np.min([p.min(axis=(0, 1)) for p in pixels], axis=0)) - 2.0
     high = np.ceil(np.max([p.max(axis=(0, 1)) for p in pixels], axis=0)) + 2.0
     size = (high - low + 1.0).astype(int)
-    if not (size <= LARGEST_VIEW * max(camera.width_px, camera.height_px)).all():
+    if not (size <= MAX_VIEW * max(camera.width_px, camera.height_px)).all():
         raise OptionError(f"camera: expected a lens that a flat picture can hold, got one of {size} px in all")
     matrix = np.array([[fx, 0.0, -low[0]], [0.0, fy, -low[1]], [0.0, 0.0, 1.0]])
     wide = Camera(int(size[0]), int(size[1]), matrix, mount=camera.mount)

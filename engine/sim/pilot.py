@@ -12,7 +12,7 @@ from engine.errors import OptionError
 from engine.sim.quadrotor import STEP_S
 from engine.sim.vehicle import STEP_S as COURSE_STEP_S
 from engine.sim.vehicle import FlightStyle, course
-from engine.types import check_positive
+from engine.values import check_positive
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from engine.errors import OptionError
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.sim.rotations import rotation, rotation_vector
 from engine.sim.vehicle import GRAVITY_MPS2
-from engine.types import Attitude, check_positive
+from engine.values import Attitude, check_positive
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ class Wind:
             raise OptionError(f"wind: expected finite numbers, got {self}")
 
 
-class Air:
+class WindField:
     """The wind as it blows, step after step."""
 
     def __init__(self, wind: Wind, rng: np.random.Generator) -> None:
@@ -136,7 +136,7 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
-class Felt:
+class IdealImu:
     """What a perfect IMU measures over one step: (3,) specific force and (3,) turn rates, both in the body."""
 
     force_mps2: Array
@@ -169,7 +169,7 @@ def aim(acceleration_mps2: Array, heading_deg: float, airframe: Airframe) -> tup
 
 def advance(
     state: State, acceleration_mps2: Array, heading_deg: float, airframe: Airframe, air_mps: Array
-) -> tuple[State, Felt]:
+) -> tuple[State, IdealImu]:
     """One step of :data:`STEP_S`.
 
     Args:
@@ -181,7 +181,7 @@ def advance(
 
     Returns:
         State: at its end.
-        Felt: what an IMU measured meanwhile.
+        IdealImu: what an IMU measured meanwhile.
     """
     wanted, force = aim(acceleration_mps2, heading_deg, airframe)
     up = -state.enu_from_body[:, 2]
@@ -199,7 +199,7 @@ def advance(
         state.enu_from_body @ rotation(STEP_S * state.rates_rps),
         state.rates_rps + STEP_S * _swing(state, wanted, airframe),
         thrust,
-    ), Felt(half.T @ pushed, state.rates_rps)
+    ), IdealImu(half.T @ pushed, state.rates_rps)
 
 
 def next_time_s(time_s: float) -> float:

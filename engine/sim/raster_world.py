@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 
 from engine.errors import MapError
-from engine.grids import Grid, warp_between
-from engine.metric_copy import open_metric_copy
-from engine.rasters import GrayReader, Source, map_errors, open_source, read_surface
+from engine.maps.grids import Grid, warp_between
+from engine.maps.metric_copy import open_metric_copy
+from engine.maps.rasters import GrayReader, Source, map_errors, open_source, read_surface
 from engine.sim.canvas import ASPHALT, CANOPY, GRASS, ROOF
 from engine.sim.conditions import CONDITIONS, Condition, condition_by_name, dress
 from engine.sim.light import LIGHTS, Float32, Image, Light, illuminate
 from engine.sim.render import World
 from engine.sim.town import Town, generator
-from engine.types import Window
+from engine.values import Window
 
 LIMIT_PX = 100 * 2**20
 """A world lies in memory, with some 20 bytes a pixel."""

@@ -21,7 +21,7 @@ from engine.camera import Camera
 from engine.errors import OptionError, ShapeError
 from engine.geo import LocalFrame, enu_from_body
 from engine.sim.light import Array, Float32, Image, Light
-from engine.types import Attitude
+from engine.values import Attitude
 
 LAYER_M = 1.0
 """Height step of the search for the first surface that a ray meets; narrower things may be missed."""
@@ -32,8 +32,8 @@ FLOOR_M = 3.0
 
 
 @dataclass(frozen=True)
-class Air:
-    """Air that is looked through: a contrast fades by exp(-3.912 d / visibility) (Koschmieder).
+class Atmosphere:
+    """Atmosphere that is looked through: a contrast fades by exp(-3.912 d / visibility) (Koschmieder).
 
     Attributes:
         visibility_m: distance at which 2 % of a contrast is left.
@@ -82,7 +82,7 @@ class World:
     pixel_to_crs: Array
     crs_epsg: int
     ground_m: Float32 | None = None
-    air: Air | None = None
+    air: Atmosphere | None = None
     glint: Glint | None = None
     gsd_m_per_px: float = field(init=False)
 
@@ -261,7 +261,7 @@ def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tup
     picture[where] = np.minimum(lit, 255.0).astype(np.uint8)
 
 
-def _seen_through(air: Air, picture: Image, slant_m: Float32) -> Image:
+def _seen_through(air: Atmosphere, picture: Image, slant_m: Float32) -> Image:
     """The picture (H, W, 3) after its light has come a way (H, W) through air."""
     left = np.exp(np.float32(-3.912 / air.visibility_m) * slant_m)[..., None]
     mixed: Float32 = picture * left + np.array(air.rgb, np.float32) * (np.float32(1.0) - left)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from engine.errors import OptionError
 from engine.geo import wrap_heading_deg
-from engine.sim.quadrotor import STEP_S, Felt, State
-from engine.types import check_positive
+from engine.sim.quadrotor import STEP_S, IdealImu, State
+from engine.values import check_positive
 
 Array = NDArray[np.float64]
 
@@ -172,7 +172,7 @@ class Instruments:
         self.compass_bias_deg = suite.compass.bias_deg * float(self._compass.standard_normal())
         self.baro_drift_m = 0.0
 
-    def imu(self, felt: Felt) -> Felt:
+    def imu(self, felt: IdealImu) -> IdealImu:
         """One step's specific force and turn rates as they are measured; the biases walk on."""
         imu, rng = self.suite.imu, self._imu
         white = rng.standard_normal(12)
@@ -185,7 +185,7 @@ class Instruments:
         self.gyro_bias_rps = (
             math.exp(-STEP_S / imu.gyro_time_s) * self.gyro_bias_rps + imu.gyro_walk * walked * white[9:]
         )
-        return Felt(force, rates)
+        return IdealImu(force, rates)
 
     def heading_deg(self, state: State) -> float:
         """The compass, in [0, 360)."""

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from engine import descriptors, keypoints, scalespace
 from engine.features import sift
 from engine.kernels import compiled, jit
+from engine.sift import descriptors, keypoints, scale_space
 
 CPU = torch.device("cpu")
 
@@ -36,13 +36,13 @@ def shape(request):
 
 @pytest.fixture(params=[1, 2], ids=["as it is", "doubled"])
 def plan(shape, request):
-    return scalespace.make_plan(*shape, 1, request.param, CPU)
+    return scale_space.make_plan(*shape, 1, request.param, CPU)
 
 
 def both(plan, contrast_threshold=0.02):
     """The picture's levels and points by either way."""
     image = picture(*plan.octaves[0].source)
-    gaussians = scalespace.gaussian_levels(image, plan)
+    gaussians = scale_space.gaussian_levels(image, plan)
     buffer, points = keypoints.detect(image, plan, contrast_threshold)
     return (gaussians, keypoints.search(gaussians, plan, contrast_threshold)), (buffer.clone(), points)
 

@@ -22,8 +22,8 @@ from PIL import Image
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.formats.datasets.singles import Array, Place, Single, picture_of, read_arrays
-from engine.types import Attitude
+from engine.formats.datasets.singles import Array, LocalMap, Single, picture_of, read_arrays
+from engine.values import Attitude
 
 MODES = ("aerial", "satellite")
 
@@ -33,7 +33,7 @@ def find_anyvisloc(scene: Path) -> list[Path]:
     return sorted(scene.glob("L??_????.npz"))
 
 
-def read_place(scene: Path, mode: str) -> Place:
+def read_place(scene: Path, mode: str) -> LocalMap:
     """Read one of a scene's two maps.
 
     Args:
@@ -58,7 +58,7 @@ def read_place(scene: Path, mode: str) -> Place:
     except (OSError, ValueError, EOFError) as error:
         raise TelemetryError(f"{heights}: cannot be read: {str(error).splitlines()[0]}") from None
     surface_m = np.asarray(surface_m if surface_m.ndim == 2 else surface_m[..., 0], dtype=np.float32)
-    return Place(
+    return LocalMap(
         picture=picture,
         pixel_to_m=_south_up(map_at, map_px),
         surface_m=surface_m,

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.formats.datasets.singles import Array, Place, Single, picture_of, read_arrays
+from engine.formats.datasets.singles import Array, LocalMap, Single, picture_of, read_arrays
 from engine.geo import attitude_from_rotation
-from engine.types import Attitude
+from engine.values import Attitude
 
 _NAMES = ("image_query", "image_dop", "dsm", "intrinsics", "extrinsics")
 _OFF_GRID = 0.05  # pixels by which the places of a regular grid may be off it
@@ -31,7 +31,7 @@ def find_ortholoc(root: Path) -> list[Path]:
     return sorted(root.glob("L*.npz"))
 
 
-def read_ortholoc(path: Path) -> tuple[Single, Place]:
+def read_ortholoc(path: Path) -> tuple[Single, LocalMap]:
     """Read one sample.
 
     Raises:
@@ -59,7 +59,7 @@ def read_ortholoc(path: Path) -> tuple[Single, Place]:
         attitude=Attitude(*attitude),
     )
     heights_m = world[:, :, 2].astype(np.float32)
-    return single, Place(picture=ortho, pixel_to_m=pixel_to_m, surface_m=heights_m, surface_to_m=pixel_to_m)
+    return single, LocalMap(picture=ortho, pixel_to_m=pixel_to_m, surface_m=heights_m, surface_to_m=pixel_to_m)
 
 
 def _grid(world: Array, path: Path) -> tuple[Array, NDArray[np.float64]]:

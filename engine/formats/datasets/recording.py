@@ -81,7 +81,7 @@ class Recording:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
+class ImportOptions:
     """What the user adds to a data set that its authors do not say.
 
     Attributes:
@@ -116,7 +116,7 @@ class Told:
                 raise OptionError(f"{name}: expected {least:g} to {most:g} {unit}, got {value:g}")
 
 
-def check_complete(recording: Recording, told: Told) -> None:
+def check_complete(recording: Recording, told: ImportOptions) -> None:
     """Refuse what cannot become a flight, before a folder is made for it.
 
     Raises:
@@ -160,7 +160,7 @@ def _imported(out: Path) -> set[str]:
         return set()
 
 
-def write_recording(out: Path, recording: Recording, told: Told) -> tuple[str, ...]:
+def write_recording(out: Path, recording: Recording, told: ImportOptions) -> tuple[str, ...]:
     """Write a flight folder: links to pictures and rasters, telemetry, truth and calibration.
 
     The telemetry knows what the data set says of attitude and height, and of the places the first one only.
@@ -202,7 +202,7 @@ def write_recording(out: Path, recording: Recording, told: Told) -> tuple[str, .
     return notes
 
 
-def _in_time(recording: Recording, told: Told) -> tuple[list[tuple[Shot, int]], tuple[str, ...]]:
+def _in_time(recording: Recording, told: ImportOptions) -> tuple[list[tuple[Shot, int]], tuple[str, ...]]:
     """The shots whose pictures are there with their stamps, each later than the one before."""
     here = [shot for shot in recording.shots if shot.picture.is_file()]
     notes = list(recording.notes)
@@ -231,7 +231,9 @@ def _below_ground(shots: Sequence[tuple[Shot, int]], datum: str | None, ground_m
     return sum(height_m <= ground_m for height_m in heights_m)
 
 
-def _telemetry_row(shot: Shot, stamp_ns: int, datum: str | None, told: Told, *, first: bool) -> TelemetryRow:
+def _telemetry_row(
+    shot: Shot, stamp_ns: int, datum: str | None, told: ImportOptions, *, first: bool
+) -> TelemetryRow:
     height_m = shot.height_m
     above_m = height_m if datum == "agl" else None
     if height_m is not None and datum in ("amsl", "ellipsoid") and told.ground_m is not None:

@@ -21,7 +21,7 @@ from engine.formats.flight import camera_info
 from engine.formats.geotiff import write_geotiff
 from engine.formats.telemetry import TelemetryRow, write_telemetry
 from engine.formats.truth import write_truth
-from engine.types import Attitude, Truth
+from engine.values import Attitude, Truth
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ EPSG, ANCHOR_M = 32631, (500_000.0, 5_500_000.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class LocalMap:
     """A map with its surface model, in metres east, north and up about a local origin.
 
     Attributes:
@@ -79,7 +79,7 @@ class Single:
         return math.degrees(math.acos(max(-1.0, min(1.0, math.cos(roll) * math.cos(pitch)))))
 
 
-def write_place(folder: Path, place: Place) -> None:
+def write_place(folder: Path, place: LocalMap) -> None:
     """Write map.tif and dsm.tif.
 
     Raises:
@@ -106,7 +106,7 @@ def _piece(path: Path, matrix: Array) -> Piece:
     return Piece(path, float(left), float(top), float(right), float(bottom))
 
 
-def write_single(folder: Path, single: Single, place: Place, maps: Path, dataset: str) -> None:
+def write_single(folder: Path, single: Single, place: LocalMap, maps: Path, dataset: str) -> None:
     """Write a flight folder of one frame, whose height and attitude are the true ones.
 
     Args:

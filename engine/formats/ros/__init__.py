@@ -1,0 +1,1 @@
+"""ROS bags and messages: readers and writers, without ROS."""

@@ -1,0 +1,189 @@
+"""Writes a flight as a bag of ROS 1 or ROS 2 (sqlite3, mcap), under the names of a camera driver and of MAVROS."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engine.camera import Camera
+from engine.errors import OptionError, TelemetryError
+from engine.formats.ros.bags import (
+    CAMERA_INFO,
+    COMPASS,
+    HEIGHT,
+    IMAGE,
+    IMU,
+    POSITION,
+    TRUTH,
+    TRUTH_ALTITUDE,
+    TRUTH_ATTITUDE,
+    TRUTH_HEIGHT,
+    VELOCITY,
+    import_rosbags,
+)
+from engine.formats.ros.messages import MessageFactory
+from engine.values import Frame, Prior, Truth
+
+KINDS = ("ros1", "ros2-sqlite3", "ros2-mcap")
+"""What is written."""
+
+_PARTS = ("metadata.yaml", "*.mcap", "*.db3")  # the files of a bag of ROS 2
+
+Write = Callable[[str, int, Any], None]
+"""Writes a message on a topic at a moment."""
+
+
+def write_bag(
+    path: str | Path,
+    frames: Iterable[tuple[Frame, Prior | None]],
+    camera: Camera,
+    *,
+    kind: str,
+    truth: Iterable[Truth] = (),
+    replace: bool = False,
+) -> int:
+    """Write a flight as a bag, under the names that a camera driver and MAVROS give their topics.
+
+    It is written beside its place and put there once it is whole: until then an older one stays.
+
+    Args:
+        path: a file for ros1, a folder for the others.
+        frames: stamped frames with what else is known of their places, consumed one at a time before ``truth``.
+        camera: written beside every frame; its mount has no place in a bag.
+        kind: one of :data:`KINDS`.
+        truth: where the vehicle really was, under ``/truth``.
+        replace: whether a bag that is there leaves for the new one.
+
+    Returns:
+        int: how many frames were written.
+
+    Raises:
+        OptionError: the kind is unknown or does not go with the name, or what is there may not be replaced.
+        TelemetryError: rosbags is not installed, a frame has no stamp, or the bag cannot be written.
+    """
+    path = Path(path)
+    if kind not in KINDS:
+        raise OptionError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+    if (path.suffix.lower() == ".bag") != (kind == "ros1"):
+        raise OptionError(f"path: expected a name that ends in .bag for ros1 and for no other kind, got {path}")
+    check_place(path, replace)
+    count = 0
+    with _put(path, replace) as unfinished, _written(path, unfinished, kind) as (write, maker):
+        for frame, prior in frames:
+            if frame.timestamp_ns is None:
+                raise TelemetryError(f"{path}: frame {count}: expected a stamp, got None")
+            _write_frame(write, maker, frame, prior, camera, frame.timestamp_ns)
+            count += 1
+        for row in truth:
+            _write_truth(write, maker, row)
+    return count
+
+
+def check_place(path: Path, replace: bool) -> None:
+    """Refuse to write a bag where something is that may not leave for it.
+
+    Raises:
+        OptionError: a bag that is not to be replaced, or a folder that holds anything but a bag.
+    """
+    if not (path.exists() or path.is_symlink()):
+        return
+    if not replace:
+        raise OptionError(f"--out: {path} exists; choose another name, or add --force to replace it")
+    if path.is_dir():
+        parts = {file for pattern in _PARTS for file in path.glob(pattern)}
+        others = sorted(set(path.iterdir()) - parts)
+        if others or path.is_symlink():
+            held = f"it holds {others[0].name} too" if others else "it is a link"
+            raise OptionError(f"--out: expected a bag in {path} to replace, but {held}")
+
+
+@contextmanager
+def _put(path: Path, replace: bool) -> Iterator[Path]:
+    """Where a new bag is written; when all is well it takes its place, and the older one leaves."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A folder of its own beside the place: a bag's files have its name within them.
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+            unfinished = Path(folder) / path.name
+            yield unfinished
+            check_place(path, replace)  # again: writing took its time
+            older = Path(folder) / "older"
+            if path.exists():
+                path.rename(older)
+            try:
+                unfinished.rename(path)
+            except OSError:
+                if older.exists():
+                    older.rename(path)
+                raise
+    except OSError as error:
+        raise TelemetryError(f"{path}: cannot be written: {error}") from None
+
+
+def _write_frame(
+    write: Write, maker: MessageFactory, frame: Frame, prior: Prior | None, camera: Camera, time_ns: int
+) -> None:
+    image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
+    write(IMAGE, time_ns, maker.image(time_ns, "camera", image))
+    write(CAMERA_INFO, time_ns, maker.camera_info(time_ns, "camera", camera))
+    angles = frame.roll_deg, frame.pitch_deg, frame.heading_deg
+    if None not in angles:
+        write(IMU, time_ns, maker.imu(time_ns, "base_link", *angles))  # type: ignore[arg-type]
+    if frame.heading_deg is not None:
+        write(COMPASS, time_ns, maker.float64(frame.heading_deg))
+    if frame.height_agl_m is not None:
+        write(HEIGHT, time_ns, maker.float64(frame.height_agl_m))
+    if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
+        velocity = maker.velocity(time_ns, "map", frame.east_velocity_mps, frame.north_velocity_mps)
+        write(VELOCITY, time_ns, velocity)
+    if prior is not None and prior.lat_deg is not None and prior.lon_deg is not None:
+        covariance_m2 = np.diag([prior.sigma_m**2, prior.sigma_m**2, 0.0])
+        place = maker.position(time_ns, "base_link", prior.lat_deg, prior.lon_deg, covariance_m2)
+        write(POSITION, time_ns, place)
+
+
+def _write_truth(write: Write, maker: MessageFactory, row: Truth) -> None:
+    time_ns = row.timestamp_ns
+    write(TRUTH, time_ns, maker.position(time_ns, "base_link", row.lat_deg, row.lon_deg, np.zeros((3, 3))))
+    angles = row.roll_deg, row.pitch_deg, row.heading_deg
+    if None not in angles:
+        write(TRUTH_ATTITUDE, time_ns, maker.imu(time_ns, "base_link", *angles))  # type: ignore[arg-type]
+    if row.height_agl_m is not None:
+        write(TRUTH_HEIGHT, time_ns, maker.float64(row.height_agl_m))
+    if row.alt_amsl_m is not None:
+        write(TRUTH_ALTITUDE, time_ns, maker.float64(row.alt_amsl_m))
+
+
+@contextmanager
+def _written(path: Path, unfinished: Path, kind: str) -> Iterator[tuple[Write, MessageFactory]]:
+    """What writes messages into a new bag, and makes them; ``path`` is what errors call it."""
+    _, typesys = import_rosbags(path)
+    from rosbags import rosbag1, rosbag2
+
+    ros1 = kind == "ros1"
+    types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if ros1 else typesys.Stores.ROS2_HUMBLE)
+    serialize = types.serialize_ros1 if ros1 else types.serialize_cdr
+    plugin = rosbag2.StoragePlugin.SQLITE3 if kind == "ros2-sqlite3" else rosbag2.StoragePlugin.MCAP
+    connections: dict[str, Any] = {}
+    try:
+        writer: Any
+        if ros1:
+            writer = rosbag1.Writer(unfinished)
+        else:
+            writer = rosbag2.Writer(unfinished, version=9, storage_plugin=plugin)
+        with writer:
+
+            def write(topic: str, time_ns: int, message: Any) -> None:
+                name = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, name, typestore=types)
+                writer.write(connections[topic], time_ns, bytes(serialize(message, name)))
+
+            yield write, MessageFactory(types.types.__getitem__, ros1)
+    except (OSError, rosbag1.WriterError, rosbag2.WriterError) as error:
+        raise TelemetryError(f"{path}: cannot be written: {error}") from None

@@ -1,0 +1,278 @@
+"""ROS messages: pictures, calibrations, attitude, heights and positions out of them and into them, of either ROS.
+
+Convention:
+    Frames are those of REP-103: the world is east-north-up, the body forward-left-up, quaternions are x, y, z, w
+    and turn the body to the world. Compass headings are degrees clockwise from true north, as MAVROS has them.
+    Messages are those of rospy, of rclpy or of rosbags: only their fields are looked at.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import DISTORTION_MODELS, Camera
+from engine.errors import CalibrationError, TelemetryError
+from engine.geo import Array, attitude_from_rotation, enu_from_body
+
+CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
+"""Encodings of sensor_msgs/Image that are read, and their bytes a pixel; 8UC3 and 8UC4 are blue first."""
+_FLU = np.diag([1.0, -1.0, -1.0])  # forward-left-up of forward-right-down, and back
+_UNIT = 0.01  # by which the square of a quaternion may miss 1
+_POSITION_KNOWN = 3
+NO_POSITION = -1
+"""NavSatStatus.status of a receiver without a fix."""
+
+
+# ------------------------------------------------------------------------------------------------ out of them
+
+
+def stamp_ns(message: Any) -> int:
+    """The header's stamp in nanoseconds; 0 where nobody set it."""
+    stamp = message.header.stamp
+    seconds = stamp.secs if hasattr(stamp, "secs") else stamp.sec
+    nanoseconds = stamp.nsecs if hasattr(stamp, "nsecs") else stamp.nanosec
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def picture_of(message: Any) -> NDArray[np.uint8]:
+    """The picture of a sensor_msgs/Image or CompressedImage, a copy.
+
+    Returns:
+        (H, W) grey or (H, W, 3) RGB.
+
+    Raises:
+        TelemetryError: the encoding is not in :data:`CHANNELS`, or the bytes are too few or no picture.
+    """
+    if not hasattr(message, "encoding"):
+        return _decoded(bytes(memoryview(message.data)))
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    channels = CHANNELS.get(message.encoding)
+    if channels is None:
+        raise TelemetryError(f"image: expected an encoding of {', '.join(CHANNELS)}, got {message.encoding!r}")
+    data = np.frombuffer(message.data, np.uint8)
+    row = width * channels
+    if height < 1 or width < 1 or step < row or data.size < (height - 1) * step + row:
+        raise TelemetryError(
+            f"image: expected {height} rows of {step} bytes for {width} x {height} {message.encoding}, "
+            f"got {data.size} bytes"
+        )
+    # The last row may lack its padding.
+    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
+    if channels == 1:
+        return rows.copy()
+    pixels = rows.reshape(height, width, channels)
+    order = (0, 1, 2) if message.encoding.startswith("rgb") else (2, 1, 0)
+    return np.ascontiguousarray(pixels[:, :, order])
+
+
+def _decoded(data: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            return np.array(picture if picture.mode == "L" else picture.convert("RGB"), np.uint8)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise TelemetryError(f"image: expected a readable compressed picture: {reason}") from None
+
+
+def camera_of(message: Any) -> Camera:
+    """The calibration of a sensor_msgs/CameraInfo, of a camera that looks straight down, its top to the nose.
+
+    Raises:
+        CalibrationError: the camera is not calibrated, bins its pixels, or its model is unknown.
+    """
+    if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
+        raise CalibrationError("camera_info: expected pictures without binning or region of interest")
+    matrix = np.asarray(message.K if hasattr(message, "K") else message.k, np.float64)
+    distortion = np.asarray(message.D if hasattr(message, "D") else message.d, np.float64)
+    model = message.distortion_model or "plumb_bob"
+    if matrix.size != 9:
+        raise CalibrationError(f"camera_info: expected 9 numbers in K, got {matrix.size}")
+    if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
+        distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
+    try:
+        return Camera(int(message.width), int(message.height), matrix.reshape(3, 3), model, distortion)
+    except CalibrationError as error:
+        raise CalibrationError(f"camera_info: {error}") from None
+
+
+def attitude_of(message: Any) -> tuple[float, float, float] | None:
+    """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None where it has no orientation."""
+    q = message.orientation
+    x, y, z, w = (float(v) for v in (q.x, q.y, q.z, q.w))
+    square = x * x + y * y + z * z + w * w
+    if message.orientation_covariance[0] == -1.0 or not abs(square - 1.0) < _UNIT:
+        return None
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return attitude_from_rotation(turn @ _FLU)
+
+
+def range_of(message: Any) -> float | None:
+    """Metres along the beam of a sensor_msgs/Range; None beyond the reach that it states."""
+    range_m = float(message.range)
+    return range_m if range_m > 0.0 and message.min_range <= range_m <= message.max_range else None
+
+
+def position_of(message: Any) -> tuple[float, float, float | None] | None:
+    """Latitude, longitude and standard deviation (None where unknown) of a sensor_msgs/NavSatFix, or None."""
+    lat_deg, lon_deg = float(message.latitude), float(message.longitude)
+    if message.status.status == NO_POSITION or not (math.isfinite(lat_deg) and math.isfinite(lon_deg)):
+        return None
+    covariance = np.asarray(message.position_covariance, np.float64).reshape(3, 3)[:2, :2]
+    if message.position_covariance_type == 0 or not np.isfinite(covariance).all():
+        return lat_deg, lon_deg, None
+    return lat_deg, lon_deg, math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+
+
+# ------------------------------------------------------------------------------------------------ into them
+
+
+@dataclass(frozen=True, slots=True)
+class MessageFactory:
+    """Makes messages of one ROS.
+
+    Attributes:
+        find: the class of a name such as "sensor_msgs/msg/Image".
+        ros1: whether headers count and calibrations are written in capitals.
+        time: a stamp of seconds and nanoseconds; None for the class builtin_interfaces/msg/Time.
+        octets: how the bytes of a picture are stored.
+        octet: how a single byte is stored.
+    """
+
+    find: Callable[[str], Any]
+    ros1: bool
+    time: Callable[[int, int], Any] | None = None
+    octets: Callable[[NDArray[np.uint8]], Any] = lambda values: values
+    octet: Callable[[int], Any] = int
+
+    def make(self, kind: str, /, **fields: Any) -> Any:
+        """A message with all of its fields."""
+        return self.find(kind)(**fields)
+
+    def header(self, time_ns: int, frame_id: str) -> Any:
+        """A header of a moment and a frame."""
+        time = self.time or (
+            lambda sec, nanosec: self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        )
+        stamp = time(*divmod(time_ns, 1_000_000_000))
+        count = {"seq": 0} if self.ros1 else {}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **count)
+
+    def float64(self, value: float) -> Any:
+        """A std_msgs/Float64."""
+        return self.make("std_msgs/msg/Float64", data=float(value))
+
+    def vector(self, x: float, y: float, z: float) -> Any:
+        """A geometry_msgs/Vector3."""
+        return self.make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
+
+    def quaternion(self, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
+        """A geometry_msgs/Quaternion."""
+        x, y, z, w = quaternion_xyzw(roll_deg, pitch_deg, heading_deg)
+        return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def image(self, time_ns: int, frame_id: str, picture: NDArray[np.uint8]) -> Any:
+        """A sensor_msgs/Image of (H, W) grey or (H, W, 3) RGB."""
+        height, width = picture.shape[:2]
+        return self.make(
+            "sensor_msgs/msg/Image",
+            header=self.header(time_ns, frame_id),
+            height=height,
+            width=width,
+            encoding="mono8" if picture.ndim == 2 else "rgb8",
+            is_bigendian=0,
+            step=picture[0].size,
+            data=self.octets(np.ascontiguousarray(picture).ravel()),
+        )
+
+    def camera_info(self, time_ns: int, frame_id: str, camera: Camera) -> Any:
+        """A sensor_msgs/CameraInfo; of the mount it says nothing."""
+        K = camera.matrix
+        blocks = {
+            "D": camera.distortion,
+            "K": K.ravel(),
+            "R": np.eye(3).ravel(),
+            "P": np.c_[K, np.zeros(3)].ravel(),
+        }
+        roi = self.make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self.make(
+            "sensor_msgs/msg/CameraInfo",
+            header=self.header(time_ns, frame_id),
+            height=camera.height_px,
+            width=camera.width_px,
+            distortion_model=camera.distortion_model,
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+            **(blocks if self.ros1 else {name.lower(): values for name, values in blocks.items()}),
+        )
+
+    def imu(self, time_ns: int, frame_id: str, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
+        """A sensor_msgs/Imu that knows the orientation only."""
+        unknown = np.array([-1.0, *(0.0,) * 8])
+        return self.make(
+            "sensor_msgs/msg/Imu",
+            header=self.header(time_ns, frame_id),
+            orientation=self.quaternion(roll_deg, pitch_deg, heading_deg),
+            orientation_covariance=np.zeros(9),
+            angular_velocity=self.vector(0.0, 0.0, 0.0),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=self.vector(0.0, 0.0, 0.0),
+            linear_acceleration_covariance=unknown,
+        )
+
+    def velocity(self, time_ns: int, frame_id: str, east_mps: float, north_mps: float) -> Any:
+        """A geometry_msgs/TwistStamped of a velocity over ground; what it does not know is NaN."""
+        nan = math.nan
+        linear, angular = self.vector(east_mps, north_mps, nan), self.vector(nan, nan, nan)
+        twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+        return self.make("geometry_msgs/msg/TwistStamped", header=self.header(time_ns, frame_id), twist=twist)
+
+    def position(self, time_ns: int, frame_id: str, lat_deg: float, lon_deg: float, covariance_m2: Array) -> Any:
+        """A sensor_msgs/NavSatFix with its covariance (3, 3) in east, north, up; the altitude is NaN, unknown."""
+        status = self.make("sensor_msgs/msg/NavSatStatus", status=0, service=0)
+        return self.make(
+            "sensor_msgs/msg/NavSatFix",
+            header=self.header(time_ns, frame_id),
+            status=status,
+            latitude=float(lat_deg),
+            longitude=float(lon_deg),
+            altitude=math.nan,
+            position_covariance=np.asarray(covariance_m2, np.float64).ravel(),
+            position_covariance_type=_POSITION_KNOWN,
+        )
+
+
+def quaternion_xyzw(roll_deg: float, pitch_deg: float, heading_deg: float) -> tuple[float, float, float, float]:
+    """The turn from the body (forward-left-up) to east-north-up, w not negative."""
+    m = enu_from_body(roll_deg, pitch_deg, heading_deg) @ _FLU
+    # The largest of the four squares is at least a quarter: dividing by its root loses nothing.
+    squares = np.array([1 + 2 * m[i, i] - np.trace(m) for i in range(3)] + [1 + np.trace(m)]) / 4.0
+    k = int(np.argmax(squares))
+    sums = np.array(
+        [
+            [4 * squares[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
+            [m[0, 1] + m[1, 0], 4 * squares[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 4 * squares[2], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 4 * squares[3]],
+        ]
+    )
+    q = sums[k] / (4.0 * math.sqrt(squares[k]))
+    x, y, z, w = (float(v) for v in (q if q[3] >= 0.0 else -q))
+    return x, y, z, w

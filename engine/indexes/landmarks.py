@@ -1,0 +1,230 @@
+"""The map's features, found once: places in 3D with their descriptors, looked up by window.
+
+A level of the map is described tile by tile as the flight touches it, or all at once before the flight
+(:meth:`LandmarkMap.prepare`), and then kept in a file for the next one. A tile is described with the neighbourhood
+that the map has beyond it, so that tiles join as if the level had been described in one piece.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from engine.features import Features, sift
+from engine.indexes.landmark_cache import Arrays, Kinds, cache_key, load_arrays, save_arrays
+from engine.orthomap import OrthoMap
+from engine.values import Window
+
+Array = NDArray[np.float64]
+
+DETECTOR_VERSION = 2
+"""Part of the key of stored landmarks; to be raised with every change of what is detected and how described."""
+TILE_PX = 256
+"""Tiles begin on multiples of this in every level."""
+HALO_PX = 64
+"""How far beyond its edges a tile is seen; the descriptor of nearly every keypoint ends there."""
+CELL_PX = 64
+"""Landmarks are ranked by strength within square cells of the level."""
+MAX_PER_CELL = 96
+PREPARED_PX = 16 << 20
+"""Levels are prepared at once, and searched as a whole, up to this many pixels."""
+MAX_LANDMARKS = 1 << 19
+"""Landmarks kept in memory, besides those of the window that was asked for last; one takes 300 bytes.
+
+Where more were prepared before the flight as many as that are kept, up to 236 MB of them.
+"""
+_SLOTS = 8192  # more than the detector finds in a tile
+_STORED: Kinds = {
+    "xy_px": (np.float32, (2,)),  # in pixels of the level
+    "scale_px": (np.float32, ()),
+    "angle_deg": (np.float32, ()),
+    "rank": (np.uint8, ()),  # by strength within its cell
+    "descriptors": (np.float16, (128,)),  # half the memory, and the same matches
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """Features of a part of the map.
+
+    Attributes:
+        features: (1, N) in pixels of the level, on the device.
+        points_m: (N, 3) east, north and the height of the surface there.
+    """
+
+    features: Features
+    points_m: Array
+
+
+_Key = tuple[int, bool, int, int]  # level, upright, row and column of the tile
+
+
+class LandmarkMap:
+    """The landmarks of one map.
+
+    Args:
+        site: the map.
+        device: where features are found and handed out; kept they are in the processor's memory.
+    """
+
+    def __init__(self, site: OrthoMap, device: torch.device) -> None:
+        self._site, self._device = site, device
+        self._tiles: dict[_Key, Arrays] = {}  # the one used last comes last
+        self._most = MAX_LANDMARKS
+        self.created = 0
+        """Tiles described so far."""
+
+    def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
+        """The landmarks of a window.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: of the map's pyramid.
+            upright: every angle is 0, along the map's x axis, instead of the dominant gradient's.
+            per_px: landmarks per pixel at most, in each cell the strongest.
+        """
+        keys = _keys(window, level, upright)
+        tiles = [self._tile(key) for key in keys]
+        self._evict(keep=len(keys))
+        low = np.array([window.x0, window.y0]) - 0.5
+        high = low + np.array([window.width_px, window.height_px])
+        most = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
+        parts = []
+        for tile in tiles:
+            xy = tile["xy_px"]
+            inside = ((xy >= low) & (xy < high)).all(axis=1) & (tile["rank"] < most)
+            parts.append({name: values[inside] for name, values in tile.items()})
+        return self._handed_out(_joined(parts))
+
+    def prepare(self, levels: Iterable[int] | None = None) -> None:
+        """Describe whole levels, upright and not, and keep them in a file where the map comes from one.
+
+        Args:
+            levels: which, in this order, as far as :data:`PREPARED_PX` goes; None takes all, the coarsest first.
+        """
+        pixels = 0
+        for level in reversed(range(self._site.levels)) if levels is None else levels:
+            pixels += math.prod(self._site.level_shape(level))
+            if pixels > PREPARED_PX:
+                break
+            for upright in (True, False):
+                self._prepare(level, upright)
+        # Memory for what is there, and no more: a large map, of which little is prepared, keeps to its bound.
+        self._most = max(self._most, sum(len(tile["rank"]) for tile in self._tiles.values()))
+
+    def _prepare(self, level: int, upright: bool) -> None:
+        rows, columns = self._site.level_shape(level)
+        whole = Window(0, 0, columns, rows)
+        keys = _keys(whole, level, upright)
+        if all(key in self._tiles for key in keys):
+            return
+        if not self._site.from_file:
+            for key in keys:
+                self._tile(key)
+            return
+        settings = (DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
+        name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
+        stored = load_arrays(name, _STORED)
+        if stored is None:
+            found = _joined([self._tile(key) for key in keys])
+            save_arrays(name, {field: found[field] for field in _STORED})
+            return
+        at = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX
+        for key in keys:
+            own = (at == (key[3], key[2])).all(axis=1)
+            self._tiles[key] = self._lifted({field: values[own] for field, values in stored.items()}, level)
+
+    def _tile(self, key: _Key) -> Arrays:
+        """A tile, now the one that was used last."""
+        tile = self._tiles.pop(key, None)
+        if tile is None:
+            level, upright, row, column = key
+            self.created += 1
+            tile = self._lifted(self._detected(level, upright, row, column), level)
+        self._tiles[key] = tile
+        return tile
+
+    def _evict(self, keep: int) -> None:
+        """Give up the tiles that were used least recently, but not the last ones."""
+        tiles = list(self._tiles.items())
+        used = sum(len(tile["rank"]) for _, tile in tiles)
+        for key, tile in tiles[: len(tiles) - keep]:
+            if used <= self._most:
+                break
+            used -= len(tile["rank"])
+            self._tiles.pop(key, None)
+
+    def _detected(self, level: int, upright: bool, row: int, column: int) -> Arrays:
+        """Every keypoint that lies on a tile, as it would be found in the whole level."""
+        rows, columns = self._site.level_shape(level)
+        x0, y0 = column * TILE_PX, row * TILE_PX
+        x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
+        left, top = max(0, x0 - HALO_PX), max(0, y0 - HALO_PX)
+        wide = Window(left, top, min(columns, x1 + HALO_PX) - left, min(rows, y1 + HALO_PX) - top)
+        inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
+        mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
+        mask[inner] = True if self._site.fully_valid else self._site.valid(wide, level)[inner]
+        if not mask.any():
+            return {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
+        found = sift(
+            as_picture(self._site.gray(wide, level), self._device),
+            max_keypoints=_SLOTS,
+            upright=upright,
+            mask=torch.from_numpy(mask)[None, None].to(self._device),
+            spread=1,  # by strength alone; landmarks are spread by the cells of the level
+        )
+        count = int(found.valid.sum())
+        xy = found.xy_px[0, :count].cpu().numpy() + np.array([left, top], np.float32)
+        rank = _rank_in_cells(xy)
+        kept = np.flatnonzero(rank < MAX_PER_CELL)
+        values = (found.scale_px, found.angle_deg, found.descriptors)
+        scale, angle, descriptors = (v[0, :count].cpu().numpy()[kept] for v in values)
+        arrays = (xy[kept], scale, angle, rank[kept], descriptors)
+        return {name: a.astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
+
+    def _lifted(self, tile: Arrays, level: int) -> Arrays:
+        map_px = self._site.full_from_level(tile["xy_px"], level)
+        return tile | {
+            "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
+        }
+
+    def _handed_out(self, found: Arrays) -> Landmarks:
+        def tensor(name: str) -> torch.Tensor:
+            return torch.from_numpy(found[name]).to(self._device)[None]
+
+        valid = torch.ones(1, len(found["rank"]), dtype=torch.bool, device=self._device)
+        descriptors = tensor("descriptors").float()
+        features = Features(tensor("xy_px"), tensor("scale_px"), tensor("angle_deg"), descriptors, valid)
+        return Landmarks(features, found["points_m"])
+
+
+def as_picture(gray: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+    """Grey levels (H, W) as (1, 1, H, W) in [0, 1] on a device."""
+    return torch.from_numpy(np.ascontiguousarray(gray)).to(device)[None, None].float() / 255.0
+
+
+def _keys(window: Window, level: int, upright: bool) -> list[_Key]:
+    """The tiles that a window of a level touches."""
+    bottom, right = window.y0 + window.height_px - 1, window.x0 + window.width_px - 1
+    rows = range(window.y0 // TILE_PX, bottom // TILE_PX + 1)
+    columns = range(window.x0 // TILE_PX, right // TILE_PX + 1)
+    return [(level, upright, row, column) for row in rows for column in columns]
+
+
+def _joined(parts: list[Arrays]) -> Arrays:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _rank_in_cells(xy_px: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(N,) how many before it lie in the same cell."""
+    column, row = (np.rint(xy_px).astype(np.int64) // CELL_PX).T
+    _, cell, counts = np.unique(np.stack([row, column]), axis=1, return_inverse=True, return_counts=True)
+    order = np.argsort(cell.ravel(), kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return rank

@@ -1,0 +1,160 @@
+"""The map as the NCC method searches it, prepared once: enhanced, with running sums and half-resolution levels.
+
+A small level of the map is prepared as a whole; of a large one, regions on a fixed grid as the flight touches
+them, of which the least recently used are given up.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from engine.align import enhance
+from engine.ncc_fft import Search, prepare
+from engine.orthomap import OrthoMap
+from engine.values import Window
+
+CELL_PX = 256
+"""Regions begin and end on multiples of this, and at least half of it beyond what is asked for: the windows that a
+flight asks for next lie within the same one."""
+WHOLE_LEVEL_PX = 1 << 23
+"""Levels of at most this many pixels are prepared as a whole."""
+MAX_REGION_PX = 6 << 20
+"""Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 27 bytes."""
+_HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A prepared part of one pyramid level.
+
+    Attributes:
+        window: where it lies, in pixels of the level.
+        search: what is matched against.
+        valid: (H, W) False on nodata; None where all of it is map.
+    """
+
+    window: Window
+    search: Search
+    valid: torch.Tensor | None
+
+
+class PreparedMap:
+    """Prepared regions of one map, on one device.
+
+    Args:
+        site: the map.
+        device: where the regions live.
+        radius_px: of the local normalisation, see :func:`engine.align.enhance`.
+        score: what frames are enhanced by, see there.
+    """
+
+    def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:
+        self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
+        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the one used last comes last
+        # Of the regions, not of their preparation: a thread that hangs in there must not stop the next one.
+        self._lock = threading.Lock()
+        self.created = 0
+        """Regions prepared so far."""
+
+    def cut(self, window: Window, level: int) -> Region:
+        """The prepared part of a level that holds a window, cut to it.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: of the map's pyramid.
+
+        Returns:
+            Region: begins up to 7 pixels before the window and ends with it.
+        """
+        x0, y0 = window.x0 & -_HALVING_PX, window.y0 & -_HALVING_PX
+        grown = Window(x0, y0, window.x0 + window.width_px - x0, window.y0 + window.height_px - y0)
+        region = self._region(grown, level)
+        i, j = grown.x0 - region.window.x0, grown.y0 - region.window.y0
+        search = region.search.crop(i, j, grown.width_px, grown.height_px)
+        valid = None
+        if region.valid is not None:
+            valid = region.valid[j : j + grown.height_px, i : i + grown.width_px]
+            if bool(valid.all()):
+                valid = None
+        return Region(grown, search, valid)
+
+    def _region(self, window: Window, level: int) -> Region:
+        with self._lock:
+            region = self._held(window, level)
+        if region is not None:
+            return region
+        rows, columns = self._site.level_shape(level)
+        if rows * columns <= WHOLE_LEVEL_PX:
+            wanted = Window(0, 0, columns, rows)
+        else:
+            wanted = _on_grid(window, columns, rows)
+        region = self._prepare(wanted, level)
+        with self._lock:
+            self.created += 1
+            self._regions[level, wanted] = region
+            self._evict()
+        return region
+
+    def _held(self, window: Window, level: int) -> Region | None:
+        """A region that holds a window, the one used last first; from now on it is that one itself."""
+        for key in reversed(self._regions):
+            if key[0] == level and _holds(key[1], window):
+                self._regions.move_to_end(key)
+                return self._regions[key]
+        return None
+
+    def _evict(self) -> None:
+        """Give up the regions that were used least recently; the newest and whole levels stay."""
+        parts = [
+            key for key in self._regions if (key[1].height_px, key[1].width_px) != self._site.level_shape(key[0])
+        ]
+        used = sum(window.area_px for _, window in parts)
+        for key in parts[:-1]:
+            if used <= MAX_REGION_PX:
+                break
+            used -= key[1].area_px
+            del self._regions[key]
+
+    def _prepare(self, window: Window, level: int) -> Region:
+        """Enhance with the neighbourhood that the map has beyond the region, so that regions join seamlessly."""
+        rows, columns = self._site.level_shape(level)
+        margin = self._radius_px + 2  # the box, the difference of neighbours, the smoothing
+        x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
+        x1 = min(columns, window.x0 + window.width_px + margin)
+        y1 = min(rows, window.y0 + window.height_px + margin)
+        wide = Window(x0, y0, x1 - x0, y1 - y0)
+        mask: NDArray[np.bool_] | None = None
+        if not self._site.fully_valid:
+            mask = self._site.valid(wide, level)
+            mask = None if mask.all() else mask
+        gray = self._site.gray(wide, level)
+        picture = enhance(gray, radius_px=self._radius_px, score=self._score, valid=mask)
+        inner = np.s_[
+            window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
+        ]
+        image = torch.from_numpy(np.ascontiguousarray(picture[inner])).to(self._device)
+        valid = None
+        if mask is not None and not mask[inner].all():
+            valid = torch.from_numpy(np.ascontiguousarray(mask[inner])).to(self._device)
+        return Region(window, prepare(image), valid)
+
+
+def _holds(region: Window, window: Window) -> bool:
+    right, bottom = window.x0 + window.width_px, window.y0 + window.height_px
+    across = region.x0 <= window.x0 and right <= region.x0 + region.width_px
+    return across and region.y0 <= window.y0 and bottom <= region.y0 + region.height_px
+
+
+def _on_grid(window: Window, columns: int, rows: int) -> Window:
+    """The window grown by half a cell to each side, then to whole cells, and cut off where the level ends."""
+    ahead = CELL_PX // 2
+    x0, y0 = (max(0, low - ahead) // CELL_PX * CELL_PX for low in (window.x0, window.y0))
+    x1 = min(columns, -(-(window.x0 + window.width_px + ahead) // CELL_PX) * CELL_PX)
+    y1 = min(rows, -(-(window.y0 + window.height_px + ahead) // CELL_PX) * CELL_PX)
+    return Window(x0, y0, x1 - x0, y1 - y0)

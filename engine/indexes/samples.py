@@ -1,0 +1,117 @@
+"""Samples of the map for dense refinement: its steepest pixels with their places in space, taken once."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.dense import Samples
+from engine.indexes.prepared import WHOLE_LEVEL_PX, PreparedMap
+from engine.orthomap import OrthoMap
+from engine.values import Window
+
+BLOCK_PX = 4
+"""One sample is taken of every block of this side: the pixel with the steepest gradient."""
+CELL_PX = 256
+"""Of a large level samples are taken cell by cell, on the cells of the prepared map."""
+MAX_CELLS = 256
+MAX_SAMPLES = 2000
+_ROUGH_REACH_PX = 1.5  # of the level: this far off a sample
+
+
+class SampleMap:
+    """Samples of one map for dense refinement, taken once.
+
+    Args:
+        site: the map.
+        prepared: the same, enhanced.
+    """
+
+    def __init__(self, site: OrthoMap, prepared: PreparedMap) -> None:
+        self._site, self._prepared = site, prepared
+        self._cells: OrderedDict[tuple[int, Window], tuple[Samples, tuple[int, int]]] = OrderedDict()
+        self._lock = threading.Lock()  # of the cells alone, as in the prepared map
+        self.created = 0
+        """Cells sampled so far."""
+
+    def find(self, window: Window, level: int) -> Samples:
+        """At most about :data:`MAX_SAMPLES` samples of a window in pixels of a level, inside it.
+
+        The window is at least a block wide and high.
+        """
+        step = math.ceil(window.area_px / BLOCK_PX**2 / MAX_SAMPLES)
+        parts = []
+        for cell in self._cells_under(window, level):
+            samples, shape = self._cell(cell, level)
+            rows, columns = (
+                slice(max(0, (low - start) // BLOCK_PX), -(-(low + size - start) // BLOCK_PX))
+                for low, size, start in (
+                    (window.y0, window.height_px, cell.y0),
+                    (window.x0, window.width_px, cell.x0),
+                )
+            )
+            taken = np.arange(shape[0])[rows, None] * shape[1] + np.arange(shape[1])[columns]
+            index = taken.ravel()[::step]
+            arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
+            parts.append([array[index] for array in arrays])
+        return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def _cells_under(self, window: Window, level: int) -> list[Window]:
+        height, width = self._site.level_shape(level)
+        if width * height <= WHOLE_LEVEL_PX:
+            return [Window(0, 0, width, height)]
+        cells = [
+            Window(x, y, min(CELL_PX, width - x), min(CELL_PX, height - y))
+            for y in range(window.y0 // CELL_PX * CELL_PX, window.y0 + window.height_px, CELL_PX)
+            for x in range(window.x0 // CELL_PX * CELL_PX, window.x0 + window.width_px, CELL_PX)
+        ]
+        # What a level has beyond its last whole cell may be narrower than a block: no sample is taken there.
+        return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
+
+    def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
+        """Samples of a cell, row by row, and how many rows and columns of them there are."""
+        with self._lock:
+            found = self._cells.pop((level, cell), None)
+            if found is not None:
+                self._cells[level, cell] = found
+                return found
+        found = self._sampled(cell, level)
+        with self._lock:
+            self.created += 1
+            self._cells[level, cell] = found
+            if len(self._cells) > MAX_CELLS:
+                self._cells.popitem(last=False)
+        return found
+
+    def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
+        region = self._prepared.cut(cell, level)
+        inner = np.s_[cell.y0 - region.window.y0 :, cell.x0 - region.window.x0 :]
+        picture = region.search.image.cpu().numpy()[inner]
+        across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
+        shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
+        rows, columns = _steepest(cv2.magnitude(across, down), shape)
+        xy_px = self._site.full_from_level(np.stack([columns + cell.x0, rows + cell.y0], axis=-1), level)
+        weights = np.ones(len(rows))
+        if region.valid is not None:
+            weights = region.valid.cpu().numpy()[inner][rows, columns].astype(np.float64)
+        height_m = self._site.surface_at(xy_px)
+        weights *= self._site.roughness_weight_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
+        points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
+        per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
+        metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # alike all over a cell
+        gradients = per_px @ np.linalg.inv(metres_per_px)
+        return Samples(points, picture[rows, columns].astype(np.float64), gradients, weights), shape
+
+
+def _steepest(size: NDArray[np.float32], shape: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the largest value in each block, block row by block row."""
+    blocks = size[: shape[0] * BLOCK_PX, : shape[1] * BLOCK_PX].reshape(shape[0], BLOCK_PX, shape[1], BLOCK_PX)
+    best = blocks.transpose(0, 2, 1, 3).reshape(shape[0], shape[1], -1).argmax(axis=-1)
+    rows = np.arange(shape[0])[:, None] * BLOCK_PX + best // BLOCK_PX
+    columns = np.arange(shape[1])[None] * BLOCK_PX + best % BLOCK_PX
+    return rows.ravel(), columns.ravel()

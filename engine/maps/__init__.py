@@ -1,0 +1,1 @@
+"""Raster files as maps: grids, tiles, pyramids, surface models, and copies on a metric grid."""

@@ -1,0 +1,310 @@
+"""The copy of a map that can be matched against: north-up on a metric grid, made once and kept in a cache.
+
+A map in degrees, a rotated or oblong one is resampled for it; a large one without overviews gets those. A large
+copy is a folder of tiles, each written and moved to its place in one step with a line in a list that says what its
+content is, so that a copy that was interrupted is carried on, and a tile that was damaged is made anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from engine.errors import MapError
+from engine.maps.grids import Grid, Warp, apply_affine, wgs84
+from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
+from engine.maps.xyz_tiles import TileCache
+from engine.values import Window
+
+MAX_SIDE_PX = 1_000_000
+GRID_VERSION = 1
+"""Part of the key of cached grids; to be raised with every change of how they are made."""
+TILE_PX = 8192
+"""Side of the tiles of a large copy; each has overviews down to a thirty-second."""
+COARSEST_PX = 16384
+"""A large file whose smallest overview has a longer side than this is copied."""
+LIST = "tiles.txt"
+"""In the folder of a large copy: a line a tile with its name, and its SHA-256 or "-" where it holds no map."""
+ProgressCallback = Callable[[int, int], None]
+"""Told while a copy is made: how many pixels of it are there, and how many it will have."""
+_REMEMBERED_BYTES = 1 << 22  # of larger files the hash is remembered with their size and time
+_FACTORS = [2, 4, 8, 16, 32]
+
+
+def _metric_grid(source: Grid) -> Grid:
+    """The north-up UTM grid (zone of the source's centre) that covers it in the finer of its two steps."""
+    from pyproj import CRS
+
+    lon, lat = source.pixels_of(wgs84())[0](source.centre_px)
+    zone = int((lon + 180.0) // 6.0) % 60 + 1
+    utm = CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+    to_utm = source.pixels_of(utm)[0]
+    near = to_utm(source.centre_px + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
+    outline = to_utm(source.lattice())
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    with np.errstate(invalid="ignore"):  # places that UTM cannot show are infinite; the check below refuses them
+        step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
+        size = (high - low) / step
+    if not (np.isfinite(size).all() and size.max() <= MAX_SIDE_PX):
+        raise MapError(f"map: expected at most {MAX_SIDE_PX} px a side on a UTM grid, got {size} of {step:.3g} m")
+    matrix = np.array([[step, 0.0, low[0] + step / 2.0], [0.0, -step, high[1] - step / 2.0]])
+    return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
+
+
+def is_large(grid: Grid) -> bool:
+    """Whether a map of this grid is read part by part, instead of being held in memory."""
+    return grid.width_px * grid.height_px > MEMORY_LIMIT_PX
+
+
+def needs_copy(source: Source) -> bool:
+    """Whether a map cannot be used as it is: its grid is no metric one, or it is large without overviews."""
+    grid = source.grid
+    if not grid.is_metric:
+        return True
+    longest_px = max(grid.width_px, grid.height_px) >> stored_levels(source)[-1]
+    return is_large(grid) and longest_px > COARSEST_PX
+
+
+def _blocks(part: Window, block_px: int = 1024) -> Iterator[Window]:
+    """Windows that cover a window, row by row; the last ones are smaller."""
+    right, bottom = part.x0 + part.width_px, part.y0 + part.height_px
+    for y0 in range(part.y0, bottom, block_px):
+        for x0 in range(part.x0, right, block_px):
+            yield Window(x0, y0, min(block_px, right - x0), min(block_px, bottom - y0))
+
+
+def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
+    """Blocks of a part of the copy's grid as (2, h, w) grey and alpha."""
+    if grid is not source:
+        yield from _resampled(reader, source, grid, part)
+        return
+    for window in _blocks(part):
+        gray, valid = reader.read(window)
+        yield window, np.stack([gray, valid.astype(np.uint8) * 255])
+
+
+def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
+    """The same, resampled: grey is cubic, alpha 255 where all of it is valid."""
+    import cv2
+
+    to_source = source.pixels_of(grid.crs)[1]
+    warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
+    limit = np.array([source.width_px, source.height_px])
+    for window in _blocks(part):
+        columns = np.arange(window.x0, window.x0 + window.width_px, dtype=np.float64)
+        rows = np.arange(window.y0, window.y0 + window.height_px, dtype=np.float64)
+        at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
+        low = np.clip(np.floor(at.min(axis=(0, 1))) - 3, 0, limit).astype(int)
+        high = np.clip(np.ceil(at.max(axis=(0, 1))) + 4, 0, limit).astype(int)
+        block = np.zeros((2, window.height_px, window.width_px), np.uint8)
+        if (high > low).all():
+            gray, valid = reader.read(Window(*low.tolist(), *(high - low).tolist()))
+            x, y = np.moveaxis((at - low).astype(np.float32), -1, 0)
+            # One pixel eroded plus the reach of bilinear make up the reach of cubic.
+            solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
+            block[0] = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            solid = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            inside = ((at >= -0.5) & (at <= limit - 0.5)).all(axis=-1)
+            block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
+        yield window, block
+
+
+class _Tally:
+    """Adds up what is there of a copy, and tells it."""
+
+    def __init__(self, grid: Grid, tell: ProgressCallback | None) -> None:
+        self._there_px, self._all_px, self._tell = 0, grid.width_px * grid.height_px, tell
+
+    def add(self, count_px: int, *, quietly: bool = False) -> None:
+        self._there_px += count_px
+        if self._tell is not None and not quietly:
+            self._tell(self._there_px, self._all_px)
+
+
+def open_metric_copy(
+    source: Source,
+    reader: GrayReader | None,
+    cache_dir: str | os.PathLike[str] | None,
+    tell: ProgressCallback | None = None,
+) -> Source:
+    """The source on its metric grid, from the cache where it was made before.
+
+    The key is the SHA-256 of the content of the file and of the files beside it that GDAL uses, of the
+    georeference, and of the version of this format. A cached file that does not fit or cannot be read is made
+    anew; where the cache cannot be written, the copy lives in the temporary directory as long as the map.
+
+    Args:
+        source: the map.
+        reader: of its pixels, None to make one if it is needed.
+        cache_dir: where copies are kept; None for the user's cache.
+        tell: called while a copy is made, and not where there is one already.
+    """
+    grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
+    default = os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenematch")
+    cache = Path(cache_dir if cache_dir is not None else default)
+    name = _key(source, cache)
+    make, name = (_tiled, name) if is_large(grid) else (_single, f"{name}.tif")
+    try:
+        return make(cache / name, source, reader, grid, tell)
+    except OSError:
+        folder = tempfile.mkdtemp(prefix="scenematch-")
+    with map_errors("map", source.path):
+        copy = make(Path(folder) / name, source, reader, grid, tell)
+    weakref.finalize(copy, shutil.rmtree, folder, ignore_errors=True)
+    return copy
+
+
+def _key(source: Source, cache: Path) -> str:
+    digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
+    digest.update(source.grid.pixel_to_crs.tobytes())
+    if isinstance(source.dataset, TileCache):  # too many files to read them all only to name the copy
+        digest.update(source.dataset.fingerprint())
+        return digest.hexdigest()
+    if source.dataset.driver == "VRT":
+        digest.update(source.dataset.name.encode())  # its text: which tile lies where
+    for name in source.dataset.files:
+        digest.update(bytes.fromhex(_file_hash(Path(name), cache)))
+    return digest.hexdigest()
+
+
+def _file_hash(path: Path, cache: Path) -> str:
+    """SHA-256 of a file's content; that of a large one is remembered while its size and time stay the same."""
+    found = path.stat()
+    told = hashlib.sha256(f"{path.absolute()} {found.st_size} {found.st_mtime_ns} {found.st_ino}".encode())
+    note = cache / "hashes" / told.hexdigest()
+    if found.st_size > _REMEMBERED_BYTES and note.is_file() and note.stat().st_size == 64:
+        return note.read_text(encoding="ascii")
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    if found.st_size > _REMEMBERED_BYTES:
+        with contextlib.suppress(OSError):
+            note.parent.mkdir(parents=True, exist_ok=True)
+            note.write_text(digest, encoding="ascii")
+    return digest
+
+
+def _single(
+    target: Path, source: Source, reader: GrayReader | None, grid: Grid, tell: ProgressCallback | None
+) -> Source:
+    """A copy in one file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    cached = _cached(target, grid)
+    if cached is not None:
+        return cached
+    target.parent.mkdir(parents=True, exist_ok=True)
+    whole, tally = Window(0, 0, grid.width_px, grid.height_px), _Tally(grid, tell)
+    _write(target, reader or GrayReader(source), source.grid, grid, whole, tally)
+    copy = _cached(target, grid)
+    if copy is None:
+        raise OSError(f"{target} could not be read back")
+    return copy
+
+
+def _tiled(
+    folder: Path, source: Source, reader: GrayReader | None, grid: Grid, tell: ProgressCallback | None
+) -> Source:
+    """A large copy: the tiles that are missing or not what the list says are made, the others stay.
+
+    Raises:
+        OSError: a tile cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    listed, tally = _read_list(folder / LIST), _Tally(grid, tell)
+    tiles = list(_blocks(Window(0, 0, grid.width_px, grid.height_px), TILE_PX))
+    for tile in tiles:
+        target = folder / f"{tile.y0 // TILE_PX:04d}-{tile.x0 // TILE_PX:04d}.tif"
+        told = listed.get(target.name)
+        if told == ("-" if not target.exists() else _file_hash(target, folder.parent)):
+            tally.add(tile.area_px, quietly=True)
+            continue
+        tally.add(0)  # what comes next may take a while before it has made anything
+        reader = reader or GrayReader(source)
+        corner = tile in (tiles[0], tiles[-1])  # the grid ends where they do
+        holds_map = _write(target, reader, source.grid, grid, tile, tally, even_empty=corner)
+        told = _file_hash(target, folder.parent) if holds_map else "-"
+        with (folder / LIST).open("a", encoding="ascii") as stream:
+            stream.write(f"{target.name} {told}\n")
+    return open_source(folder)
+
+
+def _read_list(path: Path) -> dict[str, str]:
+    """What a list says of each tile; the last line counts, and one that was cut off does not."""
+    if not path.is_file():
+        return {}
+    lines = (line.split() for line in path.read_text(encoding="ascii", errors="replace").splitlines())
+    return {words[0]: words[1] for words in lines if len(words) == 2}
+
+
+def _cached(path: Path, grid: Grid) -> Source | None:
+    """The cached file, or None where it is missing, broken or of another grid."""
+    try:
+        source = open_source(path)
+        same = np.allclose(source.grid.pixel_to_crs, grid.pixel_to_crs, rtol=0, atol=1e-6)
+        size = (source.grid.width_px, source.grid.height_px)
+        if not same or size != (grid.width_px, grid.height_px) or source.dataset.count != 2:
+            return None
+        with map_errors("map", path):  # a file cut short shows in its last rows
+            whole = size[0] * size[1] <= MEMORY_LIMIT_PX
+            source.dataset.read(window=((0 if whole else size[1] - 1, size[1]), (0, size[0])))
+    except (MapError, OSError):
+        return None
+    return source
+
+
+def _write(
+    target: Path,
+    reader: GrayReader,
+    source: Grid,
+    grid: Grid,
+    part: Window,
+    tally: _Tally,
+    *,
+    even_empty: bool = True,
+) -> bool:
+    """Write a part of the copy beside its place and move it there in one step; whether it holds any map.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    import rasterio
+    from rasterio.enums import ColorInterp, Resampling
+    from rasterio.windows import Window as RasterWindow
+
+    (a, _, c), (_, e, f) = grid.pixel_to_crs
+    x, y = c + a * (part.x0 - 0.5), f + e * (part.y0 - 0.5)
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 2, "crs": grid.crs.to_wkt(), "bigtiff": "if_safer"}
+    profile |= {"tiled": True, "compress": "deflate", "width": part.width_px, "height": part.height_px}
+    profile["transform"] = rasterio.Affine(a, 0.0, x, 0.0, e, y)
+    is_tile = (part.width_px, part.height_px) != (grid.width_px, grid.height_px)
+    handle, name = tempfile.mkstemp(suffix=".part", dir=target.parent)
+    os.close(handle)
+    holds_map = False
+    try:
+        with rasterio.open(name, "w", **profile) as dataset:
+            dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
+            for window, block in _copied(reader, source, grid, part):
+                place = (window.x0 - part.x0, window.y0 - part.y0)
+                dataset.write(block, window=RasterWindow(*place, window.width_px, window.height_px))
+                holds_map = holds_map or bool(block[1].any())
+                tally.add(window.area_px)
+            if is_tile:
+                dataset.build_overviews(_FACTORS, Resampling.average)
+        if holds_map or even_empty:
+            os.replace(name, target)
+        else:
+            target.unlink(missing_ok=True)
+    finally:
+        Path(name).unlink(missing_ok=True)
+    return holds_map or even_empty

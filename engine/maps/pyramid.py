@@ -1,0 +1,157 @@
+"""The pyramid of a map: grey and validity at every level, in memory or read window by window."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from engine.errors import OptionError
+from engine.maps.grids import Array
+from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, Mask, scaled_window
+from engine.values import Window
+
+MIN_LEVEL_PX = 16
+
+
+class Reader(Protocol):
+    """Where pixels come from: a file, or arrays.
+
+    Attributes:
+        levels: that can be read, in rising order, 0 among them.
+        all_valid: whether no pixel can be nodata, whichever is read.
+    """
+
+    @property
+    def levels(self) -> tuple[int, ...]: ...  # noqa: D102
+
+    @property
+    def all_valid(self) -> bool: ...  # noqa: D102
+
+    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
+        """Grey and validity (h, w) of a window in pixels of one of the levels."""
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """A reader of arrays (H, W)."""
+
+    gray: Gray
+    valid: Mask
+    levels: tuple[int, ...] = (0,)
+    all_valid: bool = False
+
+    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
+        """Grey and validity (h, w) of a window."""
+        part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
+        return self.gray[part], self.valid[part]
+
+
+class Pyramid:
+    """Grey and validity at every level: a small map in memory; of a large one the coarse levels, the others read.
+
+    Args:
+        width_px: of level 0.
+        height_px: of level 0.
+        reader: of the pixels. What lies between its levels is halved from the next finer one.
+    """
+
+    def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
+        self._size, self._reader = (height_px, width_px), reader
+        self.levels = max(1, int(math.log2(max(1.0, min(self._size) / MIN_LEVEL_PX))) + 1)
+        self._base = 0
+        self.is_large = math.prod(self._size) > MEMORY_LIMIT_PX
+        """Whether it is too large for memory."""
+        limit_px = min(MEMORY_LIMIT_PX, COARSE_LIMIT_PX)
+        while self.is_large and self._base < self.levels - 1 and math.prod(self.shape(self._base)) > limit_px:
+            self._base += 1
+        self._kept: dict[int, tuple[Gray, Mask]] = {}
+        self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
+        if self._base == 0:
+            self._kept[0] = self._streamed(0)
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        if not 0 <= level < self.levels:
+            raise OptionError(f"level: expected 0 to {self.levels - 1}, got {level}")
+        return self._size[0] >> level, self._size[1] >> level
+
+    def _streamed(self, level: int) -> tuple[Gray, Mask]:
+        """A whole level, read in strips so that colour and masks of the file never lie in memory at once."""
+        height, width = self.shape(level)
+        gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
+        rows = max(1, 1024 >> (level - self._stored(level)))
+        for y0 in range(0, height, rows):
+            strip = Window(0, y0, width, min(rows, height - y0))
+            gray[y0 : y0 + rows], valid[y0 : y0 + rows] = self._from_file(strip, level)
+        return gray, valid
+
+    def _stored(self, level: int) -> int:
+        """The level that is read for another."""
+        return max(stored for stored in self._reader.levels if stored <= level)
+
+    def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
+        finer = level - self._stored(level)
+        both = self._reader.read(scaled_window(window, finer), level - finer)
+        for _ in range(finer):
+            both = _halved(*both)
+        return both
+
+    def _level(self, level: int) -> tuple[Gray, Mask]:
+        if level not in self._kept:
+            at_base = level == self._base
+            self._kept[level] = self._streamed(level) if at_base else _halved(*self._level(level - 1))
+        return self._kept[level]
+
+    def crop(self, window: Window, level: int) -> tuple[Gray, Mask]:
+        """Grey and validity (h, w) of a window in pixels of a level."""
+        height, width = self.shape(level)
+        x1, y1 = window.x0 + window.width_px, window.y0 + window.height_px
+        if not (0 <= window.x0 < x1 <= width and 0 <= window.y0 < y1 <= height):
+            raise OptionError(f"window: expected one inside {width} x {height} px of level {level}, got {window}")
+        if level >= self._base:
+            gray, valid = self._level(level)
+            return gray[window.y0 : y1, window.x0 : x1], valid[window.y0 : y1, window.x0 : x1]
+        last = self._last
+        if last is None or last[0] != (window, level):  # grey and validity are often asked in turn
+            last = self._last = ((window, level), self._from_file(window, level))
+        return last[1]
+
+    @property
+    def fully_valid(self) -> bool:
+        """Whether no pixel is nodata; of a large map only where its file has no way to say that one is."""
+        return self._reader.all_valid if self.is_large else self.nodata_share == 0.0
+
+    @cached_property
+    def nodata_share(self) -> float:
+        """Share of the pixels that are not valid, at the finest level in memory."""
+        return 1.0 - float(self._level(self._base)[1].mean())
+
+    def valid_at(self, xy_px: Array) -> Mask:
+        """Validity (...,) at places (..., 2) of level 0, cut to whole pixels of the finest level in memory."""
+        height, width = self.shape(self._base)
+        x, y = np.moveaxis(xy_px.astype(np.intp) >> self._base, -1, 0)
+        return np.asarray(self._level(self._base)[1][np.minimum(y, height - 1), np.minimum(x, width - 1)])
+
+    def innermost_px(self) -> Array:
+        """The pixel (2,) of level 0 that is farthest from any that is not valid."""
+        import cv2
+
+        valid = np.pad(self._level(self._base)[1].astype(np.uint8), 1)
+        inside = cv2.distanceTransform(valid, cv2.DIST_L2, 3)[1:-1, 1:-1]
+        y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
+        return (np.array([x, y]) + 0.5) * 2.0**self._base - 0.5
+
+
+def _halved(gray: Gray, valid: Mask) -> tuple[Gray, Mask]:
+    """2 x 2 area averages; valid where all four are. An odd last row or column is left out."""
+    import cv2
+
+    height, width = gray.shape[0] // 2, gray.shape[1] // 2
+    even = slice(0, 2 * height), slice(0, 2 * width)
+    small = cv2.resize(gray[even], (width, height), interpolation=cv2.INTER_AREA)
+    all_four = np.asarray(valid[even].reshape(height, 2, width, 2).all(axis=(1, 3)))
+    return np.asarray(small, np.uint8), all_four

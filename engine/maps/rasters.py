@@ -1,0 +1,395 @@
+"""Raster files: what may be opened, where it lies on the Earth, its grey values or its heights.
+
+Convention:
+    GDAL's origin, the outer corner of the first pixel, is left behind in :func:`_centred`; a :class:`Source` has
+    the pixels of :mod:`engine.maps.grids`, centres at integers.
+
+Nodata is what the file says (tag, mask, alpha, NaN). A file that says nothing may still have a collar: pixels
+whose bands are all exactly 0, or all exactly the largest value, that hang together with the border of the
+picture and jointly cover more than :data:`COLLAR_SHARE` of it, count as nodata. Dark pixels inside do not.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import MapError, OptionError
+from engine.maps.grids import Array, Grid, apply_affine, earth_crs, overlap, wgs84
+from engine.maps.tiles import local_path, openable
+from engine.maps.xyz_tiles import TileCache, is_tile_cache, open_tile_cache
+from engine.values import MAX_SIGMA_M, Window
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+Gray = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
+COLLAR_SHARE = 0.005
+STRETCH_PERCENT = (2.0, 98.0)
+OVERVIEW_PX = 4096
+"""Stretch and collar are found on a copy of at most this many pixels a side."""
+GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
+"""Metadata item of a GeoTIFF: one standard deviation of where it lies, in metres per axis."""
+SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
+"""The same of a surface model: of how far the ground under a frame leans against it, in degrees."""
+_GDAL_CACHE_BYTES = 128 * 2**20  # GDAL's own cache is a twentieth of the machine's memory
+MEMORY_LIMIT_PX = 256 * 2**20
+"""Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
+COARSE_LIMIT_PX = 16 * 2**20
+"""Of those the first level of up to this many pixels, and the coarser ones, are held in memory."""
+SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // 4
+"""The same of heights, which take four times the memory."""
+HEIGHT_RANGE_M = (-1000.0, 20000.0)
+"""Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """An open raster file and its grid."""
+
+    path: Path
+    dataset: Any
+    grid: Grid
+
+
+def stated_sigma(given: float | None, source: Source | None, tag: str, argument: str) -> float | None:
+    """The accuracy that was given, else the one that a file says of itself, else None.
+
+    Raises:
+        OptionError: what was given is not a number above 0, or wider than any map.
+        MapError: what the file says is not one.
+    """
+    text = None if source is None else source.dataset.tags().get(tag)
+    if given is not None:
+        if not 0.0 < given <= MAX_SIGMA_M:
+            raise OptionError(f"{argument}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {given}")
+        return float(given)
+    if source is None or text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= MAX_SIGMA_M:
+        raise MapError(
+            f"{source.path}: expected a number above 0 and at most {MAX_SIGMA_M:g} as {tag}, got {text!r}"
+        )
+    return value
+
+
+@contextmanager
+def map_errors(argument: str, path: Path) -> Iterator[None]:
+    """Turn what rasterio raises into one line, and keep GDAL's cache of blocks small while it reads."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            with rasterio.Env(GDAL_CACHEMAX=_GDAL_CACHE_BYTES):
+                yield
+        except (RasterioError, OSError, ValueError) as error:
+            reason = str(error.__cause__ or error).splitlines()[0]
+            raise MapError(f"{argument}: cannot read {path}: {reason}") from None
+
+
+def open_source(
+    path: str | os.PathLike[str],
+    argument: str = "map",
+    *,
+    bounds_deg: tuple[float, float, float, float] | None = None,
+    crs: Any = None,
+) -> Source:
+    """Open a local raster and find where it lies.
+
+    Args:
+        path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a VRT, a folder of georeferenced
+            tiles, or one of tiles by their names, z/x/y.png.
+        argument: what a message calls the file.
+        bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
+            and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).
+        crs: coordinate reference system of a file that names none; else that of a ``.prj`` beside it.
+
+    Raises:
+        MapError: the file is missing, is no raster that may be opened, or cannot be placed on the Earth.
+    """
+    import rasterio
+
+    file = local_path(path, argument)
+    with map_errors(argument, file):
+        if file.is_dir() and is_tile_cache(file):
+            dataset: Any = open_tile_cache(file, argument)
+        else:
+            what, driver = openable(file, argument)
+            dataset = rasterio.open(what, driver=driver)
+        transform, own_crs = dataset.transform, dataset.crs
+    width, height = dataset.width, dataset.height
+    own = None if transform.is_identity else _centred(transform)
+    if bounds_deg is not None:
+        if own is not None:
+            raise MapError(f"bounds_deg: expected none for a file with a georeference of its own, {file}")
+        found = earth_crs(crs if crs is not None else "EPSG:4326", "crs")
+        matrix = _from_bounds(bounds_deg, found, width, height)
+    elif own is not None:
+        found, matrix = _crs_of(file, argument, own_crs, crs), own
+    else:
+        raise MapError(
+            f"{argument}: {file} is a picture without georeference; give bounds_deg=(west, south, east, "
+            "north), or a world file and its CRS (control points and RPCs are not used: gdalwarp them first)"
+        )
+    return Source(file, dataset, _checked(Grid(width, height, matrix, found), argument, file))
+
+
+def _checked(grid: Grid, argument: str, file: Path) -> Grid:
+    matrix = grid.pixel_to_crs
+    determinant = np.linalg.det(matrix[:, :2]) if np.isfinite(matrix).all() else 0.0
+    if determinant == 0.0:
+        raise MapError(f"{argument}: expected a finite, invertible geotransform, got {matrix.tolist()} in {file}")
+    lon, lat = grid.pixels_of(wgs84())[0](grid.centre_px)
+    if not (abs(lat) <= 90.0 and abs(lon) <= 540.0):  # NaN and infinity fail too
+        raise MapError(f"{argument}: the centre of {file} lies outside its CRS {grid.crs.name!r}")
+    return grid
+
+
+def _centred(transform: Any) -> Array:
+    """The one place where GDAL's origin, the outer corner of the first pixel, moves to that pixel's centre."""
+    a, b, c, d, e, f = list(transform)[:6]
+    return np.array([[a, b, c + (a + b) / 2.0], [d, e, f + (d + e) / 2.0]])
+
+
+def _crs_of(file: Path, argument: str, own: Any, given: Any) -> CRS:
+    beside = file.with_suffix(".prj")
+    if own:
+        found = earth_crs(own.to_wkt(), argument)
+        if given is not None and not earth_crs(given, "crs").equals(found, ignore_axis_order=True):
+            raise MapError(f"crs: expected none, since {file} says {found.name!r}, got {given!r}")
+        return found
+    if given is not None:
+        return earth_crs(given, "crs")
+    if beside.is_file():
+        return earth_crs(beside.read_text(encoding="utf-8", errors="replace"), argument)
+    raise MapError(
+        f"{argument}: {file} names no CRS; give crs=, such as 'EPSG:32636', or put {beside.name} beside it"
+    )
+
+
+def _from_bounds(bounds_deg: tuple[float, float, float, float], crs: CRS, width: int, height: int) -> Array:
+    from pyproj import Transformer
+
+    west, south, east, north = bounds_deg
+    if not (-180 <= west < east <= 540 and -90 <= south < north <= 90):  # NaN fails too
+        raise MapError(f"bounds_deg: expected west < east and south < north in degrees, got {tuple(bounds_deg)}")
+    to_crs = Transformer.from_crs(4326, crs, always_xy=True)
+    x, y = to_crs.transform(np.array([west, east, west, east]), np.array([north, south, south, north]))
+    step_x, step_y = (x[1] - x[0]) / width, (y[1] - y[0]) / height
+    slant_x, slant_y = np.abs([x[2] - x[0], x[3] - x[1]]).max(), np.abs([y[3] - y[0], y[2] - y[1]]).max()
+    if not (slant_x <= step_x / 2 and slant_y <= -step_y / 2):
+        raise MapError(
+            f"bounds_deg: the corners are no rectangle in crs {crs.name!r}; expected one of its own bounds"
+        )
+    return np.array([[step_x, 0.0, x[0] + step_x / 2.0], [0.0, step_y, y[0] + step_y / 2.0]])
+
+
+class GrayReader:
+    """Grey values and validity of a raster, window by window.
+
+    Colour becomes ITU-R BT.601 luma of the first three bands; a colour table is expanded first. Element types
+    other than uint8 are stretched linearly between two percentiles of the valid pixels.
+
+    Attributes:
+        levels: of the map's pyramid that the file holds: 0, and those of its overviews.
+
+    Raises:
+        MapError: an element type that is no picture, pixels that cannot be read, or none that is valid.
+    """
+
+    def __init__(self, source: Source, *, find_collar: bool = True) -> None:
+        self._source, self._lock = source, threading.Lock()
+        dataset = source.dataset
+        self.dtype = dataset.dtypes[0]
+        if self.dtype not in DTYPES:
+            raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
+        self.levels = stored_levels(source)
+        self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
+        self._palette = _palette(dataset)
+        shrink = max(1.0, max(dataset.width, dataset.height) / OVERVIEW_PX)
+        size = (math.ceil(dataset.height / shrink), math.ceil(dataset.width / shrink))
+        data, valid = self._read(Window(0, 0, dataset.width, dataset.height), size)
+        self._collars = _collars(data) if find_collar and valid.all() else {}
+        for value, area in self._collars.items():
+            valid &= ~((data == value).all(axis=0) & area)
+        self.invalid_share = 1.0 - float(valid.mean())
+        if not valid.any():
+            raise MapError(f"map: expected at least one valid pixel, got only nodata in {source.path}")
+        self._limits: Array | None = None
+        if data.dtype != np.uint8:
+            self._limits = np.percentile(_luma(data)[valid], STRETCH_PERCENT)
+
+    @property
+    def all_valid(self) -> bool:
+        """Whether no pixel can be nodata, whichever is read."""
+        flags = self._source.dataset.mask_flag_enums
+        never = all("all_valid" in {flag.name for flag in of_band} for of_band in flags)
+        return never and not self._collars and np.dtype(self.dtype).kind != "f"
+
+    def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
+        """Bands and validity of a window in pixels of the file, as so many (rows, columns)."""
+        from rasterio.enums import Resampling
+        from rasterio.windows import Window as RasterWindow
+
+        crop = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
+        # GDAL reads the overview that fits; its pixels lie between the level's where the size is no multiple.
+        how = Resampling.average if smooth and self._palette is None else Resampling.nearest
+        shape = (len(self._bands), *size)
+        with self._lock, map_errors("map", self._source.path):  # a GDAL dataset serves one thread at a time
+            data = self._source.dataset.read(self._bands, window=crop, out_shape=shape, resampling=how)
+            mask = self._source.dataset.dataset_mask(window=crop, out_shape=size)
+        if self._palette is not None:
+            data = self._palette[:, data[0]]
+        valid = np.asarray(mask >= 128)
+        return data, valid & np.isfinite(data).all(axis=0) if data.dtype.kind == "f" else valid
+
+    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
+        """Grey values and validity (h, w) of a window that lies inside, in pixels of one of :attr:`levels`."""
+        full = scaled_window(window, level)
+        data, valid = self._read(full, (window.height_px, window.width_px), smooth=level > 0)
+        for value, area in self._collars.items():
+            height, width = area.shape
+            grid, scale = self._source.grid, 2.0**level
+            y = (np.arange(window.y0, window.y0 + window.height_px) + 0.5) * scale * height / grid.height_px
+            x = (np.arange(window.x0, window.x0 + window.width_px) + 0.5) * scale * width / grid.width_px
+            valid &= ~((data == value).all(axis=0) & area[np.ix_(y.astype(int), x.astype(int))])
+        luma = _luma(data)
+        if self._limits is None:
+            return luma, valid
+        low, high = self._limits
+        scaled = (np.nan_to_num(luma, nan=low, posinf=high, neginf=low) - low) * (255.0 / max(high - low, 1e-30))
+        return np.clip(np.rint(scaled), 0, 255).astype(np.uint8), valid
+
+
+def scaled_window(window: Window, levels: int) -> Window:
+    """A window in pixels of a level so many levels finer."""
+    return Window(*(v << levels for v in (window.x0, window.y0, window.width_px, window.height_px)))
+
+
+def stored_levels(source: Source) -> tuple[int, ...]:
+    """Levels of the pyramid that a file holds: 0, and its overviews by powers of two."""
+    factors = source.dataset.overviews(1)
+    return (0, *sorted(factor.bit_length() - 1 for factor in factors if factor > 1 and factor & (factor - 1) == 0))
+
+
+def _palette(dataset: Any) -> Gray | None:
+    """(3, N) colours of a colour table, or None."""
+    if dataset.count != 1 or dataset.colorinterp[0].name != "palette":
+        return None
+    table = np.zeros((3, int(np.iinfo(dataset.dtypes[0]).max) + 1), np.uint8)
+    for index, colour in dataset.colormap(1).items():
+        table[:, index] = colour[:3]
+    return table
+
+
+def _luma(data: NDArray[Any]) -> NDArray[Any]:
+    """(h, w) of bands (1 or 3, h, w): uint8 stays uint8, everything else becomes float32."""
+    import cv2
+
+    data = data if data.dtype == np.uint8 else data.astype(np.float32)
+    if len(data) == 1:
+        return np.asarray(data[0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(np.moveaxis(data, 0, -1)), cv2.COLOR_RGB2GRAY))
+
+
+def _collars(data: NDArray[Any]) -> dict[float, Mask]:
+    """For pure black and pure white: the area that hangs together with the border.
+
+    It is widened by a pixel, because the border of a collar falls between the pixels of a thinned copy.
+    """
+    import cv2
+
+    found: dict[float, Mask] = {}
+    for value in (0, np.iinfo(data.dtype).max) if data.dtype.kind in "ui" else (0,):
+        count, labels = cv2.connectedComponents((data == value).all(axis=0).astype(np.uint8), connectivity=4)
+        touches = np.zeros(count, np.bool_)
+        touches[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
+        touches[0] = False  # label 0 is everything of another colour
+        area = touches[labels]
+        if area.mean() > COLLAR_SHARE:
+            found[float(value)] = cv2.dilate(area.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return found
+
+
+def read_surface(source: Source, grid: Grid, limit_px: int = SURFACE_LIMIT_PX) -> tuple[NDArray[np.float32], Grid]:
+    """Heights (NaN where unknown) and grid of the part of a surface model that lies under a map.
+
+    It is thinned by averages where it has more pixels than the limit.
+
+    Raises:
+        MapError: it cannot be read, or lies elsewhere.
+    """
+    part = surface_part(source, grid)
+    thin = max(1.0, math.sqrt(float(part.area_px) / limit_px))
+    shape = (math.ceil(part.height_px / thin), math.ceil(part.width_px / thin))
+    return read_heights(source, part, shape), part_grid(source.grid, part, shape)
+
+
+def surface_part(source: Source, grid: Grid) -> Window:
+    """The part of a surface model that lies under a map, in the model's pixels.
+
+    Raises:
+        MapError: it holds no heights, or lies elsewhere.
+    """
+    dtype = source.dataset.dtypes[0]
+    if isinstance(source.dataset, TileCache):
+        raise MapError(f"surface: expected heights, got a folder of pictures, {source.path}")
+    if np.dtype(dtype).kind not in "iuf":
+        raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
+    low, high = overlap(grid, source.grid)
+    if not (high > low).all():
+        raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
+    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Heights of a window of a surface model as so many (rows, columns), NaN where unknown.
+
+    Raises:
+        MapError: it cannot be read.
+    """
+    from rasterio.enums import Resampling
+    from rasterio.windows import Window as RasterWindow
+
+    whole = shape == (part.height_px, part.width_px)
+    with map_errors("surface", source.path):
+        data = source.dataset.read(
+            1,
+            window=RasterWindow(part.x0, part.y0, part.width_px, part.height_px),
+            out_shape=shape,
+            masked=True,
+            resampling=Resampling.nearest if whole else Resampling.average,
+        )
+    heights = data.astype(np.float32).filled(np.nan) * source.dataset.scales[0] + source.dataset.offsets[0]
+    heights[~((heights > HEIGHT_RANGE_M[0]) & (heights < HEIGHT_RANGE_M[1]))] = np.nan
+    return np.asarray(heights, np.float32)
+
+
+def part_grid(own: Grid, part: Window, shape: tuple[int, int]) -> Grid:
+    """The grid of a window of another, thinned to so many (rows, columns)."""
+    low, size = np.array([part.x0, part.y0]), np.array([part.width_px, part.height_px])
+    scale = size / np.array(shape[::-1])
+    # Pixel x of the thinned copy covers the file's pixels around low + (x + 0.5) * scale - 0.5.
+    crop_to_file = np.column_stack([np.diag(scale), low + 0.5 * scale - 0.5])
+    linear = own.pixel_to_crs[:, :2] @ crop_to_file[:, :2]
+    origin = apply_affine(own.pixel_to_crs, crop_to_file[:, 2])
+    return Grid(shape[1], shape[0], np.column_stack([linear, origin]), own.crs)

@@ -1,0 +1,164 @@
+"""The surface model of a map: its heights at map pixels, and the bare ground below roofs and crowns."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.maps.grids import Array, Grid, Warp, warp_between
+from engine.maps.rasters import (
+    COARSE_LIMIT_PX,
+    SURFACE_LIMIT_PX,
+    Source,
+    part_grid,
+    read_heights,
+    read_surface,
+    surface_part,
+)
+from engine.values import Window
+
+Heights = NDArray[np.float32]
+
+GROUND_PERCENT = 20.0
+"""Percentile of the surface that is taken as the level of the ground."""
+TILE_PX = 256
+"""What is read of a large surface begins and ends on multiples of this."""
+MAX_SPAN = 6
+"""Places that lie within so many tiles a side are looked up in one patch."""
+MAX_PATCHES = 16
+"""So many patches are kept, of at most 9 MiB."""
+_Patch = tuple[int, int, int, int]  # first row and column of tiles, and the last ones
+_LATTICE = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 15)] * 2), axis=-1).reshape(-1, 2)
+"""Where heights are looked at to find a plane, as shares of the way to the sides of the square."""
+_ROUNDS = 8
+_ON_PLANE_M = 0.3  # heights closer to a plane than this lie on it
+
+
+class HeightTiles:
+    """Heights of a large surface model, looked up like an array (H, W) and read where they are looked up.
+
+    Args:
+        source: the model.
+        part: of it, in its pixels: what is looked up.
+    """
+
+    def __init__(self, source: Source, part: Window) -> None:
+        self._source, self._part, self._lock = source, part, threading.Lock()
+        self._patches: OrderedDict[_Patch, Heights] = OrderedDict()  # the one used last comes last
+        self.shape = (part.height_px, part.width_px)
+
+    def __getitem__(self, place: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
+        rows, columns = place
+        if rows.size == 0:
+            return np.empty(rows.shape, np.float32)
+        y0, x0, y1, x1 = (int(v) // TILE_PX for v in (rows.min(), columns.min(), rows.max(), columns.max()))
+        if max(y1 - y0, x1 - x0) < MAX_SPAN:
+            return self._patch((y0, x0, y1, x1))[rows - y0 * TILE_PX, columns - x0 * TILE_PX]
+        out = np.empty(rows.shape, np.float32)
+        tiles = (rows // TILE_PX << 32) + columns // TILE_PX
+        for y, x in (divmod(int(tile), 1 << 32) for tile in np.unique(tiles)):
+            here = tiles == (y << 32) + x
+            out[here] = self._patch((y, x, y, x))[rows[here] - y * TILE_PX, columns[here] - x * TILE_PX]
+        return out
+
+    def _patch(self, key: _Patch) -> Heights:
+        """The heights from one tile (row, column) to another."""
+        with self._lock:  # a GDAL dataset serves one thread at a time
+            patch = self._patches.pop(key, None)
+            if patch is None:
+                y, x = key[0] * TILE_PX, key[1] * TILE_PX
+                size = (
+                    min((key[2] + 1) * TILE_PX, self.shape[0]) - y,
+                    min((key[3] + 1) * TILE_PX, self.shape[1]) - x,
+                )
+                window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
+                patch = read_heights(self._source, window, size)
+            self._patches[key] = patch
+            if len(self._patches) > MAX_PATCHES:
+                self._patches.popitem(last=False)
+        return patch
+
+
+class SurfaceModel:
+    """Heights on a grid of their own.
+
+    Args:
+        heights_m: (H, W), NaN where unknown.
+        from_map: to its pixels from those of the map.
+        thinned: the same surface with fewer pixels, where it is too large to be looked at as a whole.
+    """
+
+    def __init__(
+        self, heights_m: Heights | HeightTiles, from_map: Warp, thinned: SurfaceModel | None = None
+    ) -> None:
+        self._heights_m, self._from_map, self._thinned = heights_m, from_map, thinned
+
+    def overview(self, map_xy: Array) -> Array:
+        """As :meth:`sample`, for places all over the map: of the thinned surface where there is one."""
+        return (self._thinned or self).sample(map_xy)
+
+    def sample(self, map_xy: Array) -> Array:
+        """Bilinear heights (...,) of map pixels (..., 2), NaN outside and next to nodata."""
+        height, width = self._heights_m.shape
+        last = np.array([width - 1.0, height - 1.0])
+        at = self._from_map(map_xy)
+        inside = np.asarray(((at >= -0.5) & (at <= last + 0.5)).all(axis=-1))
+        at = np.clip(np.where(inside[..., None], at, 0.0), 0.0, last)
+        low = at.astype(np.intp)
+        (x0, y0), (x1, y1) = np.moveaxis(low, -1, 0), np.moveaxis(np.minimum(low + 1, last.astype(np.intp)), -1, 0)
+        u, v = np.moveaxis(at - low, -1, 0)
+        grid = self._heights_m
+        top = grid[y0, x0] * (1.0 - u) + grid[y0, x1] * u
+        bottom = grid[y1, x0] * (1.0 - u) + grid[y1, x1] * u
+        return np.where(inside, top * (1.0 - v) + bottom * v, np.nan)
+
+    def ground_plane(self, map_xy: Array, reach_px: float) -> tuple[float, Array] | None:
+        """The plane with a fifth of the surface below it in a square about one map pixel (2,).
+
+        Args:
+            map_xy: the square's middle.
+            reach_px: half its side.
+
+        Returns:
+            The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None where less
+            than half of the square is known.
+        """
+        from engine.kernels.lower_plane import lower_plane  # numba takes a while to import
+
+        heights_m = self.sample(map_xy + _LATTICE * reach_px)
+        known = np.isfinite(heights_m)
+        if 2 * np.count_nonzero(known) < len(known):
+            return None
+        plane = lower_plane(_LATTICE[known], heights_m[known], GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
+        return float(plane[0]), plane[1:] / reach_px
+
+    @property
+    def range_m(self) -> tuple[float, float]:
+        """Lowest and highest known height; of a large surface those of its averages."""
+        if not isinstance(self._heights_m, np.ndarray):
+            assert self._thinned is not None  # what is read in tiles comes with it
+            return self._thinned.range_m
+        return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
+
+
+def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
+    """The surface under a map, and the grid of what is used of it: in memory, or where it is large tile by tile.
+
+    Args:
+        source: the model.
+        grid: of the map.
+
+    Raises:
+        MapError: it cannot be read, or lies elsewhere.
+    """
+    part = surface_part(source, grid)
+    large = part.area_px > SURFACE_LIMIT_PX
+    heights, lies = read_surface(source, grid, COARSE_LIMIT_PX if large else SURFACE_LIMIT_PX)
+    surface = SurfaceModel(heights, warp_between(grid, lies))
+    if large:
+        tiles = HeightTiles(source, part)
+        surface = SurfaceModel(tiles, warp_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
+    return surface, lies

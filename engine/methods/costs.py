@@ -1,0 +1,80 @@
+"""What each step costs on this machine, learned from every time that it ran."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+_MEMORY = 0.93  # weight of a run after the next one: some fourteen runs count
+_SURPRISE = 2.0  # a run counts for at most this factor of what was expected: one interruption is no new price
+_SIGMAS = 3.0
+_MIN_MS = 0.05
+_DOUBT = 0.9  # what is left of the deviation each time that a step is refused for its price
+_FORGET = 0.99  # and of the price itself
+
+
+@dataclass(slots=True)
+class _Price:
+    """Running sums of a line, ms = fixed + rate * work, and of the deviations from it."""
+
+    weight: float = 0.0
+    work: float = 0.0
+    ms: float = 0.0
+    work_work: float = 0.0
+    work_ms: float = 0.0
+    square: float = 0.0
+
+    def expected_ms(self, work: float) -> float:
+        """The line's value, neither of its two parts negative."""
+        mean_work, mean_ms = self.work / self.weight, self.ms / self.weight
+        spread = self.work_work / self.weight - mean_work**2
+        rate = 0.0
+        if spread > 1e-3 * mean_work**2:
+            rate = (self.work_ms / self.weight - mean_work * mean_ms) / spread
+        elif work > mean_work > 0.0:  # all alike so far: larger work is taken to cost in proportion
+            rate = mean_ms / mean_work
+        rate = min(max(rate, 0.0), mean_ms / mean_work if mean_work > 0.0 else math.inf)
+        return mean_ms + rate * (work - mean_work)
+
+    def learn(self, work: float, ms: float) -> None:
+        if self.weight > 0.0:
+            expected = self.expected_ms(work)
+            ms = min(ms, _SURPRISE * expected + _MIN_MS)
+            self.square = _MEMORY * self.square + (1.0 - _MEMORY) * (ms - expected) ** 2
+        self.weight = _MEMORY * self.weight + 1.0
+        self.work = _MEMORY * self.work + work
+        self.ms = _MEMORY * self.ms + ms
+        self.work_work = _MEMORY * self.work_work + work * work
+        self.work_ms = _MEMORY * self.work_ms + work * ms
+
+
+class Costs:
+    """Prices of steps by name. A step's work is in units of its own, such as pixels."""
+
+    def __init__(self) -> None:
+        self._prices: dict[str, _Price] = {}
+
+    def learn(self, step: str, work: float, ms: float) -> None:
+        """Note that a step with this much work took so many milliseconds."""
+        self._prices.setdefault(step, _Price()).learn(work, ms)
+
+    def doubt(self, step: str, *, price: bool) -> None:
+        """Note that a step was refused for its price: one that never runs is never seen to have become cheap.
+
+        Args:
+            step: its name.
+            price: whether the price itself fades, so that the step is tried again; else the spread about it alone.
+        """
+        known = self._prices.get(step)
+        if known is not None:
+            known.square *= _DOUBT**2
+            if price:
+                known.ms *= _FORGET
+                known.work_ms *= _FORGET
+
+    def expected_ms(self, step: str, work: float) -> float:
+        """What the step will hardly exceed: its expected time and three deviations; 0 where it never ran."""
+        price = self._prices.get(step)
+        if price is None:
+            return 0.0
+        return price.expected_ms(work) + _SIGMAS * math.sqrt(price.square)

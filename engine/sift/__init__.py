@@ -1,0 +1,1 @@
+"""The steps of SIFT as tensor ops: scale space, keypoints, descriptors."""

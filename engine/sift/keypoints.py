@@ -1,0 +1,233 @@
+"""Keypoints: extrema of differences of Gaussians over position and scale, and the choice among them.
+
+An extremum is refined by a quadratic; what is of low contrast or lies along an edge is dropped (Lowe's tests).
+"""
+
+import threading
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from engine import device
+from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan, gaussian_levels, reach_px
+
+Array = NDArray[Any]
+
+_BORDER = 4  # octave pixels along the edge that carry no keypoint
+_EDGE_RATIO = 10.0
+_EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
+_PART_PX = 200_000  # pixels of an octave from which on a thread of its own pays
+_MOVES = 2  # times that a keypoint may move to a neighbouring voxel
+_MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Keypoints in the pixels of their octave."""
+
+    octave: Tensor  # int64, as image and level
+    image: Tensor
+    level: Tensor
+    x: Tensor
+    y: Tensor
+    growth: Tensor  # sigma over the sigma of the octave's first level
+    contrast: Tensor
+    pixel_px: Tensor  # image pixels per octave pixel
+
+    def take(self, index: Tensor) -> "Points":
+        """Return the points of these indices."""
+        fields = (self.octave, self.image, self.level, self.x, self.y, self.growth, self.contrast, self.pixel_px)
+        return Points(*(field[index] for field in fields))
+
+    @property
+    def xy_px(self) -> Tensor:
+        """Positions (M, 2) in pixels of the image."""
+        return torch.stack([self.x, self.y], dim=1) * self.pixel_px[:, None]
+
+    @property
+    def scale_px(self) -> Tensor:
+        """Sigmas (M,) in pixels of the image."""
+        return FIRST_SIGMA_PX * self.growth * torch.exp2(self.octave.float())
+
+
+def detect(images: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> tuple[Tensor, Points]:
+    """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges.
+
+    Args:
+        images: (B, H, W) float32; on a CPU one at a time.
+        plan: made for these images.
+        contrast_threshold: Lowe's.
+
+    Returns:
+        The Gaussian levels, flat, which on a CPU the thread's next call overwrites; and the points.
+    """
+    if images.device.type == "cpu":
+        return _detect_compiled(images[0], plan, contrast_threshold)
+    gaussians = gaussian_levels(images, plan)
+    return gaussians, search(gaussians, plan, contrast_threshold)
+
+
+def _detect_compiled(image: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> tuple[Tensor, Points]:
+    """Do :func:`detect` for one image, (H, W), on the CPU."""
+    from engine.kernels import compiled
+
+    gaussians = _buffer(plan.gaussian_size)
+    threshold = contrast_threshold / SCALES
+    limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, _EDGE_RATIO)
+    found, source = [], image.contiguous()
+    for number, octave in enumerate(plan.octaves):
+        height, width, *place, _ = plan.table[number].tolist()
+        voxels = _voxels_compiled(source.numpy(), octave, gaussians.numpy(), tuple(place), _EARLY * threshold)
+        found.append(compiled.refine(gaussians.numpy(), (height, width, *place), voxels, limits, number))
+        source = octave.levels(gaussians)[SCALES, :height:2, 0, :width:2].contiguous()
+    x, y, growth, contrast, level, of = torch.from_numpy(np.concatenate(found)).unbind(1)
+    pixel = torch.exp2(of) / plan.upsample
+    return gaussians, Points(of.long(), torch.zeros_like(of).long(), level.long(), x, y, growth, contrast, pixel)
+
+
+def _voxels_compiled(
+    source: Array, octave: Octave, buffer: Array, place: tuple[int, ...], threshold: float
+) -> Array:
+    """Write an octave's levels and return its extrema, by as many threads as its size is worth."""
+    from engine.kernels import compiled
+
+    (rows, columns), reach = octave.source, tuple(map(reach_px, octave.sigmas))
+    across = compiled.filters(columns, octave.width, octave.sigmas, reach, octave.up)
+    down = compiled.filters(rows, octave.height, octave.sigmas, reach, octave.up)
+
+    def work(part: tuple[int, int]) -> Any:
+        return compiled.search(source, across, down, buffer, place, part, _BORDER, np.float32(threshold))
+
+    parts = device.parts(octave.height, octave.height * octave.width // _PART_PX)
+    return np.concatenate(device.in_parallel(work, parts))
+
+
+_local = threading.local()
+
+
+def _buffer(size: int) -> Tensor:
+    """Return the thread's own memory for a scale space: new pages from the system are a tenth of the work."""
+    buffer: Tensor | None = getattr(_local, "buffer", None)
+    if buffer is None or buffer.numel() < size:
+        buffer = _local.buffer = torch.empty(size)
+    return buffer[:size]
+
+
+def search(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> Points:
+    """Find the points of all octaves in their Gaussian levels, as tensor ops."""
+    threshold = contrast_threshold / SCALES
+    found = [_extrema(gaussians, octave, _EARLY * threshold) for octave in plan.octaves]
+    number = torch.cat([torch.full_like(f[:, 0], n) for n, f in enumerate(found)])
+    level, y, image, x = torch.cat(found).unbind(1)
+    for last in (False,) * _MOVES + (True,):
+        value, gradient, hessian, shift = _fit_quadratic(gaussians, plan, number, level, image, y, x)
+        if not last:
+            step = torch.where(shift.abs() > 0.5, shift.sign(), 0.0).long().unbind(1)
+            x = (x + step[0]).clamp_min_(1).minimum(plan.table[number, 1] - 2)
+            y = (y + step[1]).clamp_min_(1).minimum(plan.table[number, 0] - 2)
+            level = (level + step[2]).clamp_(1, SCALES)
+    contrast = (value + 0.5 * (gradient * shift).sum(1)).abs()
+    xx, yy, _, xy, _, _ = hessian.unbind(1)
+    trace, determinant = xx + yy, xx * yy - xy * xy
+    keep = (contrast >= threshold) & (shift.abs().amax(1) < _MAX_SHIFT)
+    keep &= (determinant > 0) & (trace * trace * _EDGE_RATIO < (_EDGE_RATIO + 1) ** 2 * determinant)
+    growth = torch.exp2((level + shift[:, 2]) / SCALES)
+    pixel = torch.exp2(number.float()) / plan.upsample
+    points = Points(number, image, level, x + shift[:, 0], y + shift[:, 1], growth, contrast, pixel)
+    return points.take(keep.nonzero()[:, 0])
+
+
+def _extrema(gaussians: Tensor, octave: Octave, threshold: float) -> Tensor:
+    """Return (M, 4) level, y, image, x where |DoG| is the largest of its 3 x 3 x 3 and above the threshold."""
+    edge = _BORDER - 1
+    levels = octave.levels(gaussians)[:, edge : octave.height - edge, :, edge : octave.width - edge]
+    if levels.shape[1] < 3 or levels.shape[3] < 3:
+        return torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)
+    size = (levels[1:] - levels[:-1]).abs_()
+    top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
+    top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
+    top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
+    found = (size[1:-1, 1:-1, :, 1:-1] >= top).nonzero()
+    return found + torch.tensor([1, _BORDER, 0, _BORDER], device=gaussians.device)
+
+
+def _fit_quadratic(
+    gaussians: Tensor, plan: ScaleSpacePlan, number: Tensor, level: Tensor, image: Tensor, y: Tensor, x: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Fit D(p) = D + g p + p H p / 2 at voxels: D (M,), g (M, 3), H as (M, 6), and the extremum -H^-1 g (M, 3)."""
+    stencil, neighbours = _quadratic(gaussians.device)
+    _, _, offset, per_level, per_row, per_image = plan.table[number].unbind(1)
+    centre = offset + level * per_level + y * per_row + image * per_image + x
+    s, v, u = neighbours.unbind(1)
+    centre, per_level, per_row = (t.to(plan.index)[:, None] for t in (centre, per_level, per_row))
+    index = centre + s * per_level + v * per_row + u
+    voxels = gaussians.index_select(0, index.flatten()).view(-1, 4, 9)
+    cube = (voxels[:, 1:] - voxels[:, :-1]).view(-1, 27)
+    fit = cube @ stencil
+    gradient, hessian = fit[:, :3], fit[:, 3:]
+    rows = hessian[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
+    adjugate = torch.linalg.cross(rows[:, [1, 2, 0]], rows[:, [2, 0, 1]])
+    determinant = (rows[:, 0] * adjugate[:, 0]).sum(1, keepdim=True)
+    shift = -(gradient[:, None, :] @ adjugate)[:, 0] / torch.where(determinant == 0, 1e-30, determinant)
+    return cube[:, 13], gradient, hessian, shift.clamp(-9, 9)
+
+
+@lru_cache(maxsize=8)
+def _quadratic(where: torch.device) -> tuple[Tensor, Tensor]:
+    """Return (27, 9), Lowe's differences for x, y, s, xx, yy, ss, xy, xs, ys of the neighbours (s, y, x) of a DoG.
+
+    And (36, 3) int32, the Gaussians (s, y, x) that they are differences of: one level more.
+    """
+    gaussians = np.stack(np.meshgrid([-1, 0, 1, 2], [-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(36, 3)
+    s, y, x = gaussians[:27].T
+
+    def first(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        return np.asarray(a / 2 * (b == 0) * (c == 0))
+
+    def second(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        return np.asarray(np.where(a == 0, -2.0, 1.0) * (b == 0) * (c == 0))
+
+    def cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        return np.asarray(a * b / 4 * (c == 0))
+
+    columns = [first(x, y, s), first(y, s, x), first(s, x, y), second(x, y, s), second(y, s, x), second(s, x, y)]
+    columns += [cross(x, y, s), cross(x, s, y), cross(y, s, x)]
+    stencil = torch.from_numpy(np.stack(columns, 1).astype(np.float32)).to(where)
+    return stencil, torch.from_numpy(gaussians.astype(np.int32)).to(where)
+
+
+def allowed(points: Points, mask: Tensor) -> Tensor:
+    """Return the indices of the points whose nearest pixel is True in mask (B, 1, H, W)."""
+    x = (points.x * points.pixel_px).round().long().clamp_(0, mask.shape[3] - 1)
+    y = (points.y * points.pixel_px).round().long().clamp_(0, mask.shape[2] - 1)
+    return mask[points.image, 0, y, x].nonzero()[:, 0]
+
+
+def strongest(points: Points, plan: ScaleSpacePlan, max_keypoints: int, spread: int) -> Tensor:
+    """Return the indices of the points to keep, ordered by image and then by precedence.
+
+    Of two keypoints of like contrast the coarser is the surer: what counts is contrast times the root of scale.
+    """
+    order = (points.contrast * points.scale_px.sqrt()).argsort(descending=True, stable=True)
+    octave = plan.octaves[0]
+    image = points.image[order]
+    x = (points.x * points.pixel_px)[order] * (plan.upsample * spread / octave.width)
+    y = (points.y * points.pixel_px)[order] * (plan.upsample * spread / octave.height)
+    cell = (image * spread + y.long().clamp_(0, spread - 1)) * spread + x.long().clamp_(0, spread - 1)
+    share = 2 * max_keypoints / spread**2
+    crowded = rank(cell) >= share if spread > 1 else torch.zeros_like(image, dtype=torch.bool)
+    precedence = (image * 2 + crowded).argsort(stable=True)
+    return order[precedence][rank(image[precedence]) < max_keypoints]
+
+
+def rank(group: Tensor) -> Tensor:
+    """Return for each element how many before it are of the same group."""
+    order = group.argsort(stable=True)
+    ordered = group[order]
+    place = torch.arange(group.numel(), device=group.device)
+    return torch.empty_like(group).scatter_(0, order, place - torch.searchsorted(ordered, ordered))

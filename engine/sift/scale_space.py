@@ -1,0 +1,148 @@
+"""Scale space: all Gaussian levels of a batch of images, octave by octave, in one flat buffer.
+
+Every level is ``G_y I G_x^T``; upsampling is part of G, so that no interpolation comes before the blur. As tensor
+ops G is a banded matrix that is cut into blocks for the matmul; :mod:`engine.kernels.compiled` has the same
+weights as a filter.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SCALES = 3  # DoG levels searched per octave, Lowe's s
+_LEVELS = SCALES + 3  # Gaussian levels per octave
+_CAMERA_SIGMA_PX = 0.5  # blur that an image is taken to have
+FIRST_SIGMA_PX = 0.8  # sigma of the first Gaussian level, in pixels of the image
+_TRUNCATE = 3.0  # a Gaussian's reach in sigmas
+_BLOCK = 16  # input samples per block of a banded matrix
+_MIN_OCTAVE = 12
+
+
+@dataclass(frozen=True, slots=True)
+class _Band:
+    """Gaussian filters of all levels along one axis, cut into the blocks of a banded matrix."""
+
+    blocks: Tensor  # (blocks, levels, outputs, inputs)
+    reach: int  # inputs that a block takes on either side of its own
+
+    @property
+    def padded(self) -> int:
+        return self.blocks.shape[0] * _BLOCK + 2 * self.reach
+
+
+def reach_px(sigma: float) -> int:
+    """Return how far a Gaussian is taken, in pixels of what it blurs."""
+    return math.ceil(_TRUNCATE * sigma)
+
+
+@lru_cache(maxsize=128)
+def _band(inputs: int, sigmas: tuple[float, ...], up: int, device: torch.device) -> _Band:
+    """Return G[l, i, j] ~ exp(-(i / up - j)^2 / (2 sigma_l^2)), rows summing to 1 also at the edges."""
+    outputs = _outputs(inputs, up)
+    reach = reach_px(max(sigmas)) + up - 1
+    rows = _BLOCK * up
+    count = math.ceil(outputs / rows)
+    out = np.arange(count * rows).reshape(count, 1, rows, 1)
+    source = (np.arange(count)[:, None] * _BLOCK + np.arange(-reach, _BLOCK + reach)).reshape(count, 1, 1, -1)
+    spread = np.maximum(np.array(sigmas), 1e-3).reshape(1, -1, 1, 1)
+    near = np.array([reach_px(s) for s in sigmas]).reshape(1, -1, 1, 1)
+    weights = np.exp(-0.5 * ((out / up - source) / spread) ** 2)
+    weights *= (source - out // up >= -near) & (source - out // up < near + up)
+    weights *= (source >= 0) & (source < inputs) & (out < outputs)
+    weights /= np.maximum(weights.sum(-1, keepdims=True), 1e-30)
+    return _Band(torch.from_numpy(weights.astype(np.float32)).to(device), reach)
+
+
+def _outputs(inputs: int, up: int) -> int:
+    return (inputs - 1) * up + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Octave:
+    """Where an octave lies in the flat buffer of Gaussians: levels x rows x images x columns."""
+
+    source: tuple[int, int]  # height and width of the picture that is blurred
+    up: int  # outputs per pixel of it
+    sigmas: tuple[float, ...]  # in its pixels
+    height: int
+    width: int
+    shape: tuple[int, int, int, int]  # with the blocks' padding
+    offset: int
+
+    def levels(self, gaussians: Tensor) -> Tensor:
+        """Return the octave's part of the buffer, (levels, rows, images, columns)."""
+        return gaussians[self.offset : self.offset + math.prod(self.shape)].view(self.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleSpacePlan:
+    """What depends on the images' shape alone."""
+
+    upsample: int
+    octaves: tuple[Octave, ...]
+    gaussian_size: int
+    table: Tensor  # (octaves, 6) int64: height, width, offset, and the strides of level, row and image
+
+    @property
+    def index(self) -> torch.dtype:
+        """The integer that holds every index of the buffer; the shorter one gathers faster."""
+        return torch.int32 if self.gaussian_size < 2**31 else torch.int64
+
+    @property
+    def first_sigma(self) -> float:
+        """Sigma of each octave's first level in pixels of the octave."""
+        return FIRST_SIGMA_PX * self.upsample
+
+
+@lru_cache(maxsize=32)
+def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> ScaleSpacePlan:
+    """Lay out the octaves; kept for the shapes met last, as frames come in one size."""
+    growth = [2.0 ** (level / SCALES) for level in range(_LEVELS)]
+    sigmas = tuple(math.sqrt((FIRST_SIGMA_PX * g) ** 2 - _CAMERA_SIGMA_PX**2) for g in growth)
+    octaves: list[Octave] = []
+    size, source, up = 0, (height, width), upsample
+    while not octaves or min(source) >= _MIN_OCTAVE:
+        height, width = (_outputs(n, up) for n in source)
+        rows, columns = (-(-n // (_BLOCK * up)) * _BLOCK * up for n in (height, width))
+        shape = (_LEVELS, rows, batch, columns)
+        octaves.append(Octave(source, up, sigmas, height, width, shape, size))
+        size += math.prod(shape)
+        sigmas = tuple(FIRST_SIGMA_PX * upsample * math.sqrt(g**2 - 1) for g in growth)
+        source, up = ((height + 1) // 2, (width + 1) // 2), 1
+    table = [
+        (o.height, o.width, o.offset, math.prod(o.shape[1:]), math.prod(o.shape[2:]), o.shape[3]) for o in octaves
+    ]
+    return ScaleSpacePlan(upsample, tuple(octaves), size, torch.tensor(table, device=device))
+
+
+def gaussian_levels(images: Tensor, plan: ScaleSpacePlan) -> Tensor:
+    """Return all Gaussian levels of all octaves, flat, from images (B, H, W)."""
+    gaussians = images.new_empty(plan.gaussian_size)
+    for octave in plan.octaves:
+        images = _blur(images, octave, gaussians)[SCALES, :, ::2, ::2]
+    return gaussians
+
+
+def _blur(images: Tensor, octave: Octave, gaussians: Tensor) -> Tensor:
+    """Write the octave's levels G_y I G_x^T into their place and return them as (L, B, height, width)."""
+    batch, height, width = images.shape
+    across, down = (_band(n, octave.sigmas, octave.up, images.device) for n in (width, height))
+    count, levels, size, _ = across.blocks.shape
+    wide = images.new_zeros(height, batch, across.padded)
+    wide[..., across.reach : across.reach + width] = images.transpose(0, 1)
+    across_windows = wide.view(height * batch, -1).unfold(1, _BLOCK + 2 * across.reach, _BLOCK).transpose(0, 1)
+    tall = images.new_zeros(down.padded, batch, count, size)
+    inner = tall[down.reach : down.reach + height]
+    down_windows = tall.flatten(1).unfold(0, _BLOCK + 2 * down.reach, _BLOCK).transpose(1, 2)
+    out = octave.levels(gaussians)
+    for level in range(levels):
+        rows = torch.bmm(across_windows, across.blocks[:, level].mT)
+        inner.copy_(rows.view(count, height, batch, size).permute(1, 2, 0, 3))
+        torch.bmm(
+            down.blocks[:, level], down_windows, out=out[level].view(len(down_windows), -1, batch * count * size)
+        )
+    return out.transpose(1, 2)[..., : octave.height, : octave.width]

@@ -1,0 +1,314 @@
+"""The values that travel through the engine: frames and priors in, fixes or refusals out.
+
+All are frozen and slotted. Names carry their units; a position never travels without its covariance.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import DtypeError, OptionError, ShapeError, TelemetryError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MAX_SIGMA_M = 1e6
+"""Largest uncertainty of a position or of a map: no map is wider."""
+
+
+def _check_finite(name: str, value: float | None) -> None:
+    if value is not None and not math.isfinite(value):
+        raise TelemetryError(f"{name}: expected a finite number or None, got {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """How the body (forward-right-down) is turned, in aerospace order: yaw, then pitch, then roll.
+
+    Convention:
+        ``heading_deg`` clockwise from true north in [0, 360); ``pitch_deg`` positive nose up;
+        ``roll_deg`` positive right side down.
+    """
+
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float
+
+
+# What is a finite number in every frame, or unknown.
+_FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture and what the vehicle knew when it was taken.
+
+    Attributes:
+        image: (H, W) grey or (H, W, 3) RGB, uint8, numpy or torch.
+        timestamp_ns: capture time on the vehicle's clock, or None.
+        height_agl_m: height above the ground, positive, or None where unknown.
+        heading_deg: clockwise from true north, or None where unknown.
+        roll_deg: positive right side down; None is taken as level.
+        pitch_deg: positive nose up; None is taken as level.
+        east_velocity_mps: velocity over ground, or None where unknown.
+        north_velocity_mps: velocity over ground, or None where unknown.
+
+    Raises:
+        ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
+        DtypeError: the image is not uint8.
+        TelemetryError: a number is not finite, or the height is not positive.
+    """
+
+    image: NDArray[np.uint8] | Tensor
+    timestamp_ns: int | None = None
+    height_agl_m: float | None = None
+    heading_deg: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    east_velocity_mps: float | None = None
+    north_velocity_mps: float | None = None
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.image.shape)
+        if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3) or 0 in shape:
+            raise ShapeError(f"image: expected (H, W) or (H, W, 3) with at least one pixel, got {shape}")
+        if str(self.image.dtype).removeprefix("torch.") != "uint8":
+            raise DtypeError(f"image: expected uint8, got {self.image.dtype}")
+        for name in _FINITE:
+            _check_finite(name, getattr(self, name))
+        if self.height_agl_m is not None and self.height_agl_m <= 0:
+            raise TelemetryError(f"height_agl_m: expected a height above 0 m, got {self.height_agl_m}")
+
+    @property
+    def attitude(self) -> Attitude | None:
+        """The attitude with unknown roll and pitch taken as level, or None where the heading is unknown."""
+        if self.heading_deg is None:
+            return None
+        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.heading_deg % 360.0 % 360.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prior:
+    """Where the vehicle is believed to be when a frame is taken.
+
+    Give either ``lat_deg`` and ``lon_deg`` (WGS84) or ``east_m`` and ``north_m`` (about the map's origin).
+
+    Attributes:
+        sigma_m: one standard deviation of the position, per axis.
+        moved_east_m: how far the vehicle moved since the last frame; eq. 4 and 5 add it to the window.
+        moved_north_m: the same to the north.
+
+    Raises:
+        OptionError: the position is missing, doubled or not finite, or sigma_m is negative.
+    """
+
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    east_m: float | None = None
+    north_m: float | None = None
+    sigma_m: float
+    moved_east_m: float = 0.0
+    moved_north_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        geographic = self.lat_deg is not None and self.lon_deg is not None
+        local = self.east_m is not None and self.north_m is not None
+        given = [v for v in (self.lat_deg, self.lon_deg, self.east_m, self.north_m) if v is not None]
+        if geographic == local or len(given) != 2:
+            raise OptionError("prior: expected either lat_deg and lon_deg or east_m and north_m")
+        if not all(map(math.isfinite, given)):
+            raise OptionError(f"prior: expected a finite position, got {tuple(given)}")
+        if self.lat_deg is not None and self.lon_deg is not None:
+            if abs(self.lat_deg) > 90:
+                raise OptionError(f"lat_deg: expected -90 to 90, got {self.lat_deg}")
+            if abs(self.lon_deg) > 360:
+                raise OptionError(f"lon_deg: expected -360 to 360, got {self.lon_deg}")
+        if not (math.isfinite(self.moved_east_m) and math.isfinite(self.moved_north_m)):
+            raise OptionError(f"moved: expected finite metres, got {self.moved_east_m}, {self.moved_north_m}")
+        if not (math.isfinite(self.sigma_m) and self.sigma_m >= 0):
+            raise OptionError(f"sigma_m: expected 0 m or more, got {self.sigma_m}")
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A crop of the map, in whole map pixels: columns [x0, x0 + width_px), rows [y0, y0 + height_px)."""
+
+    x0: int
+    y0: int
+    width_px: int
+    height_px: int
+
+    @property
+    def area_px(self) -> int:
+        """Number of pixels inside."""
+        return self.width_px * self.height_px
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """The highest place of a correlation surface.
+
+    Attributes:
+        x: sub-pixel column of the best shift of the template in the window.
+        y: sub-pixel row of the same.
+        score: NCC at the best whole pixel, in [-1, 1].
+        second_score: the highest NCC outside the peak's exclusion zone, or -1 where nothing lies outside.
+        curvature: (2, 2) second derivatives of the score at the peak, per square pixel (negative definite).
+    """
+
+    x: float
+    y: float
+    score: float
+    second_score: float
+    curvature: NDArray[np.float64]
+
+
+class Reason(enum.Enum):
+    """Why a frame was refused."""
+
+    NO_TEXTURE = "no_texture"
+    OUTSIDE_MAP = "outside_map"
+    AMBIGUOUS = "ambiguous"
+    LOW_SCORE = "low_score"
+    TOO_FEW_MATCHES = "too_few_matches"
+    BAD_POSE = "bad_pose"
+    INCONSISTENT = "inconsistent"
+    UNCONFIRMED = "unconfirmed"
+    NO_HEIGHT = "no_height"
+    NO_HEADING = "no_heading"
+    MAP_TOO_LARGE = "map_too_large"
+    TILTED = "tilted"
+    LATE = "late"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Timings:
+    """Milliseconds spent in each stage, in the order in which the stages ran."""
+
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def total_ms(self) -> float:
+        """Sum over the stages."""
+        return sum(self.stages_ms.values())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """A position with its covariance, for the moment at which the frame was taken.
+
+    Attributes:
+        timestamp_ns: capture time of the frame, or None where the frame had none.
+        lat_deg: WGS84 latitude of the camera.
+        lon_deg: WGS84 longitude of the camera.
+        east_m: east of the map's origin.
+        north_m: north of the map's origin.
+        up_m: height of the camera in the surface model's datum (above flat ground where there is none);
+            None where the method does not measure height.
+        covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None its up entry is that of the height
+            that the frame came with.
+        attitude: what the method measured, or None where it measures none. Where NCC's peak was searched for over
+            headings or heights and not refined, only the heading is; roll and pitch are the frame's, or 0.
+        score: NCC in [-1, 1], or for SIFT the share of matches that agree with the pose.
+        method: "ncc" or "sift".
+        window: the crop of the map that was searched.
+        timings: milliseconds per stage.
+        map_xy_px: the camera's nadir in map pixels (x, y).
+        stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "refined" in all of the
+            pose, "verified" by both methods.
+        confidence: probability in (0, 1) that the place is right, as ``docs/integrity.md`` says; None where NCC
+            searched the map, the heading or the height, for which none was fitted.
+    """
+
+    timestamp_ns: int | None
+    lat_deg: float
+    lon_deg: float
+    east_m: float
+    north_m: float
+    up_m: float | None
+    covariance_m2: NDArray[np.float64]
+    attitude: Attitude | None
+    score: float
+    method: str
+    window: Window
+    timings: Timings
+    map_xy_px: tuple[float, float]
+    stage: str = "fine"
+    confidence: float | None = None
+
+    @property
+    def sigma_m(self) -> float:
+        """Horizontal standard deviation, the larger of the two axes of the ellipse."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2[:2, :2])[-1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoFix:
+    """A refusal: the frame gave no position that can be trusted, and why.
+
+    Attributes:
+        reason: the rule that refused.
+        detail: one sentence with the figures behind the reason.
+        timestamp_ns: capture time of the frame, or None where the frame had none.
+        method: the method that refused, or None where none was tried.
+        score: the score that was reached, or None where matching did not get so far.
+        window: the crop that was searched, or None.
+        timings: milliseconds per stage that ran.
+    """
+
+    reason: Reason
+    detail: str = ""
+    timestamp_ns: int | None = None
+    method: str | None = None
+    score: float | None = None
+    window: Window | None = None
+    timings: Timings = field(default_factory=Timings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Where the vehicle really was at one moment; what is unknown is None.
+
+    Attributes:
+        timestamp_ns: on the clock of the frames.
+        lat_deg: WGS84 latitude.
+        lon_deg: WGS84 longitude.
+        alt_amsl_m: height above mean sea level.
+        height_agl_m: height above the ground.
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+        heading_deg: clockwise from true north.
+    """
+
+    timestamp_ns: int
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float | None = None
+    height_agl_m: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    heading_deg: float | None = None
+
+
+Result = Fix | NoFix
+"""What a frame ends in."""
+
+
+def check_positive(options: object, *names: str) -> None:
+    """Refuse options of which one is not a finite number above 0.
+
+    Raises:
+        OptionError: names the first that is not.
+    """
+    for name in names:
+        value = getattr(options, name)
+        if not (math.isfinite(value) and value > 0):
+            raise OptionError(f"{name}: expected a number above 0, got {value}")
