@@ -9,8 +9,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from engine.cli.simulate import LoopSettings, WorldSettings, run_closed_loop
 from engine.device import set_threads
+from engine.runs.simulation import LoopSettings, WorldSettings, run_closed_loop
 
 FLIGHTS = (
     ("noon", "ncc", "none"),

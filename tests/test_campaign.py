@@ -17,16 +17,16 @@ import pytest
 
 from engine import OptionError
 from engine.cli.app import run
-from engine.cli.campaign import _prepare
-from engine.cli.campaign_plan import Campaign, _fingerprint, plan_campaign
-from engine.cli.demo import write_flight
-from engine.cli.executors import in_processes
-from engine.cli.jobs import read_result
 from engine.errors import TelemetryError
 from engine.formats.logs.readers import LogClock
 from engine.formats.settings import read_settings
 from engine.formats.track import read_track
 from engine.report.campaign import Line, pooled, write_tables
+from engine.runs.campaign import _prepare
+from engine.runs.campaign_plan import Campaign, _fingerprint, plan_campaign
+from engine.runs.demo import write_flight
+from engine.runs.executors import in_processes
+from engine.runs.jobs import read_result
 from engine.sim import plan_flight
 
 pytestmark = pytest.mark.timeout(900)  # a dozen processes, on a machine that may be busy

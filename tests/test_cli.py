@@ -18,11 +18,11 @@ import rasterio
 import torch
 from PIL import Image
 
-from engine.cli import track as track_module
 from engine.cli.app import run
-from engine.cli.demo import write_flight
 from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
+from engine.runs import tracking as track_module
+from engine.runs.demo import write_flight
 from engine.sim import plan_flight
 
 COLUMNS = (

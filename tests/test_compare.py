@@ -9,12 +9,12 @@ from PIL import Image
 
 from engine import OptionError
 from engine.cli.app import run
-from engine.cli.compare import USUAL, parse_runs
-from engine.cli.demo import write_flight
-from engine.cli.track import Settings, folder_inputs, run_track
 from engine.formats.logs.readers import LogClock
 from engine.formats.track import read_track
 from engine.report.comparison import draw_comparison
+from engine.runs.comparison import USUAL, parse_runs
+from engine.runs.demo import write_flight
+from engine.runs.tracking import Settings, folder_inputs, run_track
 from engine.sim import plan_flight
 
 
@@ -86,8 +86,8 @@ def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp
 
 def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr("engine.cli.compare.run_compare", lambda inputs, *_, **__: told.append(inputs) or {})
-    monkeypatch.setattr("engine.cli.compare.print_comparison", lambda *_: None)
+    monkeypatch.setattr("engine.runs.comparison.run_compare", lambda inputs, *_, **__: told.append(inputs) or {})
+    monkeypatch.setattr("engine.runs.comparison.print_comparison", lambda *_: None)
     log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
     options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}", f"--frame-stamps={stamps}"]
     assert run(command(flight, tmp_path, *options, "--log-offset-s=-1.5", "--image-topic=/down")) == 0

@@ -17,9 +17,6 @@ from rasterio.warp import reproject
 
 from engine import Camera
 from engine.cli.app import run
-from engine.cli.campaign_plan import RecordedFlight, plan_campaign
-from engine.cli.dataset import check_flight
-from engine.cli.track import Settings, run_track
 from engine.formats.datasets.alto import EPSG
 from engine.formats.datasets.mosaic import Mosaic, Piece, write_mosaic
 from engine.formats.geotiff import write_geotiff
@@ -29,6 +26,9 @@ from engine.formats.truth_checks import check_truth
 from engine.geo import LocalFrame, ecef_from_geodetic, enu_from_body
 from engine.maps.rasters import open_source
 from engine.report.published import PUBLISHED, published_cells
+from engine.runs.campaign_plan import RecordedFlight, plan_campaign
+from engine.runs.dataset_import import check_flight
+from engine.runs.tracking import Settings, run_track
 from engine.sim import picture_at, plan_flight
 from engine.values import Attitude, Truth
 
@@ -560,7 +560,7 @@ def test_frames_without_truth_are_counted_and_the_telemetrys_heading_is_judged()
 
 
 def test_the_command_says_what_it_finds_and_leaves_with_one(plan, frames, truth, tmp_path, capsys):
-    from engine.cli.demo import write_flight
+    from engine.runs.demo import write_flight
 
     write_flight(tmp_path, plan)
     assert run(["dataset", "check", str(tmp_path)]) == 0

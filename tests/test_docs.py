@@ -11,12 +11,12 @@ from typer.main import get_command
 import engine
 from docs.site_roles import on_page_content
 from engine.cli.app import app
-from engine.cli.demo import write_flight
 from engine.formats.track import COLUMNS
 from engine.integrity import AssumedErrors, PeakRule
 from engine.methods.sift import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.pose import PoseOptions
+from engine.runs.demo import write_flight
 from engine.sim import plan_flight
 from engine.values import Reason
 

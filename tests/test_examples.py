@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.cli.demo import write_flight
 from engine.formats.flight import open_flight
 from engine.formats.truth import read_truth
+from engine.runs.demo import write_flight
 from engine.sim import plan_flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

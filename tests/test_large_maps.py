@@ -15,9 +15,9 @@ from rich.console import Console
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
 from engine.cli import console
 from engine.cli.app import run
-from engine.cli.checks import check_start
 from engine.maps import metric_copy
 from engine.maps.rasters import GrayReader
+from engine.runs.checks import check_start
 from engine.values import Window
 
 SIDE = 17_000

@@ -15,15 +15,15 @@ from bench import browser
 from engine import Frame, Navigator, NoFix, Prior, Reason, SceneMatcher
 from engine.adapters.ros import RosBridge
 from engine.adapters.ros_out import RosOptions
-from engine.cli import watching
 from engine.cli.app import run
-from engine.cli.demo import write_flight
-from engine.cli.track import Settings, run_track
-from engine.cli.watching import Watching
 from engine.formats.ros.messages import MessageFactory
 from engine.formats.track import read_track
 from engine.live import Answer
 from engine.navigator import NavigatorState
+from engine.runs import watching
+from engine.runs.demo import write_flight
+from engine.runs.tracking import Settings, run_track
+from engine.runs.watching import Watching
 from engine.sim import plan_flight
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -298,7 +298,7 @@ def test_a_simulated_flight_that_nobody_flies_has_no_view(capsys):
 
 
 def test_nothing_of_rerun_is_loaded_where_nobody_watches():
-    script = "import sys, engine.cli.track, engine.cli.simulate, engine.cli.bridge; print('rerun' in sys.modules)"
+    script = "import sys, engine.runs.tracking, engine.runs.simulation, engine.runs.mavlink_bridge; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

@@ -23,7 +23,6 @@ from bench.log_files import (
     write_dataflash,
 )
 from engine.cli.app import run
-from engine.cli.demo import write_flight
 from engine.errors import OptionError, TelemetryError
 from engine.formats.flight import open_flight
 from engine.formats.logs.readers import LogClock, open_log, open_truth, stamp_frames
@@ -31,6 +30,7 @@ from engine.formats.resampling import MAX_GAP_NS, Log, interpolate, make_series,
 from engine.formats.telemetry import read_telemetry
 from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
+from engine.runs.demo import write_flight
 from engine.sim import plan_flight
 
 

@@ -5,9 +5,9 @@ from dataclasses import fields
 
 import pytest
 
-from engine.cli.record import Record, read_record
 from engine.errors import OptionError, TelemetryError
 from engine.formats.settings import nested
+from engine.runs.record import Record, read_record
 
 RECORD = Record(
     map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,

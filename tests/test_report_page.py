@@ -10,8 +10,6 @@ from PIL import Image
 
 from bench.browser import missing, open_browser
 from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.cli.demo import write_flight
-from engine.cli.track import Settings, run_evaluate, run_track
 from engine.formats.notes import Note, note_of, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
@@ -24,6 +22,8 @@ from engine.report.explain import choose_frames
 from engine.report.metrics import Errors, Ground, summarise
 from engine.report.page import FinishedTrack, write_page
 from engine.report.verdict import MEANINGS, verdict_of
+from engine.runs.demo import write_flight
+from engine.runs.tracking import Settings, run_evaluate, run_track
 from engine.sim import plan_flight
 from engine.values import Reason, Window
 

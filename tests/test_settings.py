@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from engine import OptionError
-from engine.cli.track import Settings, settings_from
 from engine.formats.settings import changed, meanings_of, options_from_mapping, read_settings, settings_text
 from engine.methods.sift import SiftOptions
 from engine.navigator import NavigatorOptions
+from engine.runs.tracking import Settings, settings_from
 
 KEY = re.compile(r"^#(\w+ = )", re.MULTILINE)
 

@@ -97,8 +97,8 @@ def mavlink(
     Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
     played at their own pace, until they end.
     """
-    from engine.cli.bridge import BridgeFiles, LinkSettings, MatchSettings, run_bridge
-    from engine.cli.watching import Watching
+    from engine.runs.mavlink_bridge import BridgeFiles, LinkSettings, MatchSettings, run_bridge
+    from engine.runs.watching import Watching
 
     use_threads(threads)
     inputs = BridgeFiles(map_path, surface, camera, frames, telemetry, source, rate, grab, map_sigma)
@@ -125,7 +125,7 @@ def mavlink_params(
 
     Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
     """
-    from engine.cli.bridge import write_parameters
+    from engine.runs.mavlink_bridge import write_parameters
 
     write_parameters(firmware, message, out, delay_ms=delay, max_sigma_m=max_sigma, force=force)
 
@@ -183,9 +183,9 @@ def ros(
     An empty name of a topic leaves it out.
     """
     from engine.adapters.ros import Topics
-    from engine.cli.bridge import MatchSettings
-    from engine.cli.bridge_ros import RosFiles, run_bridge_ros
-    from engine.cli.watching import Watching
+    from engine.runs.mavlink_bridge import MatchSettings
+    from engine.runs.ros_bridge import RosFiles, run_bridge_ros
+    from engine.runs.watching import Watching
 
     use_threads(threads)
     topics = Topics(

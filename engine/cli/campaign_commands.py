@@ -34,8 +34,8 @@ def campaign(
     Each flight by each method is a run in a process of its own, with one thread. The same command goes on where an
     earlier one ended, for whatever reason it did.
     """
-    from engine.cli.campaign import run_campaign
     from engine.report.campaign import POOL_COLUMNS, pool_cells, pooled
+    from engine.runs.campaign import run_campaign
 
     lines = run_campaign(file, out, workers=workers, ray=ray, force=force)
     if as_json:

@@ -67,8 +67,8 @@ def import_dataset(
     Links its pictures, lays its map together, and says what could not be known and what is doubtful about its
     truth. Single photographs become flights of one frame each, with a campaign's file that lists them.
     """
-    from engine.cli.dataset import SINGLES, Choice, run_import, run_import_singles
     from engine.formats.datasets.recording import ImportOptions
+    from engine.runs.dataset_import import SINGLES, Choice, run_import, run_import_singles
 
     of_singles = {"reference": reference, "max_tilt_deg": max_tilt, "limit": limit}
     added = {
@@ -113,7 +113,7 @@ def check(
 
     Exits with 1 where something was found.
     """
-    from engine.cli.dataset import check_flight, print_findings
+    from engine.runs.dataset_import import check_flight, print_findings
 
     findings = check_flight(directory, max_speed)
     if as_json:

@@ -51,7 +51,7 @@ def demo(
     Draws a town and the paper's flight over it, follows it with NCC and SIFT, each in the paper's own recipe
     and as this engine does it, and prints the paper's Table I beside the results. Needs no data.
     """
-    from engine.cli.demo import run_demo
+    from engine.runs.demo import run_demo
 
     use_threads(threads)
     run_demo(out, frames=frames, seed=seed, device=device, force=force, as_json=as_json)
@@ -111,8 +111,8 @@ def track(
     Writes track.csv (one row a frame), summary.json and figures into the output folder. Without --start the
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
-    from engine.cli.track import FlightFiles, camera_or_bag, parse_clock, run_track, settings_from
-    from engine.cli.watching import Watching
+    from engine.runs.tracking import FlightFiles, camera_or_bag, parse_clock, run_track, settings_from
+    from engine.runs.watching import Watching
 
     use_threads(threads)
     clock = parse_clock(frame_stamps, log_offset)
@@ -159,8 +159,8 @@ def compare(
     Follows the flight once a run, each into a folder of its own as track does, and tells them apart in one table
     and one chart.
     """
-    from engine.cli.compare import parse_runs, print_comparison, run_compare
-    from engine.cli.track import FlightFiles, parse_clock
+    from engine.runs.comparison import parse_runs, print_comparison, run_compare
+    from engine.runs.tracking import FlightFiles, parse_clock
 
     use_threads(threads)
     wanted = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
@@ -214,7 +214,7 @@ def locate(
 
     Prints a fix and exits with 0, or prints why there is none and exits with 1.
     """
-    from engine.cli.locate import Known, run_locate
+    from engine.runs.single_frame import Known, run_locate
 
     use_threads(threads)
     known = Known(height_agl, heading, roll, pitch, near)
@@ -271,8 +271,8 @@ def simulate(
     folder holds its track, estimate, figures and summary too.
     """
     from engine.cli.arguments import refuse_given
-    from engine.cli.simulate import LoopSettings, WorldSettings, run_closed_loop, run_simulate
-    from engine.cli.watching import Watching
+    from engine.runs.simulation import LoopSettings, WorldSettings, run_closed_loop, run_simulate
+    from engine.runs.watching import Watching
 
     use_threads(threads)
     scene = WorldSettings(seed=seed, condition=condition, relief_m=relief, map=map_path, surface=surface)
@@ -306,7 +306,7 @@ def evaluate(
 
     Prints the errors and rewrites the folder's summary.json and figures.
     """
-    from engine.cli.track import run_evaluate
+    from engine.runs.tracking import run_evaluate
 
     console.report(run_evaluate(directory, truth), as_json, title=f"track in {directory}", out=directory)
 
@@ -328,7 +328,7 @@ def export(
 
     Refused frames leave gaps. Times of day are written where the frames' stamps are UTC.
     """
-    from engine.cli.export import run_export
+    from engine.runs.track_export import run_export
 
     console.facts(
         run_export(directory, kind, out, truth=truth, force=force), as_json, title=f"track in {directory}"
@@ -351,6 +351,6 @@ def bag(
 
     With pictures, calibration, telemetry and truth under the names that a camera driver and MAVROS use.
     """
-    from engine.cli.bag import run_bag
+    from engine.runs.bag_conversion import run_bag
 
     console.facts(run_bag(directory, out, kind, force=force), as_json, title=f"flight in {directory}")

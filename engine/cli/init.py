@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from engine.cli import console
-from engine.cli.track import Settings
 from engine.errors import OptionError
 from engine.formats.settings import settings_text
+from engine.runs.tracking import Settings
 
 _HEAD = """\
 # Settings of scenematch: every option with its default. Take the # off a key to change it; what stays commented

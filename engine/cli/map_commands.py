@@ -69,7 +69,7 @@ def audit(
     availability along it is predicted, and its poor stretches are listed. A huge map is audited in part: around a
     place, along the route, or both.
     """
-    from engine.cli.audit import AuditFiles, run_audit
+    from engine.runs.map_audit import AuditFiles, run_audit
 
     use_threads(threads)
     inputs = AuditFiles(map_path, surface, camera, route, other, height_agl, around, corridor)

@@ -10,10 +10,10 @@ from typing import Any
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_choice, check_device, open_map, parse_position
-from engine.cli.checks import check_place
 from engine.errors import OptionError
 from engine.formats.frames import read_image
 from engine.matcher import METHODS, SceneMatcher
+from engine.runs.checks import check_place
 from engine.values import Fix, Frame, NoFix
 
 

@@ -23,12 +23,12 @@ from engine.cli.arguments import (
     parse_position,
     refuse_given,
 )
-from engine.cli.checks import check_place
-from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.live import LiveOptions
 from engine.matcher import METHODS, SceneMatcher
 from engine.orthomap import OrthoMap
+from engine.runs.checks import check_place
+from engine.runs.watching import Watching, watched_beside
 
 if TYPE_CHECKING:
     from engine.adapters.mavlink import Bridge, Status

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.cli.simulate import WorldSettings, run_simulate
-from engine.cli.track import FlightFiles, Settings, run_track
 from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
 from engine.report.campaign import are_figures, are_times
+from engine.runs.simulation import WorldSettings, run_simulate
+from engine.runs.tracking import FlightFiles, Settings, run_track
 
 RESULT, LOG = "result.json", "log.txt"
 _TIMES = ("latency_ms", "deadlines_missed", "settings")

@@ -12,15 +12,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 from engine.cli.arguments import check_choice
-from engine.cli.compare import Run, parse_runs
-from engine.cli.jobs import Draw, Follow, Job
-from engine.cli.simulate import WorldSettings
-from engine.cli.track import FlightFiles, folder_inputs
 from engine.errors import OptionError
 from engine.formats.datasets.recording import ABOUT
 from engine.formats.logs.readers import AS_LOGGED, LogClock
 from engine.formats.settings import read_settings
 from engine.maps.rasters import GEOREFERENCE_TAG, stated_sigma
+from engine.runs.comparison import Run, parse_runs
+from engine.runs.jobs import Draw, Follow, Job
+from engine.runs.simulation import WorldSettings
+from engine.runs.tracking import FlightFiles, folder_inputs
 from engine.sim import CONDITIONS
 from engine.sim.town import RELIEF_MAX_M
 

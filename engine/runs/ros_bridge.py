@@ -11,12 +11,12 @@ from engine.adapters.vehicle import Origin
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import named_as_typed, open_map, parse_position
-from engine.cli.bridge import MatchSettings
-from engine.cli.checks import check_place
-from engine.cli.watching import Watching, watched_beside
 from engine.errors import BackendError, CalibrationError, OptionError
 from engine.formats.ros.messages import camera_of
 from engine.matcher import SceneMatcher
+from engine.runs.checks import check_place
+from engine.runs.mavlink_bridge import MatchSettings
+from engine.runs.watching import Watching, watched_beside
 
 _PATIENCE_S = 30.0
 

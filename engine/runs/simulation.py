@@ -14,9 +14,6 @@ import numpy as np
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_choice, check_device, check_folder, prepare_folder
-from engine.cli.demo import START_SIGMA_M, write_flight
-from engine.cli.track import OWNED
-from engine.cli.watching import Watching, watched
 from engine.errors import OptionError
 from engine.formats.flight import write_flight_folder
 from engine.formats.track import TrackRow, read_track, track_row, write_track
@@ -26,6 +23,9 @@ from engine.orthomap import OrthoMap
 from engine.report.closed_loop import draw_loop, summarise_loop, write_record
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
+from engine.runs.demo import START_SIGMA_M, write_flight
+from engine.runs.tracking import OWNED
+from engine.runs.watching import Watching, watched
 from engine.sim import CONDITIONS, FlightStyle, Town, build_town, picture_at, plan_flight, world_from_map
 from engine.sim.faults import KINDS, Fault
 from engine.sim.flight import grid_at

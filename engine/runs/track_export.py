@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from engine.cli.arguments import check_choice
-from engine.cli.record import read_record
 from engine.errors import OptionError, TelemetryError
 from engine.formats.export import WRITERS, segments
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import TrackRow, read_track
 from engine.formats.truth import interpolate_truth
 from engine.geo import LocalFrame
+from engine.runs.record import read_record
 
 
 def run_export(

@@ -22,9 +22,6 @@ from engine.cli.arguments import (
     parse_position,
     prepare_folder,
 )
-from engine.cli.checks import check_needs, check_pictures, check_place, check_start
-from engine.cli.record import Record, read_record
-from engine.cli.watching import Watching, watched
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.flight import Flight, FlightFrame, open_flight
 from engine.formats.logs.readers import LogClock, is_log, open_truth
@@ -43,6 +40,9 @@ from engine.report.explain import choose_frames, explain_frames
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
 from engine.report.page import FinishedTrack, write_page
+from engine.runs.checks import check_needs, check_pictures, check_place, check_start
+from engine.runs.record import Record, read_record
+from engine.runs.watching import Watching, watched
 from engine.values import Fix, NoFix, Prior, Truth
 
 if TYPE_CHECKING:  # rerun is optional

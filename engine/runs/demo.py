@@ -7,9 +7,9 @@ from typing import Any
 
 from engine.cli import console
 from engine.cli.arguments import check_device, check_folder, prepare_folder
-from engine.cli.compare import CHART, COLUMNS, TABLE, USUAL, cells, parse_runs, run_compare
-from engine.cli.track import FlightFiles, folder_inputs
 from engine.formats.flight import write_flight_folder
+from engine.runs.comparison import CHART, COLUMNS, TABLE, USUAL, cells, parse_runs, run_compare
+from engine.runs.tracking import FlightFiles, folder_inputs
 from engine.sim import FlightPlan, plan_flight
 from engine.sim.town import EXACT
 from engine.values import Prior

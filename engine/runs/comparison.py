@@ -10,12 +10,12 @@ from typing import Any
 
 from engine.cli import console
 from engine.cli.arguments import check_folder, prepare_folder
-from engine.cli.track import FlightFiles, Settings, open_inputs, run_track, settings_from
 from engine.errors import OptionError
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
 from engine.matcher import METHODS
 from engine.report.comparison import draw_comparison
+from engine.runs.tracking import FlightFiles, Settings, open_inputs, run_track, settings_from
 
 TABLE, CHART = "table.json", "comparison.png"
 USUAL = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")

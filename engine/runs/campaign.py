@@ -11,11 +11,11 @@ from pathlib import Path
 
 from engine.cli import console
 from engine.cli.arguments import check_folder
-from engine.cli.campaign_plan import RUNS, WORKSHOP, CampaignPlan, plan_campaign
-from engine.cli.executors import Execute, in_processes, on_ray
-from engine.cli.jobs import Job, do, read_result
 from engine.errors import OptionError
 from engine.report.campaign import TABLE, TABLE_HEAD, Line, write_tables
+from engine.runs.campaign_plan import RUNS, WORKSHOP, CampaignPlan, plan_campaign
+from engine.runs.executors import Execute, in_processes, on_ray
+from engine.runs.jobs import Job, do, read_result
 
 MARKER = "scenematch-campaign.txt"
 """Says of a folder, from its begin on, that a campaign works in it: what is unfinished there may be removed."""
