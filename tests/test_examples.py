@@ -15,7 +15,7 @@ import pytest
 
 from engine.formats.flight import open_flight
 from engine.formats.truth import read_truth
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
