@@ -14,7 +14,7 @@ from bench.conftest import peak_memory_mb
 from bench.scenes import flight, pair
 from engine import Fix, MatcherOptions, SceneMatcher, ncc_fft
 from engine.kernels import reference  # the float64 truth that errors are counted from
-from engine.methods.hypothesis import NccOptions
+from engine.methods.options import NccOptions
 
 SIZES = [
     (96, 64),

@@ -18,8 +18,7 @@ from bench.map_views import map_pairs
 from bench.scenes import flight
 from bench.views import Size, warped_pairs
 from engine import Fix, MatcherOptions, SceneMatcher, device
-from engine.methods.hypothesis import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.methods.options import NccOptions, SiftOptions
 
 SIZES: list[Size] = [(150, 150), (300, 300), (640, 480)]
 BATCH = 16

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, SceneMatcher, Window
-from engine.methods.ncc import NccOptions
+from engine.methods.options import NccOptions
 
 HEIGHT_M = 80.0
 PLANE_DEG = 25.0  # the heading in the plane's axes, by which the pictures are drawn
