@@ -2,7 +2,7 @@
 
 A peak is high over a wrong place too, where streets or furrows run alike. What tells the two apart is how far it
 stands out from chance, how near its best rival comes, and whether the place is where it was expected. One logistic
-function of these gives the probability; its constants were fitted by ``python -m bench.confidence`` on
+function of these gives the probability; its constants were fitted by ``python -m bench.accuracy.confidence`` on
 simulated towns. Votes of the frame's blocks, each on its own shift, were tried there too and added nothing.
 """
 

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from bench.audit import Trial, auc, fit
+from bench.accuracy.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
 from engine.audit.availability import Flag, audit_map, predict, probability
 from engine.audit.plan import AuditOptions, plan_audit

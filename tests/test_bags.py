@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from bench.fuzz_bags import damaged
+from bench.live.fuzz_bags import damaged
 from engine.camera import Camera
 from engine.cli.app import run as main
 from engine.errors import OptionError, TelemetryError

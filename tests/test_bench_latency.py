@@ -5,10 +5,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from bench.burden import hogs
-from bench.endless import GRACE_MS, Flown, Taken, cause, draw, stage_at, summary, there_and_back
-from bench.latency_page import share
-from bench.soak import slope
+from bench.live.burden import hogs
+from bench.live.endless import GRACE_MS, Flown, Taken, cause, draw, stage_at, summary, there_and_back
+from bench.live.soak import slope
+from bench.pages.latency import share
 
 STAGES = {"grey": 1.0, "align": 2.0, "match": 4.0}
 

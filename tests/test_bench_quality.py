@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from bench import quality
-from bench.detectors import detectors
-from bench.flights import attitude_rms_deg, moved_to_middle
-from bench.map_views import map_pairs
-from bench.quality import Keypoints, ViewPair, judge
-from bench.views import by_homography, warped_pairs
+from bench.accuracy import quality
+from bench.accuracy.flights import attitude_rms_deg, moved_to_middle
+from bench.accuracy.quality import Keypoints, ViewPair, judge
+from bench.inputs.map_views import map_pairs
+from bench.inputs.views import by_homography, warped_pairs
+from bench.speed.detectors import detectors
 from engine import Camera, Fix
 from engine.values import Attitude, Timings, Truth
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench import browser
+from bench.pages import browser
 from engine import Frame, Navigator, NoFix, Prior, Reason, SceneMatcher
 from engine.adapters.ros import RosBridge
 from engine.adapters.ros_out import RosOptions

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.log_files import (
+from bench.inputs.log_files import (
     ELSE,
     GPS_MS,
     GPS_WEEK,
@@ -368,7 +368,7 @@ def test_a_ulog_that_leads_its_parser_in_circles_is_refused(tmp_path):
 
 
 def test_mutated_files_are_read_or_refused():
-    from bench.fuzz_logs import fuzz
+    from bench.live.fuzz_logs import fuzz
 
     done = fuzz(count=150, seed=3)
     assert len(done.outcomes) == 8

@@ -453,13 +453,13 @@ def test_keys_are_bytes_or_hexadecimal(tmp_path):
 
 
 def test_hours_of_traffic_leave_nothing_behind():
-    from bench.fuzz_mavlink import growth_bytes
+    from bench.live.fuzz_mavlink import growth_bytes
 
     assert growth_bytes(hours=0.05) < 20_000
 
 
 def test_minutes_of_the_hour_in_which_everything_goes_wrong():
-    from bench.bridge_hour import hour
+    from bench.live.bridge_hour import hour
 
     flown = hour(minutes=1.5, flood_pieces=2000)
     assert flown["due"] > 200
@@ -475,7 +475,7 @@ def test_minutes_of_the_hour_in_which_everything_goes_wrong():
 
 
 def test_random_and_mutated_packets_harm_nothing():
-    from bench.fuzz_mavlink import fuzz
+    from bench.live.fuzz_mavlink import fuzz
 
     assert fuzz(count=3000, seed=5).longest_s < 2.0
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.browser import missing, open_browser
+from bench.pages.browser import missing, open_browser
 from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.formats.notes import Note, note_of, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
