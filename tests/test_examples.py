@@ -8,7 +8,6 @@ import sys
 import time
 import types
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +16,9 @@ from engine.formats.flight import open_flight
 from engine.formats.truth import read_truth
 from engine.runs.demo import write_flight
 from engine.sim import plan_flight
+from tests.support.paths import ROOT
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = ROOT / "examples"
 FRAMES = 8
 
 

@@ -1,6 +1,6 @@
 """A stand-in autopilot that flies a flight folder in real time, for a bridge beside it on the bench.
 
-``python -m bench.live.fly_standin FLIGHT [--port 14550] [--firmware ardupilot|px4] [--seconds S]``, before or after
+``python -m bench.live.fly_standin FLIGHT [--port N] [--firmware ardupilot|px4] [--seconds S]``, before or after
 the bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT holds a ``telemetry.csv``
 and a ``truth.csv`` with heights and attitude, as ``scenematch simulate`` writes them.
 """

@@ -4,7 +4,6 @@ import csv
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +30,7 @@ from engine.runs.dataset_import import check_flight
 from engine.runs.tracking import Settings, run_track
 from engine.sim import picture_at, plan_flight
 from engine.values import Attitude, Truth
+from tests.support.paths import ROOT
 
 CAMERA = Camera.from_fov(300, 300, 60.0)  # the simulated flights'
 GROUND_M = 120.0  # level of the miniatures' ground, above whatever their heights are counted from
@@ -574,7 +574,7 @@ def test_the_command_says_what_it_finds_and_leaves_with_one(plan, frames, truth,
 
 
 def test_the_page_has_the_published_figures_of_the_code():
-    page = (Path(__file__).parents[1] / "docs" / "datasets.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
     for dataset, figures in PUBLISHED.items():
         for one in figures:
             *cells, source = published_cells(one)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from conftest import site_of
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.methods import ncc as ncc_method
 from engine.methods.ncc import NccOptions
 from engine.sim import FlightStyle, SensorNoise, paper_flight
+from tests.support.towns import site_of
 
 EXACT = SensorNoise(
     height_sd_m=0.0, height_drift_sd_m=0.0, heading_sd_deg=0.0, heading_bias_deg=0.0, tilt_sd_deg=0.0,

@@ -46,8 +46,9 @@ from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.values import Fix, NoFix, Reason, Timings, Window
+from tests.support.paths import ROOT
 
-GOLDEN = Path(__file__).parent / "golden" / "mavlink"
+GOLDEN = ROOT / "tests" / "golden" / "mavlink"
 ORIGIN = Origin(33.6400000, 72.9900000, 510.0)
 VEHICLE = Vehicle(
     roll_deg=2.0, pitch_deg=-3.0, heading_deg=270.0, east_velocity_mps=1.0, north_velocity_mps=2.0,
@@ -894,15 +895,14 @@ def wait_until(holds, timeout_s=10.0):
 
 
 def test_the_table_of_traps_names_tests_and_code_that_are_there():
-    page = (Path(__file__).parents[1] / "docs" / "mavlink.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "mavlink.md").read_text(encoding="utf-8")
     rows = [
         line for line in page.split("## The traps", 1)[1].split("\n## ", 1)[0].splitlines() if "`test_" in line
     ]
     assert len(rows) > 12
-    here = set(re.findall(r"^def (test_\w+)", Path(__file__).read_text(encoding="utf-8"), re.MULTILINE))
-    code = "".join(
-        path.read_text(encoding="utf-8") for path in (Path(__file__).parents[1] / "engine").rglob("*.py")
-    )
+    adapters = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py"))
+    here = set(re.findall(r"^def (test_\w+)", adapters, re.MULTILINE))
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "engine").rglob("*.py"))
     for row in rows:
         _, _, where, tests, _ = row.split("|")
         assert set(re.findall(r"`(test_\w+)`", tests)) <= here, row

@@ -298,7 +298,8 @@ def test_a_simulated_flight_that_nobody_flies_has_no_view(capsys):
 
 
 def test_nothing_of_rerun_is_loaded_where_nobody_watches():
-    script = "import sys, engine.runs.tracking, engine.runs.simulation, engine.runs.mavlink_bridge; print('rerun' in sys.modules)"
+    modules = "engine.runs.tracking, engine.runs.simulation, engine.runs.mavlink_bridge"
+    script = f"import sys, {modules}; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

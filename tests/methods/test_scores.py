@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,11 +18,11 @@ from engine.methods import ncc
 from engine.methods.hypothesis import NccOptions
 from engine.methods.query import Query, Stopwatch
 from engine.values import Window
+from tests.support.paths import ROOT
 
 CPU = torch.device("cpu")
 NADIR = np.array([310.0, 305.0])
 PIXELS = 0.5  # the most that a fix may be off, in map pixels
-ROOT = Path(__file__).parents[1]
 
 
 def noise(shape=(60, 63), seed=0, top=256):

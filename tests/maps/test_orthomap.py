@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,15 +20,15 @@ from engine.formats.geotiff import write_geotiff
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
+from tests.support.paths import ROOT, SHARED
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 UTM = "EPSG:32636"
 STEP_M = 0.5
 WEST, NORTH = 686000.0, 3630000.0
 CORNER = Affine(STEP_M, 0.0, WEST, 0.0, -STEP_M, NORTH)
 CENTRED = np.array([[STEP_M, 0.0, WEST + STEP_M / 2], [0.0, -STEP_M, NORTH - STEP_M / 2]])
 
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the flights of ../shared/data are not there")
+needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason="the flights of ../shared/data are not there")
 
 
 def noise(*shape, low=1, high=255, seed=0):
@@ -74,8 +73,7 @@ def site():
 
 def test_import_loads_neither_rasterio_nor_pyproj():
     code = "import sys, engine.orthomap; print([m for m in ('rasterio', 'pyproj') if m in sys.modules])"
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
@@ -637,7 +635,7 @@ def test_info_can_be_written_as_json(tmp_path, geographic, site):
 
 @needs_data
 def test_simulated_town():
-    folder = DATA / "gazebo-a1"
+    folder = SHARED / "gazebo-a1"
     site = OrthoMap.open(folder / "map.tif", folder / "dsm.tif")
     assert site.info()["convergence_deg"] == pytest.approx(1.078, abs=5e-4)
     assert site.gsd_m_per_px == pytest.approx(0.53, abs=1e-4)
@@ -647,7 +645,7 @@ def test_simulated_town():
 
 @needs_data
 def test_satellite_map_with_a_colour_table_and_a_black_collar():
-    site = OrthoMap.open(DATA / "nust" / "map.tif")
+    site = OrthoMap.open(SHARED / "nust" / "map.tif")
     valid = site.valid(whole(site))
     assert 0.3 < 1.0 - valid.mean() < 0.4
     assert (site.gray(whole(site))[~valid] == 0).all()  # index 255 of the table, which stands for black
@@ -655,7 +653,7 @@ def test_satellite_map_with_a_colour_table_and_a_black_collar():
 
 @needs_data
 def test_geographic_orthophoto_with_a_black_collar(tmp_path):
-    folder = DATA / "caliterra"
+    folder = SHARED / "caliterra"
     site = OrthoMap.open(folder / "map.tif", folder / "dsm.tif", cache_dir=tmp_path)
     assert site.crs.to_epsg() == 32614
     assert site.gsd_m_per_px == pytest.approx(0.08, abs=1e-3)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_sim import CAMERA, ORIGIN, TO_CRS, centre_of_bright, patch_world, project
 
 from engine.camera import Camera
 from engine.errors import OptionError
@@ -12,6 +11,7 @@ from engine.sim import ExposureMotion, FlightStyle, Optics, build_town, plan_fli
 from engine.sim.flight import DRONE_SENSOR
 from engine.sim.optics import Sensor
 from engine.values import Attitude
+from tests.support.patches import CAMERA, ORIGIN, TO_CRS, centre_of_bright, patch_world, project
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
 IDEAL = Sensor(

@@ -8,7 +8,6 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from test_sim import CAMERA, EPSG, GSD, ORIGIN, SIZE, TO_CRS, centre_of_bright, patch_world, project
 
 from engine import OrthoMap
 from engine.errors import MapError, OptionError, ShapeError
@@ -31,6 +30,7 @@ from engine.sim.light import LIGHTS, illuminate
 from engine.sim.raster_world import bare_ground
 from engine.sim.render import Atmosphere, Glint
 from engine.values import Attitude
+from tests.support.patches import CAMERA, EPSG, GSD, ORIGIN, SIZE, TO_CRS, centre_of_bright, patch_world, project
 
 TINY = {"width_px": 64, "height_px": 64}
 MIDDLING = {"width_px": 700, "height_px": 720}

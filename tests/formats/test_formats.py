@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -35,8 +34,8 @@ from engine.formats.telemetry import (
 from engine.formats.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from engine.formats.truth import interpolate_truth, read_truth, write_truth
 from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
+from tests.support.paths import SHARED
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
 
 HEADER = "timestamp_ns,frame,height_agl_m,heading_deg,lat_deg,lon_deg\n"
@@ -579,9 +578,9 @@ def test_a_frame_without_a_stamp_cannot_be_written(tmp_path):
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_reads_the_shared_flights(name):
-    directory = DATA / name
+    directory = SHARED / name
     if not directory.is_dir():
-        pytest.skip(f"no flight {name} under {DATA}")
+        pytest.skip(f"no flight {name} under {SHARED}")
     frames = directory / "flight.mp4" if name == "nust" else directory / "frames"
     camera = Camera.load(directory / "camera.yaml")
     flight = open_flight(frames, directory / "telemetry.csv", camera)

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -28,6 +27,7 @@ from engine.runs.demo import write_flight
 from engine.runs.executors import in_processes
 from engine.runs.jobs import read_result
 from engine.sim import plan_flight
+from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.timeout(900)  # a dozen processes, on a machine that may be busy
 RUNS = ("town-1-noon/ncc", "good/ncc", "bad/ncc")
@@ -196,7 +196,7 @@ def test_a_run_is_a_flight_by_a_method_in_the_order_of_the_file(place, tmp_path)
 
 
 def test_the_file_in_the_documentation_is_one(tmp_path):
-    page = (Path(__file__).parents[1] / "docs" / "campaigns.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "campaigns.md").read_text(encoding="utf-8")
     path = tmp_path / "campaign.toml"
     path.write_text(re.search(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[1], encoding="utf-8")
     found = read_settings(path, Campaign)

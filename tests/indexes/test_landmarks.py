@@ -14,14 +14,15 @@ from engine.features import sift
 from engine.indexes import landmark_cache, landmarks
 from engine.indexes.landmarks import CELL_PX, MAX_PER_CELL, TILE_PX, LandmarkMap, as_picture
 from engine.values import Window
+from tests.support.ground import Ground
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def site(make_ground):
+def site():
     """More than two tiles a side, with ground that rises to the east."""
-    ground = make_ground(size=(560, 600))
+    ground = Ground(size=(560, 600))
     rising = np.tile(np.linspace(10.0, 40.0, 600, dtype=np.float32), (560, 1))
     return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=rising)
 
@@ -101,8 +102,8 @@ def test_upright_landmarks_have_the_angle_of_the_maps_x_axis(marks, site):
     assert marks.find(whole(site), 0, upright=False).features.angle_deg.std() > 30
 
 
-def test_no_landmark_lies_on_nodata(make_ground):
-    ground = make_ground(size=(300, 400))
+def test_no_landmark_lies_on_nodata():
+    ground = Ground(size=(300, 400))
     valid = np.zeros(ground.gray.shape, bool)
     valid[40:220, 100:310] = True
     gray = np.where(valid, ground.gray, 255).astype(np.uint8)
@@ -143,10 +144,10 @@ def test_memory_is_bounded_and_what_was_given_up_comes_back_the_same(site, marks
 
 
 @pytest.fixture
-def stored(tmp_path, monkeypatch, make_ground):
+def stored(tmp_path, monkeypatch):
     """A map in a file, with a cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    ground = make_ground(size=(280, 300))
+    ground = Ground(size=(280, 300))
     return write_map(tmp_path / "map.tif", ground, ground.gray), tmp_path / "cache" / "scenematch"
 
 
@@ -219,10 +220,10 @@ def test_a_file_that_is_not_to_be_believed_is_made_anew(stored, how):
         assert landmark_cache.load_arrays(key, landmarks._STORED) is not None
 
 
-def test_another_map_or_another_detector_has_another_file(stored, make_ground, monkeypatch):
+def test_another_map_or_another_detector_has_another_file(stored, monkeypatch):
     prepared(stored[0])
     names = {path.name for path in stored[1].iterdir()}
-    ground = make_ground(size=(280, 300))
+    ground = Ground(size=(280, 300))
     changed = ground.gray.copy()
     changed[140, 150] ^= 1
     write_map(stored[0], ground, changed)

@@ -34,7 +34,7 @@ from engine.formats.ros.messages import (
 )
 from engine.live import LiveOptions
 from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
-from tests.conftest import body_axes
+from tests.support.ground import body_axes
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
 NOW_NS = 1_700_000_000_123_456_789
