@@ -3,7 +3,7 @@
 A peak is high over a wrong place too, where streets or furrows look alike. Three features tell the two apart: how
 far the peak stands out from chance, how near its best rival comes, and how well its position agrees with the
 prior. A logistic function of these gives the probability; its weights were fitted by ``python -m
-bench.confidence`` on simulated towns. Votes of the frame's blocks, each with its own shift, added nothing there.
+bench.accuracy.confidence`` on simulated towns. Votes of the frame's blocks, each with its shift, added nothing.
 """
 
 from __future__ import annotations

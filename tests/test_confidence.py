@@ -128,7 +128,7 @@ def test_every_peak_has_a_probability(score, second, sigma, prior_chi_square):
 
 def test_the_fit_finds_the_weights_that_drew_the_labels():
     """Labels drawn with known weights: the fit has them again, to the scatter of 20,000 draws."""
-    from bench.confidence import fitted
+    from bench.accuracy.confidence import fitted
 
     rng = np.random.default_rng(0)
     x = np.c_[np.ones(20_000), rng.uniform(0.5, 3.0, 20_000), rng.random(20_000), rng.uniform(0, 12, 20_000)]
@@ -139,7 +139,7 @@ def test_the_fit_finds_the_weights_that_drew_the_labels():
 
 def test_scores_are_ranked():
     """Right ones 3 and 1, wrong ones 2 and 0: of four pairs three are in order; 1 is kept, so 2 passes."""
-    from bench.integrity_page import auc, calibration_error, false_positives
+    from bench.pages.integrity import auc, calibration_error, false_positives
 
     score, right = np.array([3.0, 1.0, 2.0, 0.0]), np.array([True, True, False, False])
     assert auc(score, right) == 0.75

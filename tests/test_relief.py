@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import body_axes
 
 from engine import Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
 from engine.align import view_of
 from engine.methods.options import NccOptions
 from engine.values import Attitude
+from tests.support.ground import body_axes
 
 NADIR = np.array([315.0, 296.0])
 HEIGHT_M = 150.0
