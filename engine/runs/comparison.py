@@ -10,7 +10,7 @@ from typing import Any
 from engine.errors import OptionError
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
-from engine.matcher import METHODS
+from engine.methods import METHODS
 from engine.report.comparison import draw_comparison
 from engine.runs.folders import StrPath, check_folder, prepare_folder
 from engine.runs.inputs import FlightFiles, open_inputs

@@ -16,7 +16,8 @@ from engine.adapters.vehicle import Origin
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
 from engine.live import LiveOptions
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
 from engine.orthomap import OrthoMap
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
 from engine.runs.checks import check_position

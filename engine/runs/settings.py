@@ -8,9 +8,8 @@ from typing import Any
 
 from engine.errors import OptionError
 from engine.formats.settings import read_settings
-from engine.matcher import METHODS, PROFILES, MatcherOptions
-from engine.methods.hypothesis import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.methods import METHODS
+from engine.methods.options import PROFILES, MatcherOptions, NccOptions, SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.runs.arguments import check_choice, check_device, parse_budget, parse_position
 from engine.runs.folders import StrPath

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.frames import read_image
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
 from engine.runs.arguments import check_choice, check_device, parse_position
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
