@@ -237,7 +237,7 @@ def _write_photographs(
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Refuse a folder in a flight's place that no import made."""
+    """Refuse a folder in the way of a flight that no import created."""
     if folder.is_symlink() or (folder.exists() and not (folder / ABOUT).is_file()):
         raise OptionError(f"out: expected flights of an earlier import to replace, but {folder} is no such one")
 
