@@ -19,7 +19,7 @@ from engine.errors import DtypeError, MapError, ShapeError
 from engine.geo import LocalFrame
 from engine.maps.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs, warp_between
 from engine.maps.metric_copy import ProgressCallback, is_large, needs_copy, open_metric_copy
-from engine.maps.pyramid import Arrays, Pyramid, Reader
+from engine.maps.pyramid import ArrayReader, Pyramid, Reader
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG, Gray, GrayReader, Mask, open_source, stated_sigma
 from engine.maps.surface import GROUND_PERCENT, SurfaceModel, open_surface
 from engine.values import Window
@@ -190,7 +190,7 @@ class OrthoMap:
                 f"pixel_to_crs: expected a square north-up grid in a projected CRS, got {grid.crs.name!r}"
             )
 
-        site = cls("arrays", grid, Arrays(gray, mask), grid.crs)
+        site = cls("arrays", grid, ArrayReader(gray, mask), grid.crs)
         site.georeference_sigma_m = stated_sigma(
             georeference_sigma_m, None, GEOREFERENCE_TAG, "georeference_sigma_m"
         )

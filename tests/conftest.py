@@ -20,7 +20,7 @@ from pyproj import Transformer
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from engine import Camera, Fix, Frame, OrthoMap, Prior
-from engine.sim import build_town, paper_flight
+from engine.sim import build_town, plan_flight
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 NO_SHARED = f"the shared flights are not there: {SHARED}"
@@ -64,7 +64,7 @@ def site_of(town, *, surface=True):
 @pytest.fixture(scope="session")
 def sim_flight():
     """The first 24 frames of the paper's flight over a simulated town."""
-    return paper_flight(1, frames=24)
+    return plan_flight(1, frames=24).draw()
 
 
 @pytest.fixture(scope="session")

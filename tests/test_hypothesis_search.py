@@ -10,7 +10,7 @@ from conftest import site_of
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.methods import ncc as ncc_method
 from engine.methods.ncc import NccOptions
-from engine.sim import FlightStyle, SensorNoise, paper_flight
+from engine.sim import FlightStyle, SensorNoise, plan_flight
 
 EXACT = SensorNoise(
     height_sd_m=0.0, height_drift_sd_m=0.0, heading_sd_deg=0.0, heading_bias_deg=0.0, tilt_sd_deg=0.0,
@@ -24,7 +24,7 @@ OFF = [(5.0, 0.05), (-5.0, 0.03), (3.3, -0.05), (-1.7, -0.02), (0.0, 0.0)]
 @pytest.fixture(scope="module")
 def flight():
     """A flight whose telemetry is the truth: what is off, the tests put there."""
-    return paper_flight(3, frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    return plan_flight(3, frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9)).draw()
 
 
 @pytest.fixture(scope="module")

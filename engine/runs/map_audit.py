@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.audit.availability import Audit, RouteAvailability, gather, predict
+from engine.audit.availability import Audit, RouteAvailability, gather, predict_route
 from engine.audit.plan import AuditOptions, AuditPlan, MapPart, plan_audit
-from engine.audit.self_match import SelfMatchStatistics, measure
+from engine.audit.self_match import SelfMatchStatistics, measure_self_match
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import check_folder, named_as_typed, open_map, parse_circle, prepare_folder
@@ -65,8 +65,8 @@ def run_audit(inputs: AuditFiles, out: Path, *, sigma_m: float, force: bool, as_
         plan = plan_audit(site, camera, height_m, AuditOptions(prior_sigma_m=sigma_m), other, part)
     _check_size(plan, part)
     prepare_folder(out, force, OWNED)
-    audit = gather(plan, console.progress(measure(plan), len(plan), "auditing"))
-    route = None if waypoints is None else predict(audit, *waypoints.T)
+    audit = gather(plan, console.progress(measure_self_match(plan), len(plan), "auditing"))
+    route = None if waypoints is None else predict_route(audit, *waypoints.T)
     _write(out, audit, route, inputs.map.name)
     result = summary(audit, route, inputs)
     (out / "summary.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
@@ -181,7 +181,7 @@ def summary(audit: Audit, route: RouteAvailability | None, inputs: AuditFiles) -
         "availability": float(audit.availability[known].mean()) if known.any() else None,
         "shares": audit.shares,
         "evidence_median": {
-            one.name: _median(getattr(audit.evidence, one.name)) for one in fields(SelfMatchStatistics)
+            one.name: _median(getattr(audit.statistics, one.name)) for one in fields(SelfMatchStatistics)
         },
         "route": None if route is None else _route_facts(route, str(inputs.route)),
     }
@@ -189,7 +189,7 @@ def summary(audit: Audit, route: RouteAvailability | None, inputs: AuditFiles) -
 
 def _part_facts(plan: AuditPlan, inputs: AuditFiles) -> dict[str, Any] | None:
     """What part of the map was audited; None for all of it."""
-    if plan.looked.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
+    if plan.audited.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
         return None
     return {
         "around": inputs.around,

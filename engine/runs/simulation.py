@@ -27,13 +27,14 @@ from engine.runs.demo import START_SIGMA_M, write_flight
 from engine.runs.tracking import OWNED
 from engine.runs.watching import Watching, watched
 from engine.sim import CONDITIONS, FlightStyle, Town, build_town, picture_at, plan_flight, world_from_map
-from engine.sim.faults import KINDS, Fault
+from engine.sim.faults import FAULT_KINDS, Fault
 from engine.sim.flight import grid_at
 from engine.sim.light import Image
-from engine.sim.loop import START_NS, ClosedLoop
+from engine.sim.loop import ClosedLoop
 from engine.sim.pilot import plan_rounds
 from engine.sim.quadrotor import State
-from engine.sim.town import EXACT, RELIEF_MAX_M, generator
+from engine.sim.town import EXACT, MAX_RELIEF_M, generator
+from engine.sim.vehicle import START_NS
 from engine.values import Frame, Prior, Truth
 
 if TYPE_CHECKING:  # rerun is optional
@@ -74,8 +75,8 @@ class WorldSettings:
             check_choice("--condition", self.condition, tuple(CONDITIONS))
         if self.surface is not None and self.map is None:
             raise OptionError(f"--surface: expected with --map only, got {self.surface}")
-        if not 0.0 <= self.relief_m <= RELIEF_MAX_M:
-            raise OptionError(f"--relief-m: expected 0 to {RELIEF_MAX_M:g}, got {self.relief_m:g}")
+        if not 0.0 <= self.relief_m <= MAX_RELIEF_M:
+            raise OptionError(f"--relief-m: expected 0 to {MAX_RELIEF_M:g}, got {self.relief_m:g}")
         if self.relief_m and self.map is not None:
             raise OptionError(
                 f"--relief-m: expected without --map, whose surface has its own, got {self.relief_m:g}"
@@ -85,7 +86,7 @@ class WorldSettings:
         """The world with its map: a town of the seed's, or the user's rasters."""
         if self.map is not None:
             return world_from_map(self.map, self.surface, condition=self.condition, seed=self.seed)
-        return build_town(self.seed, condition=self.condition, relief_m=self.relief_m)
+        return build_town(self.seed, condition=self.condition or "noon", relief_m=self.relief_m)
 
     def facts(self) -> dict[str, Any]:
         """The same as JSON can hold it."""
@@ -108,7 +109,7 @@ class LoopSettings:
 
     def __post_init__(self) -> None:
         check_choice("--method", self.method, METHODS)
-        check_choice("--fault", self.fault, KINDS)
+        check_choice("--fault", self.fault, FAULT_KINDS)
         if not 0.1 <= self.minutes <= 120.0:
             raise OptionError(f"--minutes: expected 0.1 to 120, got {self.minutes:g}")
         check_device("--device", self.device)
