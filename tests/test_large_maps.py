@@ -190,7 +190,7 @@ def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_p
 def tiny_limits(monkeypatch):
     """A map of a few hundred pixels a side counts as large, and its copy has tiles of 128."""
     for module in ("metric_copy", "pyramid"):
-        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
+        monkeypatch.setattr(f"engine.maps.{module}.MEMORY_LIMIT_PX", 20_000)
     monkeypatch.setattr(metric_copy, "TILE_PX", 128)
     monkeypatch.setattr(metric_copy, "COARSEST_PX", 64)
 

@@ -168,7 +168,7 @@ def _texture(gray: Gray) -> float:
 
 
 def _own_and_rivals(scores: Pictures, x: int, y: int, exclusion_px: float) -> tuple[Array, Array]:
-    """The highest score (T,) at a position, and outside its exclusion zone (-1 where nothing extent outside)."""
+    """The highest score (T,) at a position, and outside its exclusion zone (-1 where nothing is outside)."""
     near = scores[:, max(0, y - _NEAR_PX) : y + _NEAR_PX + 1, max(0, x - _NEAR_PX) : x + _NEAR_PX + 1]
     down, across = np.ogrid[-y : scores.shape[1] - y, -x : scores.shape[2] - x]
     outside = down * down + across * across > max(exclusion_px, _NEAR_PX) ** 2

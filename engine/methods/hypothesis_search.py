@@ -21,7 +21,7 @@ from engine.methods import hypothesis
 from engine.methods.hypothesis import Aligned, NccOptions
 from engine.methods.query import Query, level_crop
 from engine.ncc_fft import surfaces
-from engine.peaks import best_places
+from engine.peaks import best_positions
 from engine.values import Frame, NoFix, Peak, Window
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ def _coarse(
     found: list[tuple[float, Frame, Array]] = []
     with query.watch.stage("match"):
         for aligned, trim, scores in zip(fitting, trims, _all_scores(region, templates, options), strict=True):
-            for x, y, score in best_places(scores, separation, _CANDIDATES):
+            for x, y, score in best_positions(scores, separation, _CANDIDATES):
                 place = np.array([x + region.window.x0, y + region.window.y0], dtype=np.float64) - trim
                 nadir = query.site.full_from_level(place - aligned.patch.offset_px, level)
                 found.append((score, aligned.frame, nadir))

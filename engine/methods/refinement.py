@@ -90,7 +90,7 @@ def _through_levels(
             picture, ground, pose, belief, last_step_sigmas=_LAST_STEP if level == own else _LAST_STEP_COARSE
         )
         pose = pose if fit is None else fit.pose
-    return fit if fit is not None and fit.settled and fit.correlation >= before else None
+    return fit if fit is not None and fit.converged and fit.correlation >= before else None
 
 
 def _tilted(pose: Pose, height_m: float) -> list[Pose]:

@@ -213,7 +213,7 @@ def _nearest(raster: NDArray[Any], x: Float32, y: Float32) -> NDArray[Any]:
     return raster[rows, np.clip(np.rint(x).astype(np.int32), 0, raster.shape[1] - 1)]
 
 
-def _refine(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
+def _intersect(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
     """Height at which rays meet the surface, and whether they meet it from the side.
 
     Bisects between the layer inside and the free layer above it; a surface that rises above the free end is a
@@ -338,7 +338,7 @@ def _trace(world: World, rays: _Rays) -> Image:
     # On flat ground a ray that met no layer ends at 0; on hills every ray is intersected with its own ground.
     where = np.flatnonzero(found) if world.ground_m is None else np.arange(found.size)
     far_x, far_y = x.ravel()[where], y.ravel()[where]
-    z_m, wall = _refine(world, rays, far_x, far_y, heights[found.ravel()[where]], float(heights[1]))
+    z_m, wall = _intersect(world, rays, far_x, far_y, heights[found.ravel()[where]], float(heights[1]))
     drop = np.full(found.shape, rays.camera_m, np.float32)
     drop.reshape(-1)[where] -= z_m
     x, y = x * drop + np.float32(rays.nadir_px[0]), y * drop + np.float32(rays.nadir_px[1])

@@ -26,7 +26,7 @@ def scene():
 def look(scene, *, center_m=None, rotation=None, slope=None, gradients=None):
     picture, offset_m, turned, center, leaning = scene
     count = offset_m.shape[1]
-    return dense_loops.seen(
+    return dense_loops.project(
         picture, MATRIX, turned if rotation is None else rotation, center if center_m is None else center_m,
         leaning if slope is None else slope, offset_m, np.zeros(3),
         np.zeros((count, 2)) if gradients is None else gradients, np.ones(count), EDGE_PX, CELLS,
