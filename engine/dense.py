@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from engine.errors import ShapeError
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 
 MIN_SAMPLES = 60
 _STEPS = 12  # Gauss-Newton steps at most; three or four are usual
@@ -102,7 +102,7 @@ class EnhancedFrame:
         matrix: (3, 3) pinhole intrinsics.
     """
 
-    levels: Image
+    levels: FloatImage
     matrix: Array
 
 

@@ -227,16 +227,20 @@ def match(
     Raises:
         OptionError: The ratio is not in (0, 1].
     """
-    if not 0 < ratio <= 1:
-        raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
-    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+    _check_ratio(ratio)
     with torch.inference_mode():
+        limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
         first, index, second, is_mutual = _nearest(query, train, limits)
         nearest, next_nearest = _distance(first), _distance(second)
-        # Of two equal ones neither wins, also where rounding puts one of them at 0.
+        # Two equal distances give a ratio of 1, also where rounding puts one of them at 0.
         quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
         valid = nearest.isfinite() & (quotient <= ratio)
-        return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+
+
+def _check_ratio(ratio: float) -> None:
+    if not 0 < ratio <= 1:
+        raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
 
 
 def _nearest(

@@ -1,4 +1,4 @@
-"""The adaptive window: how large a crop of the map each frame is matched against (equations 4 and 5)."""
+"""The adaptive window: the crop of the map that a frame is matched against (equations 4 and 5)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from engine.errors import OptionError
 from engine.values import Window
 
 SPREAD_SIGMAS = 3.0
-"""Of the prior: a window holds what is matched at every place this near to the middle."""
+"""Standard deviations of the prior that a window covers to each side."""
 
 
 def window_size_px(
@@ -17,8 +17,8 @@ def window_size_px(
     """Width and height of the window in map pixels: W = 1.3 s T + v tau (eq. 4, 5).
 
     Args:
-        footprint_px: s T, the frame's extent (width, height) once it lies on the map.
-        moved_px: v tau, the movement (x, y) since the last frame; only its size counts.
+        footprint_px: s T, the frame's extent (width, height) on the map.
+        moved_px: v tau, the movement (x, y) since the last frame; signs are ignored.
         margin: the paper's 1.3.
 
     Raises:
@@ -35,10 +35,15 @@ def window_size_px(
 def place_window(
     center_px: tuple[float, float], size_px: tuple[float, float], map_size_px: tuple[int, int]
 ) -> Window | None:
-    """The window in whole pixels about a centre (x, y), clipped at the edge of a map (width, height).
+    """The window in whole pixels about a centre, clipped to the map.
+
+    Args:
+        center_px: (x, y).
+        size_px: width and height before it is clipped.
+        map_size_px: width and height of the map.
 
     Returns:
-        Window | None: None where the window and the map have nothing in common.
+        Window | None: None where the window is outside the map.
     """
     spans = []
     for center, size, limit in zip(center_px, size_px, map_size_px, strict=True):
