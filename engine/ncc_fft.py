@@ -150,6 +150,9 @@ def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
         image: (H, W) float32, its mean small against its standard deviation.
         halvings: upper bound on the number of half-resolution levels.
 
+    Returns:
+        Search: with integral images (2, H+1, W+1) float64, and levels down to 48 x 48 pixels.
+
     Raises:
         ShapeError: the picture is not (H, W), or is empty.
         DtypeError: it is not float32.
