@@ -283,9 +283,10 @@ def plan_flight(
     town = town or build_town(seed, **town_options)
     motion, origin = _fly_over(town, camera, style, generator(seed, 0xF1))
     stamps_ns = _stamps_ns(motion, frames, rate_hz)
-    truth = motion.at(stamps_ns * 1e-9)
+    time_s = np.asarray(stamps_ns * 1e-9, np.float64)
+    truth = motion.at(time_s)
     telemetry = simulate_telemetry(truth, noise or SensorNoise(), generator(seed, 0x5E))
-    sways = () if optics is None else _sways(motion, stamps_ns * 1e-9)
+    sways = () if optics is None else _sways(motion, time_s)
     stamps = tuple((START_NS + stamps_ns).tolist())
     return FlightPlan(town, camera, origin, truth, telemetry, stamps, seed, optics=optics, sways=sways)
 
@@ -305,4 +306,4 @@ def _fly_over(
 def _stamps_ns(motion: Motion, frames: int | None, rate_hz: float) -> NDArray[np.int64]:
     """Times (N,) of the frames since take-off in nanoseconds."""
     count = int(motion.time_s[-1] * rate_hz) + 1
-    return np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz).astype(np.int64)
+    return np.asarray(np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz), np.int64)
