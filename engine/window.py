@@ -64,7 +64,7 @@ def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) 
         window: in full-resolution pixels, inside the map.
         level: of the pyramid.
         step_px: width and height are rounded up to a multiple of this where the level is large enough, so that
-            a flight meets few different sizes and nothing is planned anew in flight.
+            a flight meets few different sizes and nothing is planned again in flight.
     """
     rows, columns = site.level_shape(level)
     spans = []
@@ -76,5 +76,5 @@ def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) 
 
 
 def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int) -> int:
-    """The pyramid level whose pixels are nearest to the wanted size without being much coarser."""
+    """The pyramid level whose pixels are nearest to the requested size without being much coarser."""
     return min(max(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + 0.25), 0), levels - 1)

@@ -43,8 +43,8 @@ class HeightTiles:
         self._patches: OrderedDict[_Patch, Heights] = OrderedDict()  # the most recently used is last
         self.shape = (part.height_px, part.width_px)
 
-    def __getitem__(self, place: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
-        rows, columns = place
+    def __getitem__(self, index: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
+        rows, columns = index
         if rows.size == 0:
             return np.empty(rows.shape, np.float32)
         y0, x0, y1, x1 = (int(v) // TILE_PX for v in (rows.min(), columns.min(), rows.max(), columns.max()))

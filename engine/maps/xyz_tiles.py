@@ -109,7 +109,7 @@ class TileCache:
         self.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self.mask_flag_enums = ([MaskFlags.per_dataset, MaskFlags.alpha],) * 4
         self._cached: OrderedDict[tuple[int, int, int], Pixels] = OrderedDict()
-        self._last: tuple[Any, Pixels] | None = None  # bands and alpha are asked for in turn
+        self._last: tuple[Any, Pixels] | None = None  # bands and alpha are read in turn
 
     def overviews(self, _band: int) -> list[int]:
         """Factors of the coarser levels."""

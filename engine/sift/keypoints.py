@@ -270,5 +270,5 @@ def rank(group: Tensor) -> Tensor:
     """
     order = group.argsort(stable=True)
     ordered = group[order]
-    place = torch.arange(group.numel(), device=group.device)
-    return torch.empty_like(group).scatter_(0, order, place - torch.searchsorted(ordered, ordered))
+    index = torch.arange(group.numel(), device=group.device)
+    return torch.empty_like(group).scatter_(0, order, index - torch.searchsorted(ordered, ordered))
