@@ -285,6 +285,6 @@ def _project(
     )  # fmt: skip
     if count < MIN_SAMPLES:
         return None
-    differences, weights, correlation, gain = dense_loops.compare(levels, samples.values, weights)
+    differences, weights, correlation, gain = dense_loops.compare_levels(levels, samples.values, weights)
     expected *= gain
     return _Projection(differences, points, offset_m[:2], rotation, shown, expected, weights, cells, correlation)

@@ -111,7 +111,7 @@ def _bilinear(picture, u, v):
 
 
 @compiled
-def compare(levels, values, weights):
+def compare_levels(levels, values, weights):
     """Differences of picture and map up to gain and bias, robust weights, the correlation and the gain.
 
     Args:

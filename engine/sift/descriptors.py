@@ -19,7 +19,7 @@ from engine import device
 from engine.sift.keypoints import Points
 from engine.sift.scale_space import ScaleSpacePlan
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
 _POINTS_PER_THREAD = 64
 _ANGLE_BINS = 36
@@ -86,7 +86,7 @@ def dominant_angle(gaussians: Tensor, points: Points, plan: ScaleSpacePlan) -> T
     window, smooth = (weights.numpy() for weights in _orientation_weights(gaussians.device))
     window = window.reshape(_ORIENT_SAMPLES, _ORIENT_SAMPLES)
 
-    def work(where: Array, positions: Array) -> Any:
+    def work(where: AnyArray, positions: AnyArray) -> Any:
         step = np.float32(_ORIENT_STEP)
         return sift_descriptors.angles(
             gaussians.numpy(), plan.table.numpy(), where, positions, step, window, smooth
@@ -144,7 +144,7 @@ def describe(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpaceP
         return normalise(cells_by_tensors(gaussians, points, angle, plan), root=root)
     from engine.kernels import sift_descriptors
 
-    def work(where: Array, positions: Array, turn: Array) -> Any:
+    def work(where: AnyArray, positions: AnyArray, turn: AnyArray) -> Any:
         step = np.float32(_CELL_SIGMAS / _CELL_SAMPLES)
         return sift_descriptors.descriptors(
             gaussians.numpy(), plan.table.numpy(), where, positions, turn, step, _tents()
@@ -153,7 +153,7 @@ def describe(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpaceP
     return normalise(_in_parts(work, points, plan, angle), root=root)
 
 
-def _in_parts(work: Callable[..., Array], points: Points, plan: ScaleSpacePlan, *columns: Tensor) -> Tensor:
+def _in_parts(work: Callable[..., AnyArray], points: Points, plan: ScaleSpacePlan, *columns: Tensor) -> Tensor:
     """Return work(where, positions, *columns) of all points, in parallel parts.
 
     ``where`` is octave, image, level; ``positions`` x, y, sigma in octave pixels.
@@ -206,11 +206,13 @@ def _pooling(where: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-def _tents() -> Array:
+def _tents() -> AnyArray:
     """Return (cells, samples) float32: the weights of :func:`_pooling` along one axis."""
     ramp = (np.arange(_DESC_SAMPLES) - (_DESC_SAMPLES - 1) / 2) / _CELL_SAMPLES
     centres = np.arange(_CELLS) - (_CELLS - 1) / 2
-    tents: Array = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(-0.5 * (ramp / (_CELLS / 2)) ** 2)
+    tents: AnyArray = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(
+        -0.5 * (ramp / (_CELLS / 2)) ** 2
+    )
     return tents.astype(np.float32)
 
 

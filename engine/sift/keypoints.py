@@ -16,7 +16,7 @@ from torch import Tensor
 from engine import device
 from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan, gaussian_levels, reach_px
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
 _BORDER = 4  # octave pixels along the edge without keypoints
 _EDGE_RATIO = 10.0
@@ -98,8 +98,8 @@ def _detect_compiled(image: Tensor, plan: ScaleSpacePlan, contrast_threshold: fl
 
 
 def _voxels_compiled(
-    source: Array, octave: Octave, buffer: Array, layout: tuple[int, ...], threshold: float
-) -> Array:
+    source: AnyArray, octave: Octave, buffer: AnyArray, layout: tuple[int, ...], threshold: float
+) -> AnyArray:
     """Write an octave's levels and return its extrema (M, 3), by a number of threads that suits its size."""
     from engine.kernels.sift_extrema import filters, find_extrema
 
