@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+_DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
 """Extras that add nothing to the engine."""
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
@@ -19,7 +20,7 @@ _EXTRA = re.compile(r"""extra == ["']([^"']+)["']""")
 def examine() -> tuple[dict[str, Any], bool]:
     """Facts by name, and whether nothing is missing."""
     facts: dict[str, Any] = {
-        "scenematch": _version("scenematch"),
+        "scenematch": _version(_DISTRIBUTION),
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
@@ -43,7 +44,7 @@ def requirements() -> tuple[list[str], dict[str, list[str]]]:
     """The packages that the engine needs, and by extra those that it can use, as its installation states them."""
     needed: list[str] = []
     extras: dict[str, list[str]] = {}
-    for text in metadata.requires("scenematch") or ():
+    for text in metadata.requires(_DISTRIBUTION) or ():
         name, extra = _NAME.match(text), _EXTRA.search(text)
         if name is None:
             continue

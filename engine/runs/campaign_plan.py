@@ -254,7 +254,8 @@ def _scenes(simulated: SimulatedFlights) -> Iterator[tuple[str, WorldSettings]]:
 
 
 def _drawing(name: str, scene: WorldSettings, frames: int | None, out: Path) -> Job:
-    made_of = {"simulation": json.dumps(scene.facts() | {"frames": frames}), "engine": version("scenematch")}
+    facts = json.dumps(scene.facts() | {"frames": frames})
+    made_of = {"simulation": facts, "engine": version("scenematch-engine")}
     return Job(name, out / FLIGHTS / name, out / WORKSHOP, made_of, Draw(scene, frames))
 
 
@@ -262,7 +263,7 @@ def _settings_print(run: Run) -> dict[str, str]:
     text = json.dumps(asdict(run.settings), sort_keys=True, default=str)
     return {
         "settings": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
-        "engine": version("scenematch"),
+        "engine": version("scenematch-engine"),
     }
 
 
