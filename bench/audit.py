@@ -2,7 +2,7 @@
 
     python -m bench.audit [--quick] [--fit] [--page FILE]
 
-Rewrites what follows the heading "Measured" of docs/audit.md. ``--fit`` fits the rule on grounds of its own, which
+Rewrites docs/audit-measured.md below its marker. ``--fit`` fits the rule on grounds of its own, which
 are not reported on, prints its weights, and writes nothing.
 """
 
@@ -36,8 +36,8 @@ from engine.values import Attitude, Truth, Window
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-PAGE = Path(__file__).parents[1] / "docs" / "audit.md"
-MEASURED = "## Measured\n"
+PAGE = Path(__file__).parents[1] / "docs" / "audit-measured.md"
+MEASURED = "<!-- bench.audit -->\n"
 WRONG_M = 10.0
 START_SIGMA_M = 15.0
 CAMERA = Camera.from_fov(300, 300, 60.0)

@@ -27,7 +27,7 @@ from engine.adapters.vehicle import Origin
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 
-PAGE = Path(__file__).parents[1] / "docs" / "mavlink.md"
+PAGE = Path(__file__).parents[1] / "docs" / "mavlink-measured.md"
 BEGIN, END = "<!-- written by bench.bridge_hour -->", "<!-- end of what bench.bridge_hour writes -->"
 HOUR = (
     "`python -m bench.bridge_hour` flies the bridge beside a stand-in autopilot (pymavlink, UDP on loopback, "
@@ -316,7 +316,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of the hour at speed")
     parser.add_argument("--real-minutes", type=float, default=3.0)
     parser.add_argument("--method", default="auto")
-    parser.add_argument("--write", action="store_true", help="into docs/mavlink.md")
+    parser.add_argument("--write", action="store_true", help="into docs/mavlink-measured.md")
     told = parser.parse_args()
     flown = hour(told.minutes)
     print(
