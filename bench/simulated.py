@@ -2,7 +2,7 @@
 
     python -m bench.simulated [--quick] [--sheet] [--docs DIR]
 
-Writes the tables of docs/simulator-measured.md, between its markers; --sheet draws docs/img/sim-conditions.png instead.
+Writes the tables of docs/simulator-measured.md; --sheet draws docs/img/sim-conditions.png instead.
 """
 
 from __future__ import annotations
