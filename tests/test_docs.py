@@ -144,6 +144,12 @@ def test_files_that_a_page_names_are_there(page):
     assert named or page.name != "architecture.md"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_benchmarks_that_a_page_names_are_there(page):
+    named = re.findall(r"python\s+-m\s+(bench(?:\.\w+)+)", page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name.replace(".", "/")).with_suffix(".py").is_file()] == []
+
+
 # ------------------------------------------------------------------------------------------ lists and values
 
 
