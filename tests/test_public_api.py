@@ -6,11 +6,11 @@ import inspect
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import engine
+from tests.support.paths import ROOT
 
 PUBLIC = [
     "Attitude",
@@ -66,9 +66,7 @@ def fresh():
         "print('REPORT', json.dumps([loaded, reach, torch.cuda.is_initialized(), "
         "sorted(n for n in sys.modules if n.startswith('engine.'))]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", report], capture_output=True, text=True, cwd=Path(__file__).parents[1], check=True
-    )
+    done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)
     before, _, rest = done.stdout.partition("REPORT ")
     loaded, reach, cuda, modules = json.loads(rest)
     return {"printed": before + done.stderr, "loaded": loaded, "reach": reach, "cuda": cuda, "modules": modules}
