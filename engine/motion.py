@@ -192,7 +192,7 @@ def en_m(fix: Fix) -> Array:
     return np.array([fix.east_m, fix.north_m])
 
 
-def is_valid_fix(fix: Fix) -> bool:
+def is_valid(fix: Fix) -> bool:
     """Whether the position is finite and the covariance positive definite."""
     finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
     return finite and bool(np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0)

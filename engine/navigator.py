@@ -20,7 +20,7 @@ from engine.motion import (
     PositionEstimate,
     VelocityEstimate,
     en_m,
-    is_valid_fix,
+    is_valid,
 )
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, check_positive
@@ -230,7 +230,7 @@ class Navigator:
         if not late:
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
-                self._refusals += 1  # no time to look says nothing of where the vehicle is
+                self._refusals += 1  # a lack of time says nothing of the position
             self._note_loss(now)
         return result
 
@@ -291,7 +291,7 @@ class Navigator:
 
     def _judge(self, fix: Fix, now: OdometrySample, given: PositionEstimate | None, *, late: bool) -> Fix | NoFix:
         """The fix where it is accepted; else it is pending, and refused for now."""
-        if not is_valid_fix(fix):
+        if not is_valid(fix):
             return _refusal(fix, Reason.BAD_POSE, "the covariance of the match is not positive definite")
         own, against = self._reckoned(now), self._against(fix, now)
         contradicted = against is not None
@@ -306,9 +306,8 @@ class Navigator:
         before = self._pending_position(now)
         agree = before is not None and self._confirms(before, fix)
         pending = _PendingFix(fix, now, self._pending.count + 1 if agree and self._pending is not None else 1)
-        if pending.count >= self._options.confirm and not (
-            contradicted and self._dead_reckoning_outweighs(now, pending.count)
-        ):
+        outweighed = contradicted and self._dead_reckoning_outweighs(now, pending.count)
+        if pending.count >= self._options.confirm and not outweighed:
             self._accept(fix, now, pending.count, jump=contradicted)
             return fix
         self._pending = pending
@@ -318,9 +317,9 @@ class Navigator:
         return estimate.sigma_m <= self._options.trusted_sigma_m and estimate.chi_square(fix) <= self._options.gate
 
     def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
-        """A well-known prediction that a fix contradicts: by the last fix, or by one some seconds ago.
+        """A trusted prediction that a fix contradicts: from the last fix, or from one some seconds ago.
 
-        Step by step a wrong match may lead away slowly enough; over seconds, measured velocities show it.
+        From frame to frame wrong matches may drift slowly enough; over seconds, measured velocities show it.
         """
         predictions = [self._reckoned(now)]
         if self._recent and now.blind_s == _sample(self._recent[0]).blind_s:

@@ -85,30 +85,36 @@ class Ncc:
         if query.prior is None:
             self.locate(query)
             return
-        for coarser, work_px in self._expected_window_px(query).items():
-            with query.scheduler.costed("ncc", work_px):
-                result = self._at_level(query, coarser)
-            self.refine(query, result)
+        for coarser in self._expected_window_px(query):
+            self.refine(query, self.correlate(query, coarser))
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
         return self.refine(query, self.correlate(query))
 
-    def correlate(self, query: Query) -> Result:
-        """A fix by correlation alone, on the finest level of the map that there is time for."""
-        scheduler = query.scheduler
+    def correlate(self, query: Query, coarser: int | None = None) -> Result:
+        """A fix by correlation alone.
+
+        Args:
+            query: the frame.
+            coarser: levels above the one whose pixels are like the frame's; None takes the finest that there is
+                time for.
+        """
         if query.telemetry.height_agl_m is None:
-            return self._at_level(query, 0)  # which refuses
+            return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
         if query.prior is None or not self._trusts(query):
             step = "ncc search" if query.prior is None else "ncc hypotheses"
             works = {0: float(query.site.width_px * query.site.height_px)}
         else:
             step, works = "ncc", self._expected_window_px(query)
-        coarser = scheduler.first_affordable(step, works)
+        if coarser is None:
+            coarser = query.scheduler.first_affordable(step, works)
         if coarser is None:
             return query.refuse_late(METHOD, step)
-        with scheduler.costed(step, works[coarser]):
-            return self._at_level(query, coarser)
+        with query.scheduler.costed(step, works[coarser]):
+            found = self.find(query, coarser=coarser)
+            result = found if isinstance(found, NoFix) else self.judge(query, found)
+        return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def refine(self, query: Query, result: Result) -> Result:
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
@@ -129,28 +135,37 @@ class Ncc:
         return explain_correlation(Correlator(query, self.prepared, self.options), window)
 
     def find(self, query: Query, *, coarser: int = 0) -> PeakCandidate | NoFix:
-        """The highest peak of one frame, or a refusal where there is none.
-
-        Args:
-            query: the frame.
-            coarser: levels above the one whose pixels are like the frame's; quicker and less accurate.
-        """
+        """The highest peak of one frame, or a refusal where there is none; see :meth:`correlate`."""
         refusal = self._refuse_unusable(query)
         if refusal is not None:
             return refusal
-        pose = query.telemetry
-        assert pose.height_agl_m is not None  # or it was refused
         correlator = Correlator(query, self.prepared, self.options)
-        level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
-        with query.scheduler.stage("align"):
-            known = pose if pose.grid_heading_deg is not None else replace(pose, grid_heading_deg=0.0)
-            aligned = correlator.align(known, level)
+        aligned = self._align(correlator, coarser)
         if isinstance(aligned, NoFix):
             return aligned
         window = correlator.window(aligned)
         if window is None:
             return query.refuse_outside(METHOD)
-        return self._find_in(correlator, aligned, window)
+        wide = query.site.is_large and window.area_px >> 2 * aligned.level > MAX_WINDOW_PX
+        if wide and hypothesis_search.coarse_px(correlator, aligned, window) > MAX_WINDOW_PX:
+            size = f"{window.width_px} x {window.height_px} px"
+            detail = f"a window of {size} is not searched; a better prior is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
+        searched = not self._trusts(query)
+        if searched or wide or query.prior is None:
+            peak, aligned = hypothesis_search.search(correlator, aligned, window)
+        else:
+            peak = correlator.search(aligned, window)
+        if peak is None:
+            detail = "the map does not cover the frame anywhere in the window"
+            return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
+        if query.scheduler.deadline.remaining_ms < 0:
+            detail = "the budget was spent before the peak was known"
+            return query.refuse(Reason.LATE, detail, METHOD, window=window)
+        fix = self._fix(correlator, aligned, peak, window, searched=searched)
+        found = PeakCandidate(peak, aligned, fix, None, searched)
+        no_features = searched or wide or query.prior is None
+        return found if no_features else self._with_confidence(correlator, found)
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where its peak is accepted, else a refusal."""
@@ -164,11 +179,6 @@ class Ncc:
     def _trusts(self, query: Query) -> bool:
         return self.options.trusts(query.telemetry.grid_heading_deg)
 
-    def _at_level(self, query: Query, coarser: int) -> Result:
-        found = self.find(query, coarser=coarser)
-        result = found if isinstance(found, NoFix) else self.judge(query, found)
-        return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
-
     def _refuse_unusable(self, query: Query) -> NoFix | None:
         """A refusal of a frame that lacks what the method needs."""
         pose = query.telemetry
@@ -178,27 +188,14 @@ class Ncc:
             return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
         return query.refuse_flat(METHOD, self.options.rule.min_deviation)
 
-    def _find_in(self, correlator: Correlator, aligned: Aligned, window: Window) -> PeakCandidate | NoFix:
-        query, trusted = correlator.query, self._trusts(correlator.query)
-        wide = query.site.is_large and window.area_px >> 2 * aligned.level > MAX_WINDOW_PX
-        if wide and hypothesis_search.coarse_px(correlator, aligned, window) > MAX_WINDOW_PX:
-            size = f"{window.width_px} x {window.height_px} px"
-            detail = f"a window of {size} is not searched; a better prior is needed"
-            return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
-        if trusted and query.prior is not None and not wide:
-            peak = correlator.search(aligned, window)
-        else:
-            peak, aligned = hypothesis_search.search(correlator, aligned, window)
-        if peak is None:
-            detail = "the map does not cover the frame anywhere in the window"
-            return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
-        if query.scheduler.deadline.remaining_ms < 0:
-            detail = "the budget was spent before the peak was known"
-            return query.refuse(Reason.LATE, detail, METHOD, window=window)
-        fix = self._fix(correlator, aligned, peak, window, searched=not trusted)
-        if not trusted or wide or query.prior is None or query.prior_px is None:
-            return PeakCandidate(peak, aligned, fix, None, searched=not trusted)
-        return self._with_confidence(correlator, PeakCandidate(peak, aligned, fix, None, searched=False))
+    def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
+        """The frame by its own height and heading, or by any heading where it came without one."""
+        query, pose = correlator.query, correlator.query.telemetry
+        assert pose.height_agl_m is not None  # or it was refused
+        level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
+        known = pose if pose.grid_heading_deg is not None else replace(pose, grid_heading_deg=0.0)
+        with query.scheduler.stage("align"):
+            return correlator.align(known, level)
 
     def _with_confidence(self, correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
         """The candidate with its probability; one that is not high must also beat the null hypothesis."""
