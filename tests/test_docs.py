@@ -112,6 +112,13 @@ def test_pages_fit_the_line():
         assert not long, f"{page.name}: {long}"
 
 
+def test_pages_use_the_words_of_the_field():
+    private = r"laid|bank|rungs?|ladder|priced?|told|surer|leans|boastful|watchman|believe[sd]?|beliefs?"
+    for page in PAGES:
+        prose = re.sub(r"`[^`]*`", "", CODE.sub("", page.read_text(encoding="utf-8")))
+        assert re.findall(rf"\b(?:{private})\b", prose, re.IGNORECASE) == [], page.name
+
+
 # ------------------------------------------------------------------------------------------- architecture
 
 
