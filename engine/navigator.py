@@ -292,7 +292,7 @@ class Navigator:
     def _judge(self, fix: Fix, now: OdometrySample, given: PositionEstimate | None, *, late: bool) -> Fix | NoFix:
         """The fix where it is accepted; else it is pending, and refused for now."""
         if not is_valid(fix):
-            return _refusal(fix, Reason.BAD_POSE, "the covariance of the match is not positive definite")
+            return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
         own, against = self._reckoned(now), self._against(fix, now)
         contradicted = against is not None
         confirmed = own is not None and not self._lost and not contradicted and self._confirms(own, fix)
@@ -372,9 +372,9 @@ class Navigator:
             apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
             sigma_m = math.hypot(against.sigma_m, fix.sigma_m)
             detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
-            return _refusal(fix, Reason.INCONSISTENT, detail)
+            return fix.refused(Reason.INCONSISTENT, detail)
         detail = f"{count} of the {self._options.confirm} matches in a row that must agree"
-        return _refusal(fix, Reason.UNCONFIRMED, detail)
+        return fix.refused(Reason.UNCONFIRMED, detail)
 
     def _note_loss(self, now: OdometrySample) -> None:
         """Declare the flight lost, or drop its start, after too many refusals or too much uncertainty."""
@@ -393,15 +393,3 @@ class Navigator:
 def _sample(anchor: _Anchor) -> OdometrySample:
     assert anchor.sample is not None  # a fix has one
     return anchor.sample
-
-
-def _refusal(fix: Fix, reason: Reason, detail: str) -> NoFix:
-    return NoFix(
-        reason=reason,
-        detail=detail,
-        timestamp_ns=fix.timestamp_ns,
-        method=fix.method,
-        score=fix.score,
-        window=fix.window,
-        timings=fix.timings,
-    )

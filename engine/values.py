@@ -279,6 +279,18 @@ class Fix:
         """Horizontal standard deviation, the larger of the two axes of the ellipse."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2[:2, :2])[-1]))
 
+    def refused(self, reason: Reason, detail: str) -> NoFix:
+        """The refusal of this fix, with what was measured of it."""
+        return NoFix(
+            reason=reason,
+            detail=detail,
+            timestamp_ns=self.timestamp_ns,
+            method=self.method,
+            score=self.score,
+            window=self.window,
+            timings=self.timings,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoFix:
