@@ -249,7 +249,8 @@ def _worlds(simulated: SimulatedFlights) -> Iterator[tuple[str, WorldSettings]]:
 
 
 def _simulate_job(name: str, world: WorldSettings, frames: int | None, out: Path) -> Job:
-    inputs = {"simulation": json.dumps(world.facts() | {"frames": frames}), "engine": version("scenematch")}
+    facts = json.dumps(world.facts() | {"frames": frames})
+    inputs = {"simulation": facts, "engine": version("scenematch-engine")}
     return Job(name, out / FLIGHTS / name, out / UNFINISHED, inputs, SimulateTask(world, frames))
 
 
@@ -257,7 +258,7 @@ def _settings_hash(settings: TrackSettings) -> dict[str, str]:
     text = json.dumps(asdict(settings), sort_keys=True, default=str)
     return {
         "settings": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
-        "engine": version("scenematch"),
+        "engine": version("scenematch-engine"),
     }
 
 
