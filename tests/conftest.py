@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import hypothesis
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from engine import Fix
-from engine.sim import build_town, paper_flight
+from engine.sim import paper_flight
 from tests.support.ground import CAMERA, Ground
 from tests.support.paths import NO_SHARED, SHARED
-from tests.support.towns import site_of
+from tests.support.towns import drawn_once, drawn_town, site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
@@ -33,6 +36,20 @@ def _no_home_directory(tmp_path_factory):
         yield
 
 
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """Plots are one pixel: for runs in which their files count and not what is on them (a second a run)."""
+    blank = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(blank))
+
+
+@pytest.fixture
+def towns_drawn_once(monkeypatch):
+    """Commands that draw a town take the one that was drawn before."""
+    monkeypatch.setattr("engine.sim.flight.build_town", drawn_once)
+    monkeypatch.setattr("engine.runs.simulation.build_town", drawn_once)
+
+
 @pytest.fixture(scope="session")
 def shared():
     """The folder of the shared flights; tests that ask for it are skipped where it is missing."""
@@ -44,7 +61,7 @@ def shared():
 @pytest.fixture(scope="session")
 def sim_flight():
     """The first 24 frames of the paper's flight over a simulated town."""
-    return paper_flight(1, frames=24)
+    return paper_flight(1, town=drawn_town(1), frames=24)
 
 
 @pytest.fixture(scope="session")
@@ -61,7 +78,7 @@ def sim_site(sim_town):
 @pytest.fixture(scope="session")
 def other_site():
     """The map of another town with the same kind of streets."""
-    return site_of(build_town(7))
+    return site_of(drawn_town(7))
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from engine.audit.availability import Flag, audit_map, predict
 from engine.audit.plan import AuditOptions, MapPart, plan_audit
 from engine.cli.app import run
 from engine.errors import OptionError
-from engine.sim import build_town
+from tests.support.towns import drawn_town
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 HEIGHT_M = 75.0
@@ -30,7 +30,7 @@ MIDDLE = (CORNER[0] + 450, CORNER[1] + 450)
 
 @pytest.fixture(scope="module")
 def gray():
-    town = cv2.cvtColor(build_town(5).ortho, cv2.COLOR_RGB2GRAY)[:900, :900]
+    town = cv2.cvtColor(drawn_town(5).ortho, cv2.COLOR_RGB2GRAY)[:900, :900]
     return np.maximum(town, 1)
 
 

@@ -32,6 +32,7 @@ from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.runs.demo import write_flight
 from engine.sim import plan_flight
+from tests.support.towns import drawn_town
 
 
 def at(log, *seconds):
@@ -435,7 +436,7 @@ def test_dataflash_is_read_as_pymavlink_reads_it(tmp_path):
 def flown(tmp_path_factory):
     """A flight folder of three frames, and the same telemetry as a DataFlash log with camera messages."""
     folder = tmp_path_factory.mktemp("flown")
-    write_flight(folder, plan_flight(frames=3))
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
     rows = read_telemetry(folder / "telemetry.csv")
     truth = read_truth(folder / "truth.csv")
     messages = []

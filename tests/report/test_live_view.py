@@ -25,6 +25,7 @@ from engine.runs.demo import write_flight
 from engine.runs.tracking import Settings, run_track
 from engine.runs.watching import Watching
 from engine.sim import plan_flight
+from tests.support.towns import drawn_town
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 from pyarrow import duration, timestamp
@@ -63,7 +64,7 @@ def has_content(row):
 def runs(tmp_path_factory):
     """A flight with a black frame, tracked without and with a recording."""
     folder = tmp_path_factory.mktemp("live")
-    inputs = write_flight(folder / "flight", plan_flight(frames=FRAMES))
+    inputs = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
     cv2.imwrite(str(folder / "flight" / "frames" / f"{DARK:06d}.jpg"), np.zeros((300, 300, 3), np.uint8))
     for method in ("ncc", "sift"):
         for name, wish in (("off", None), ("on", Watching(folder / f"{method}.rrd"))):
@@ -173,9 +174,10 @@ def matcher(sim_site, sim_flight):
 # --------------------------------------------------------------------------------------- loop and bridges
 
 
+@pytest.mark.usefixtures("towns_drawn_once", "blank_figures")
 def test_the_closed_loop_is_recorded_frame_by_frame(tmp_path, capsys):
     recording, out = tmp_path / "loop.rrd", tmp_path / "out"
-    command = ["simulate", "--closed-loop", "--minutes", "0.1", "--method", "ncc", "--device", "cpu"]
+    command = ["simulate", "--closed-loop", "--minutes", "0.05", "--method", "ncc", "--device", "cpu"]
     assert run([*command, "--out", str(out), "--rerun", str(recording)]) == 0
     track, rows = read_track(out / "track.csv"), rows_of(recording)
     assert sorted(rows["frame"]) == list(range(len(track)))
@@ -307,6 +309,7 @@ def test_nothing_of_rerun_is_loaded_where_nobody_watches():
 # ---------------------------------------------------------------------------------------------- the viewer
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all is there")
 def test_the_viewer_draws_it_without_a_complaint(runs, tmp_path):
     picture = tmp_path / "view.png"

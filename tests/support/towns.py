@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 
 from engine import OrthoMap
+from engine.sim import Town, build_town
+
+
+def drawn_town(seed: int = 1) -> Town:
+    """The town of a seed, drawn once a process (two seconds): nobody writes into it."""
+    return drawn_once(seed)
+
+
+drawn_once = cache(build_town)
 
 
 def site_of(town, *, surface=True):
