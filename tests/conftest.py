@@ -48,6 +48,7 @@ def towns_drawn_once(monkeypatch):
     """Commands that draw a town take the one that was drawn before."""
     monkeypatch.setattr("engine.sim.flight.build_town", drawn_once)
     monkeypatch.setattr("engine.runs.simulation.build_town", drawn_once)
+    monkeypatch.setattr("engine.sim.build_town", drawn_once)
 
 
 @pytest.fixture(scope="session")

@@ -247,11 +247,13 @@ def test_every_frame_is_shown_with_its_match(flown):
     assert "deviate" in frames[DARK]["detail"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_equal_tracks_give_equal_bytes(flown, again):
     run_evaluate(again, None)
     assert (again / "report.html").read_bytes() == (flown / "report.html").read_bytes()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_without_the_frames_the_page_says_so(flown, again):
     record = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     record["settings"]["frames"] = str(again / "gone")
@@ -261,6 +263,7 @@ def test_without_the_frames_the_page_says_so(flown, again):
     assert "No frames are shown" in (again / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_run_that_left_no_notes_has_a_page_without_frames(again):
     (again / "notes.csv").unlink()
     run_evaluate(again, None)
