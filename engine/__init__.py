@@ -14,7 +14,8 @@ from engine.errors import (
     ShapeError,
     TelemetryError,
 )
-from engine.matcher import MatcherOptions, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods.options import MatcherOptions
 from engine.navigator import Navigator, NavigatorOptions, NavigatorState
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window

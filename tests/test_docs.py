@@ -12,7 +12,7 @@ from docs.site_roles import on_page_content
 from engine.cli.app import app
 from engine.formats.track import COLUMNS
 from engine.integrity import AssumedErrors, PeakRule
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.pose import PoseOptions
 from engine.runs.demo import write_flight

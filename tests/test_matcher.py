@@ -32,9 +32,9 @@ from engine import (
     Window,
 )
 from engine.integrity import AssumedErrors, PeakRule
-from engine.methods import sift
-from engine.methods.ncc import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.methods.feature_pose import FeatureMatcher, attitude_prior
+from engine.methods.options import NccOptions, SiftOptions
+from engine.values import GridPose
 from tests.support.ground import Ground
 
 METHODS = ("ncc", "sift")
@@ -304,18 +304,18 @@ def test_without_a_second_look_a_height_off_by_two_is_refused(ground, camera, fr
 def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
     ground, camera, frame, prior, monkeypatch, budget_ms, looks
 ):
-    beliefs = []
+    hypotheses = []
 
-    def look(query, _, belief, __):
+    def look(matcher, hypothesis):
         time.sleep(0.03)
-        beliefs.append(belief)
-        return query.refuse(Reason.TOO_FEW_MATCHES, "none", "sift")
+        hypotheses.append(hypothesis)
+        return matcher.query.refuse(Reason.TOO_FEW_MATCHES, "none", "sift")
 
-    monkeypatch.setattr(sift, "_look", look)
+    monkeypatch.setattr(FeatureMatcher, "_find_with", look)
     result = with_sift(ground, camera).locate(frame, prior, Budget(total_ms=budget_ms))
     assert result.reason is Reason.TOO_FEW_MATCHES
-    assert [belief.turn_deg is None for belief in beliefs] == [False, True][:looks]
-    assert [belief.heights_m for belief in beliefs] == [(150.0, 150.0), (75.0, 300.0)][:looks]
+    assert [hypothesis.x_axis_deg is None for hypothesis in hypotheses] == [False, True][:looks]
+    assert [hypothesis.heights_m for hypothesis in hypotheses] == [(150.0, 150.0), (75.0, 300.0)][:looks]
 
 
 # Where SIFT's features come from
@@ -350,9 +350,10 @@ def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, 
     """Of roll, pitch and heading by turns; of the two tilts each by whether it was told."""
     lifted = cv2.Rodrigues(np.radians([0.0, mounted_deg, 0.0]))[0] @ camera.mount  # about the body's right
     frame = Frame(np.zeros((8, 8), np.uint8), 0, 100.0, 40.0, None, 3.0)
-    query = SimpleNamespace(frame=frame, camera=replace(camera, mount=lifted))
+    known = GridPose(frame.height_agl_m, frame.heading_deg, frame.roll_deg, frame.pitch_deg)
+    query = SimpleNamespace(telemetry=known, camera=replace(camera, mount=lifted))
     errors = AssumedErrors(tilt_deg=0.4, unknown_tilt_deg=5.0)
-    prior = sift._attitude_prior(query, 40.0, 1.5, errors)
+    prior = attitude_prior(query, 40.0, 1.5, errors)
     for about_body_deg in np.diag([5.0, 0.4, 1.5]):
         about_camera = lifted.T @ np.radians(about_body_deg)
         assert about_camera @ prior.precision @ about_camera == pytest.approx(1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, SceneMatcher, Window
-from engine.methods.ncc import NccOptions
+from engine.methods.options import NccOptions
 from tests.support.ground import Ground
 
 HEIGHT_M = 80.0

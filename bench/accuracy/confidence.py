@@ -19,7 +19,7 @@ from bench.accuracy.judged import Bench, Row
 from bench.accuracy.trials import Trial, ground
 from engine.confidence import PeakModel, PoseModel
 from engine.device import set_threads
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
 MODELS = {"NCC": PeakModel, "SIFT": PoseModel}

@@ -31,7 +31,7 @@ from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, track_row
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
 from engine.navigator import ACCEPT_ALL, Matcher
 from engine.report.metrics import Ground, errors_en_m, summarise
 from engine.sim import plan_flight

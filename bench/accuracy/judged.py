@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 from bench.accuracy.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.confidence import probability, regressors
-from engine.methods import ncc, sift
-from engine.methods.hypothesis import NccOptions
-from engine.methods.query import Query, level_crop
-from engine.methods.sift import SiftOptions
+from engine.confidence import regressors
+from engine.methods.feature_pose import PoseCandidate
+from engine.methods.ncc import Ncc, PeakCandidate
+from engine.methods.options import NccOptions, SiftOptions
+from engine.methods.query import Query
+from engine.methods.sift import Sift
 from engine.ncc_fft import surface
 from engine.pose import PoseOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
+from engine.window import level_crop
 
 Array = NDArray[np.float64]
+M = TypeVar("M", Ncc, Sift)
 
 METHODS = {"NCC": 0.5, "NCC, refined": 0.2, "SIFT": 0.2, "auto": 0.1}
 """Which share of the matches is by which."""
@@ -90,14 +93,15 @@ class Bench:
         matcher = self.matcher(made.on, method)
         if method == "NCC":
             query = _query(matcher, made.frame, made.prior)
-            found = ncc.find(query, matcher._prepared, matcher.options.ncc)
+            ncc = _part(matcher, "ncc", Ncc)
+            found = ncc.find(query)
             if isinstance(found, NoFix):
                 return self.row(made, method, None, False, [], [])
-            result = ncc.judge(query, found, matcher.options.ncc.rule)
-            assert found.evidence is not None  # there is a prior, and a heading and height to trust
-            scores = [probability(found.evidence), found.peak.score, _psr(query, matcher, found)]
-            scores.append(-found.evidence.ratio)
-            values = regressors(found.evidence).tolist()
+            result = ncc.judge(query, found)
+            assert found.features is not None  # there is a prior, and a heading and height to trust
+            scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found)]
+            scores.append(-found.features.ratio)
+            values = regressors(found.features).tolist()
             return self.row(made, method, found.fix, isinstance(result, Fix), scores, values)
         if method == "SIFT":
             return self.posed(made, made.frame, made.prior, matcher.options.sift)
@@ -110,14 +114,15 @@ class Bench:
         """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""
         matcher = self.matcher(made.on, "SIFT")
         query = _query(matcher, frame, prior)
-        found = sift.find(query, matcher._landmarks, options)
-        fixed = isinstance(found, sift.Found) and not sift.doubtful(found, options)
+        sift = _part(matcher, "sift", Sift)
+        found = sift.find(query, options)
+        fixed = isinstance(found, PoseCandidate) and found.confidence >= options.min_confidence
         if isinstance(found, NoFix):
-            found = sift.find(query, matcher._landmarks, replace(options, pose=LOOSE, min_confidence=0.0))
+            found = sift.find(query, replace(options, pose=LOOSE, min_confidence=0.0))
         if isinstance(found, NoFix):
             return self.row(made, "SIFT", None, False, [], [])
-        scores = [probability(found.evidence), -found.evidence.log10_nfa, found.fix.score]
-        return self.row(made, "SIFT", found.fix, fixed, scores, regressors(found.evidence).tolist())
+        scores = [found.confidence, -found.features.log10_nfa, found.fix.score]
+        return self.row(made, "SIFT", found.fix, fixed, scores, regressors(found.features).tolist())
 
     def row(
         self, made: Trial, method: str, fix: Fix | None, fixed: bool, scores: list[float], values: list[float]
@@ -139,10 +144,17 @@ def _query(matcher: SceneMatcher, frame: Frame, prior: Prior | None) -> Query:
     return matcher._query(frame, prior, Deadline(Budget()))
 
 
-def _psr(query: Query, matcher: SceneMatcher, found: ncc.Found) -> float:
+def _part(matcher: SceneMatcher, name: str, kind: type[M]) -> M:
+    """The method of a matcher that is only made of that one."""
+    method = matcher._method.parts.get(name, matcher._method)
+    assert isinstance(method, kind)
+    return method
+
+
+def _psr(query: Query, ncc: Ncc, found: PeakCandidate) -> float:
     """Peak-to-sidelobe ratio: the peak above the mean of the rest, in standard deviations of the rest."""
     crop = level_crop(query.site, found.fix.window, found.aligned.level)
-    region, template = matcher._prepared.cut(crop, found.aligned.level), found.aligned.template
+    region, template = ncc.prepared.cut(crop, found.aligned.level), found.aligned.template
     scores = surface(region.search, template[None])[0].numpy()
     y, x = np.unravel_index(int(scores.argmax()), scores.shape)
     rows, columns = np.ogrid[: scores.shape[0], : scores.shape[1]]

@@ -25,7 +25,7 @@ from bench import SHARED
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher, device
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
-from engine.methods.hypothesis import NccOptions
+from engine.methods.options import NccOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import Motion, SensorNoise, build_town, plan_flight
 from engine.sim.vehicle import measure

@@ -25,8 +25,7 @@ from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMat
 from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.integrity import AssumedErrors
-from engine.methods.hypothesis import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.methods.options import NccOptions, SiftOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import plan_flight
 from engine.sim.town import EXACT

@@ -23,16 +23,19 @@ from bench import DOCS, SHARED
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.align import SCORES, enhance, to_gray
 from engine.budget import Budget, Deadline
+from engine.confidence import PriorAgreement, peak_features
 from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.indexes.prepared import PreparedMap
 from engine.integrity import judge_peak, score_sigma
-from engine.methods import hypothesis
-from engine.methods.hypothesis import Aligned, NccOptions
-from engine.methods.query import Query, Stopwatch, level_for
+from engine.methods.correlation import Aligned, Correlator
+from engine.methods.options import NccOptions
+from engine.methods.query import Query
+from engine.methods.scheduler import Scheduler
 from engine.ncc_fft import match_template, prepare
 from engine.sim import plan_flight
+from engine.window import level_for
 
 Gray = NDArray[np.uint8]
 
@@ -123,7 +126,7 @@ def fly(flight: Flight, score: str, site: OrthoMap | None = None) -> list[Trial]
         east, north = truth + rng.uniform(-PRIOR_OFF_M, PRIOR_OFF_M, 2)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
         gray = flight.camera.undistort(to_gray(frame))
-        query = Query(frame, gray, pinhole, ground, prior, CPU, Stopwatch(Deadline(Budget()), CPU))
+        query = Query(frame, gray, pinhole, ground, prior, CPU, Scheduler(Deadline(Budget()), CPU))
         trials.append(search(query, prepared, options, truth))
     return trials
 
@@ -134,18 +137,20 @@ def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDAr
     site, height_m = query.site, query.frame.height_agl_m
     assert height_m is not None
     level = level_for(site.gsd_m_per_px, height_m / query.camera.focal_px, site.levels)
-    aligned = hypothesis.align(query, query.frame, level, options)
+    correlator = Correlator(query, prepared, options)
+    aligned = correlator.align(query.telemetry, level)
     if not isinstance(aligned, Aligned):
         return refused
-    window = hypothesis.window_about(query, aligned, options)
-    peak = None if window is None else hypothesis.search(query, prepared, aligned, window, options)
+    window = correlator.window(aligned)
+    peak = None if window is None else correlator.search(aligned, window)
     if peak is None:
         return refused
     pixels = aligned.template.numel()
     nadir = site.full_from_level(np.array([peak.x, peak.y]) - aligned.patch.offset_px, level)
     error_m = float(np.hypot(*(site.enu_from_pixel(nadir) - truth)))
     lead = (peak.score - peak.second_score) / score_sigma(pixels)
-    believed = judge_peak(peak, pixels, options.rule, whole_map=False) is None
+    at_prior = peak_features(peak, score_sigma(pixels), PriorAgreement(0.0, 1.0))
+    believed = judge_peak(peak, pixels, at_prior, None, options.rule) is None
     return Trial(error_m, lead if error_m <= WRONG_M else -lead, believed)
 
 

@@ -21,8 +21,8 @@ from engine.align import to_gray, view_of
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
-from engine.methods.query import level_for
 from engine.values import Attitude, Truth, Window
+from engine.window import level_for
 
 ALIGNED = 0.75  # least correlation at which a photograph counts as aligned with its map
 _PHOTOGRAPHS = "caliterra"

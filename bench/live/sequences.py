@@ -33,7 +33,7 @@ from engine import (
     SceneMatcher,
     device,
 )
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
 from engine.pose import PoseOptions
 
 SIDE_PX, MAP_PX, GSD_M = 64, 192, 0.5

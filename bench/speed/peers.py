@@ -15,10 +15,12 @@ from engine import Budget, Camera, Fix, Frame, NoFix, OrthoMap, Prior
 from engine.align import to_gray, view_of
 from engine.budget import Deadline
 from engine.geo import attitude_from_rotation, enu_from_body
-from engine.methods.query import Query, Stopwatch, level_crop, level_for
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
+from engine.methods.query import Query
+from engine.methods.scheduler import Scheduler
 from engine.pose import AttitudePrior, PoseStats, solve_pose
-from engine.values import Attitude, Reason, Window
+from engine.values import Attitude, GridPose, Reason, Window
+from engine.window import level_crop, level_for
 
 Image = NDArray[np.float32]
 
@@ -132,9 +134,9 @@ class OpenCvFeatures:
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """Where the camera was."""
         device, options, site = torch.device("cpu"), self._options, self.site
-        watch = Stopwatch(Deadline(budget or Budget()), device)
+        scheduler = Scheduler(Deadline(budget or Budget()), device)
         gray = self._camera.undistort(to_gray(frame))
-        query = Query(frame, gray, self._pinhole, site, prior, device, watch)
+        query = Query(frame, gray, self._pinhole, site, prior, device, scheduler)
         window = self._window(query)
         if window is None:
             return query.refuse(Reason.OUTSIDE_MAP, "no window", "sift")
@@ -147,21 +149,23 @@ class OpenCvFeatures:
         points_px = (seen.xy_px[pairs[:, 0]] + 0.5) / options.scale - 0.5
         map_px = site.full_from_level(known.xy_px[pairs[:, 1]] + corner, level)
         points_m = np.c_[site.enu_from_pixel(map_px), site.surface_at(map_px)]
-        stats = solve_pose(points_m, points_px, self._camera.matrix, options.pose, prior=self._attitude(frame))
+        stats = solve_pose(
+            points_m, points_px, self._camera.matrix, options.pose, prior=self._attitude(query.telemetry)
+        )
         if stats is None or stats.rotation[2, 2] > -math.cos(math.radians(options.max_tilt_deg)):
             return query.refuse(Reason.BAD_POSE, f"no pose from {len(pairs)} matches", "sift", window=window)
         return self._fix(query, stats, window)
 
     def _window(self, query: Query) -> Window | None:
-        frame, site = query.frame, self.site
-        if query.prior_px is None or frame.height_agl_m is None:
+        pose, site = query.telemetry, self.site
+        if query.prior_px is None or pose.height_agl_m is None:
             return Window(0, 0, site.width_px, site.height_px)
-        attitude = frame.attitude or Attitude(0.0, 0.0, 0.0)
-        view = view_of(self._camera, attitude, frame.height_agl_m, query.jacobian)
+        attitude = pose.grid_attitude or Attitude(0.0, 0.0, 0.0)
+        view = view_of(self._camera, attitude, pose.height_agl_m, query.jacobian)
         if view is None:
             return None
         footprint = view.footprint_px
-        if frame.heading_deg is None:
+        if pose.grid_heading_deg is None:
             footprint = (math.hypot(*footprint),) * 2
         return query.window(query.prior_px + view.center_px, footprint, footprint, margin=self._options.margin)
 
@@ -191,11 +195,11 @@ class OpenCvFeatures:
         count = round(options.max_keypoints * max(1.0, crop.area_px / frame_px))
         return _opencv_features(site.gray(crop, level), min(count, most or count), mask)
 
-    def _attitude(self, frame: Frame) -> AttitudePrior | None:
-        errors = self._options.errors
-        if not self._options.use_attitude or None in (frame.heading_deg, frame.roll_deg, frame.pitch_deg):
+    def _attitude(self, pose: GridPose) -> AttitudePrior | None:
+        errors, attitude = self._options.errors, pose.grid_attitude
+        if not self._options.use_attitude or attitude is None or not pose.has_tilt:
             return None
-        turn = enu_from_body(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)
+        turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
         sigma_deg = (errors.tilt_deg, errors.tilt_deg, errors.heading_deg)
         return AttitudePrior((turn @ self._camera.mount).T, sigma_deg)
 
@@ -203,25 +207,15 @@ class OpenCvFeatures:
         errors, site = self._options.errors, self.site
         slope_deg = errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg
         slope_m2 = (float(stats.center_m[2]) * math.radians(slope_deg)) ** 2
-        east, north, up = (float(v) for v in stats.center_m)
-        x, y = site.pixel_from_enu(stats.center_m[:2])
-        lat, lon = site.geodetic_from_pixel(np.array([x, y]))
-        return Fix(
-            timestamp_ns=query.frame.timestamp_ns,
-            lat_deg=float(lat),
-            lon_deg=float(lon),
-            east_m=east,
-            north_m=north,
-            up_m=up,
-            covariance_m2=stats.covariance_center_m2
-            + np.diag([slope_m2, slope_m2, 0])
-            + errors.map_m**2 * np.eye(3),
-            attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ self._camera.mount.T)),
+        return query.fix(
+            "sift",
+            site.pixel_from_enu(stats.center_m[:2]),
+            stats.covariance_center_m2 + np.diag([slope_m2, slope_m2, 0]) + errors.map_m**2 * np.eye(3),
             score=float(stats.inliers.mean()),
-            method="sift",
             window=window,
-            timings=query.watch.timings,
-            map_xy_px=(float(x), float(y)),
+            east_north_m=stats.center_m[:2],
+            up_m=float(stats.center_m[2]),
+            grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ self._camera.mount.T)),
         )
 
 

@@ -14,7 +14,7 @@ from bench.speed import peers
 from bench.speed.conftest import peak_memory_mb
 from engine import Fix, MatcherOptions, SceneMatcher, ncc_fft
 from engine.kernels import reference  # the float64 truth that errors are counted from
-from engine.methods.hypothesis import NccOptions
+from engine.methods.options import NccOptions
 
 SIZES = [
     (96, 64),

@@ -20,7 +20,7 @@ import numpy as np
 from bench.inputs.scenes import flight, mosaic, town_gray
 from engine import Fix, MatcherOptions, OrthoMap, SceneMatcher, device
 from engine.formats.geotiff import write_geotiff
-from engine.methods.hypothesis import NccOptions
+from engine.methods.options import NccOptions
 from engine.sim import build_town
 
 

@@ -1,1 +1,1 @@
-"""Whole runs: follow a flight, compare methods, campaigns, simulation, bridges; a library, without a command line."""
+"""Whole runs as a library: follow a flight, compare methods, campaigns, simulation, bridges."""

@@ -13,7 +13,7 @@ from engine.cli.arguments import check_folder, prepare_folder
 from engine.errors import OptionError
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
-from engine.matcher import METHODS
+from engine.methods import METHODS
 from engine.report.comparison import draw_comparison
 from engine.runs.tracking import FlightFiles, Settings, open_inputs, run_track, settings_from
 

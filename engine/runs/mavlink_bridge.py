@@ -25,7 +25,8 @@ from engine.cli.arguments import (
 )
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.live import LiveOptions
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
 from engine.orthomap import OrthoMap
 from engine.runs.checks import check_place
 from engine.runs.watching import Watching, watched_beside

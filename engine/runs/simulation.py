@@ -18,7 +18,8 @@ from engine.errors import OptionError
 from engine.formats.flight import write_flight_folder
 from engine.formats.track import TrackRow, read_track, track_row, write_track
 from engine.formats.truth import read_truth
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
 from engine.orthomap import OrthoMap
 from engine.report.closed_loop import draw_loop, summarise_loop, write_record
 from engine.report.figures import draw_figures

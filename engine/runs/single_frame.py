@@ -12,7 +12,8 @@ from engine.cli import console
 from engine.cli.arguments import check_choice, check_device, open_map, parse_position
 from engine.errors import OptionError
 from engine.formats.frames import read_image
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
 from engine.runs.checks import check_place
 from engine.values import Fix, Frame, NoFix
 

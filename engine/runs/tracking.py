@@ -30,9 +30,9 @@ from engine.formats.ros.bags import is_bag, read_bag_camera
 from engine.formats.settings import changed, nested, options_from_mapping, read_settings
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
-from engine.matcher import METHODS, PROFILES, MatcherOptions, SceneMatcher
-from engine.methods.hypothesis import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
+from engine.methods.options import PROFILES, MatcherOptions, NccOptions, SiftOptions
 from engine.navigator import ACCEPT_ALL, Navigator, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude

@@ -7,7 +7,7 @@ import pytest
 
 from engine import OptionError
 from engine.formats.settings import changed, meanings_of, options_from_mapping, read_settings, settings_text
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.runs.tracking import Settings, settings_from
 

@@ -136,7 +136,7 @@ def test_a_vague_place_is_searched_coarse_to_fine_and_too_vague_a_one_refused(la
     assert isinstance(found, Fix)
     assert np.hypot(*(np.array(found.map_xy_px) - truth)) < 4.0
     assert found.window.area_px > 16e6
-    monkeypatch.setattr("engine.methods.ncc.WIDE_PX", 100_000)
+    monkeypatch.setattr("engine.methods.ncc.MAX_WINDOW_PX", 100_000)
     refused = matcher.locate(frame, prior)
     assert isinstance(refused, NoFix)
     assert refused.reason is Reason.MAP_TOO_LARGE
@@ -189,7 +189,7 @@ def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_p
 @pytest.fixture
 def tiny_limits(monkeypatch):
     """A map of a few hundred pixels a side counts as large, and its copy has tiles of 128."""
-    for module in ("metric_copy", "pyramid"):
+    for module in ("maps.metric_copy", "maps.pyramid"):
         monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
     monkeypatch.setattr(metric_copy, "TILE_PX", 128)
     monkeypatch.setattr(metric_copy, "COARSEST_PX", 64)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
-from engine.methods import ncc as ncc_method
-from engine.methods.ncc import NccOptions
+from engine.methods.ncc import Ncc
+from engine.methods.options import NccOptions
 from engine.sim import FlightStyle, SensorNoise, paper_flight
 from tests.support.towns import drawn_town, site_of
 
@@ -57,22 +57,22 @@ def turn_between(a_deg, b_deg):
 
 
 @pytest.fixture
-def laid_heights(monkeypatch):
-    """The heights by which fixes were laid; a fix does not say them."""
-    heights, real = [], ncc_method._fix
+def aligned_heights(monkeypatch):
+    """The heights of the hypotheses behind the fixes; a fix does not have them."""
+    heights, real = [], Ncc._fix
 
-    def noting(query, aligned, *rest, **named):
-        heights.append(aligned.frame.height_agl_m)
-        return real(query, aligned, *rest, **named)
+    def noting(self, correlator, aligned, *rest, **named):
+        heights.append(aligned.pose.height_agl_m)
+        return real(self, correlator, aligned, *rest, **named)
 
-    monkeypatch.setattr(ncc_method, "_fix", noting)
+    monkeypatch.setattr(Ncc, "_fix", noting)
     return heights
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
 @pytest.mark.parametrize(("turn_deg", "share"), OFF)
 def test_a_wrong_heading_and_height_are_put_right(
-    matcher, site, flight, error_m, laid_heights, turn_deg, share, known
+    matcher, site, flight, error_m, aligned_heights, turn_deg, share, known
 ):
     bank = matcher(heading_search_deg=5.0, height_search_share=0.05)
     for k in PLACES:
@@ -80,7 +80,7 @@ def test_a_wrong_heading_and_height_are_put_right(
         fix = bank.locate(told(frame, turn_deg, share), near(truth) if known else None)
         assert error_m(site, fix, truth) < 2.0
         assert turn_between(fix.attitude.heading_deg, truth.heading_deg) < 0.3
-        assert laid_heights[-1] == pytest.approx(truth.height_agl_m, rel=0.005)
+        assert aligned_heights[-1] == pytest.approx(truth.height_agl_m, rel=0.005)
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])

@@ -1,4 +1,4 @@
-"""The anytime ladder: what is done of each method within a budget, and what is refused before it is begun."""
+"""The scheduler: what is done of each method within a budget, and what is refused before it is begun."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import numpy as np
 import pytest
 
 from engine import Budget, Fix, Navigator, NoFix, OrthoMap, Prior, Reason, SceneMatcher
-from engine.methods import sift
+from engine.methods.sift import Sift
 
 NADIR = np.array([315.0, 296.0])
-HURRY = Budget(total_ms=1e6)  # finite, so that prices count, and never over
+HURRY = Budget(total_ms=1e6)  # finite, so that costs count, and never over
 
 
-class Prices:
-    """Prices that a test sets, per rung and unit of work; nothing is learned."""
+class FixedCosts:
+    """Costs that a test sets, per step and unit of work; nothing is learned."""
 
     def __init__(self, **per_unit):
-        self.per_unit = {name.replace("_", " "): price for name, price in per_unit.items()}
+        self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
 
-    def expected_ms(self, rung, work):
-        return self.per_unit.get(rung, 0.0) * work
+    def upper_bound_ms(self, step, work):
+        return self.per_unit.get(step, 0.0) * work
 
-    def learn(self, rung, work, ms):
+    def learn(self, step, work, ms):
         pass
 
-    def doubt(self, rung, *, price):
+    def note_refusal(self, step, *, decay_cost):
         pass
 
 
@@ -42,7 +42,7 @@ def site(ground):
 def make(site, camera):
     def made(method, **per_unit):
         matcher = SceneMatcher(site, camera, method, "cpu")
-        matcher._costs = Prices(**per_unit)
+        matcher._costs = FixedCosts(**per_unit)
         return matcher
 
     return made
@@ -64,7 +64,7 @@ def off_m(ground, fix):
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift"])
-def test_with_time_the_highest_rung(ground, make, frame, prior, method):
+def test_with_time_the_finest_level(ground, make, frame, prior, method):
     for budget in (None, HURRY):
         fix = make(method).locate(frame, prior, budget)
         assert off_m(ground, fix) < 1.0
@@ -72,21 +72,21 @@ def test_with_time_the_highest_rung(ground, make, frame, prior, method):
 
 
 def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, prior):
-    fix, fine = make("ncc", dense=1e9).locate(frame, prior, HURRY), make("ncc").locate(frame, prior, HURRY)
+    fix, fine = make("ncc", refinement=1e9).locate(frame, prior, HURRY), make("ncc").locate(frame, prior, HURRY)
     assert isinstance(fix, Fix)
     assert isinstance(fine, Fix)
     assert (fix.stage, fix.up_m, fine.stage) == ("fine", None, "refined")
     assert fine.sigma_m <= fix.sigma_m
 
 
-@pytest.mark.parametrize(("method", "rung"), [("ncc", "ncc"), ("sift", "sift")])
-def test_with_less_time_a_coarse_fix_of_the_same_place(ground, make, frame, prior, method, rung):
+@pytest.mark.parametrize(("method", "step"), [("ncc", "ncc"), ("sift", "sift")])
+def test_with_less_time_a_coarse_fix_of_the_same_place(ground, make, frame, prior, method, step):
     fine = make(method)
     work = []
-    fine._costs.expected_ms = lambda name, pixels: work.append(pixels) or 0.0
+    fine._costs.upper_bound_ms = lambda name, pixels: work.append(pixels) or 0.0
     fine.locate(frame, prior, HURRY)
-    # A pixel costs so much that the finest rung is 1.5 times the budget.
-    fix = make(method, **{rung: 1.5 * HURRY.total_ms / work[0]}).locate(frame, prior, HURRY)
+    # A pixel costs so much that the finest step is 1.5 times the budget.
+    fix = make(method, **{step: 1.5 * HURRY.total_ms / work[0]}).locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
 
@@ -106,21 +106,21 @@ def test_both_methods_verify_each_other(ground, make, frame, prior):
     assert fix.stage == "verified"
 
 
-@pytest.mark.parametrize(("prices", "method"), [({"sift": 1e9}, "ncc"), ({"ncc": 1e9}, "sift")])
-def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, prices, method):
-    fix = make("auto", **prices).locate(frame, prior, HURRY)
+@pytest.mark.parametrize(("costs", "method"), [({"sift": 1e9}, "ncc"), ({"ncc": 1e9}, "sift")])
+def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, costs, method):
+    fix = make("auto", **costs).locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 1.0
     assert (fix.stage, fix.method) == ({"ncc": "refined", "sift": "fine"}[method], method)
 
 
 def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):
-    honest = sift.locate
+    honest = Sift.locate
 
-    def elsewhere(*args):
-        fix = honest(*args)
+    def elsewhere(*args, **named):
+        fix = honest(*args, **named)
         return replace(fix, east_m=fix.east_m + 40.0)
 
-    monkeypatch.setattr(sift, "locate", elsewhere)
+    monkeypatch.setattr(Sift, "locate", elsewhere)
     result = make("auto").locate(frame, prior)
     assert isinstance(result, NoFix)
     assert result.reason is Reason.INCONSISTENT
@@ -142,18 +142,18 @@ def test_a_search_of_the_whole_map_has_a_budget_of_its_own(ground, make, frame):
     assert off_m(ground, fix) < 1.5
 
 
-def test_prices_are_learned_and_then_kept_to(ground, camera, frame, prior):
+def test_costs_are_learned_and_then_kept_to(ground, camera, frame, prior):
     matcher = SceneMatcher(ground.site, camera, "auto", "cpu")
     matcher.warmup()
-    for rung, work in (("ncc", 100_000.0), ("sift", 22_500.0), ("ncc search", 1e5), ("sift search", 22_500.0)):
-        assert matcher._costs.expected_ms(rung, work) > 0.0
+    for step, work in (("ncc", 100_000.0), ("sift", 22_500.0), ("ncc search", 1e5), ("sift search", 22_500.0)):
+        assert matcher._costs.upper_bound_ms(step, work) > 0.0
     assert isinstance(matcher.locate(frame, prior, Budget(total_ms=1e4)), Fix)
     refused = matcher.locate(frame, prior, Budget(total_ms=0.3))
     assert isinstance(refused, NoFix)
     assert refused.reason is Reason.LATE
 
 
-def test_a_price_that_is_refused_fades_until_it_is_tried_again(ground, camera, frame, prior):
+def test_a_cost_that_is_refused_decays_until_it_is_tried_again(ground, camera, frame, prior):
     matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
     matcher._costs.learn("ncc", 1e6, 1e5)  # the machine was slow
     results = [matcher.locate(frame, prior, Budget(total_ms=2e4)) for _ in range(300)]
@@ -161,7 +161,7 @@ def test_a_price_that_is_refused_fades_until_it_is_tried_again(ground, camera, f
     assert isinstance(results[-1], Fix)
 
 
-def test_a_vague_prior_is_no_price_of_a_sharp_one(site, camera, frame, prior):
+def test_a_vague_prior_does_not_raise_the_cost_of_a_sharp_one(site, camera, frame, prior):
     """A window is never larger than the map, whatever the prior says: neither is what it is thought to cost."""
     matcher = SceneMatcher(site, camera, "ncc", "cpu")
     for vague in (5.0, 1e6, 5.0, 1e6):
@@ -169,7 +169,7 @@ def test_a_vague_prior_is_no_price_of_a_sharp_one(site, camera, frame, prior):
     assert isinstance(matcher.locate(frame, prior, Budget(total_ms=60_000.0)), Fix)
 
 
-def test_after_warmup_nothing_is_made_in_flight(ground, site, camera):
+def test_after_warmup_nothing_is_created_in_flight(ground, site, camera):
     matcher = SceneMatcher(site, camera, "auto", "cpu")
     matcher.warmup()
     before = matcher.cache_counters

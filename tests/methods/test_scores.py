@@ -14,9 +14,10 @@ from engine.align import SCORES, enhance
 from engine.budget import Budget, Deadline
 from engine.indexes import prepared as prepared_map
 from engine.indexes.prepared import PreparedMap
-from engine.methods import ncc
-from engine.methods.hypothesis import NccOptions
-from engine.methods.query import Query, Stopwatch
+from engine.methods.ncc import Ncc
+from engine.methods.options import NccOptions
+from engine.methods.query import Query
+from engine.methods.scheduler import Scheduler
 from engine.values import Window
 from tests.support.paths import ROOT
 
@@ -146,11 +147,10 @@ def test_regions_of_a_large_map_join_without_a_seam(score, nodata, ground, monke
 
 def locate(ground, camera, frame, score):
     """The NCC method on a map that was prepared for a score."""
-    options = NccOptions(score=score)
-    prepared = PreparedMap(ground.site, CPU, options.enhance_radius_px, score)
-    watch = Stopwatch(Deadline(Budget()), CPU)
-    query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, watch)
-    return ncc.locate(query, prepared, options)
+    options = MatcherOptions(ncc=NccOptions(score=score))
+    scheduler = Scheduler(Deadline(Budget()), CPU)
+    query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, scheduler)
+    return Ncc(ground.site, CPU, options).locate(query)
 
 
 def assert_found(result):

@@ -14,9 +14,7 @@ from engine.formats.notes import Note, note_of, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.integrity import PeakRule
-from engine.matcher import MatcherOptions
-from engine.methods.hypothesis import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
 from engine.report.charts import Plot, ticks
 from engine.report.explain import choose_frames
 from engine.report.metrics import Errors, Ground, summarise

@@ -12,8 +12,8 @@ from engine.runs.record import Record, read_record
 RECORD = Record(
     map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,
     frame_stamps="/s.csv", log_offset_s=0.5, heights={"take-off": 3}, method="ncc", profile="engine",
-    device="cpu", changed={"ncc.rule.sure": 1.0}, origin={"lat_deg": 48.0, "lon_deg": 16.0}, ground_m=3.5,
-    ground_amsl_m=None, more={"closed_loop": {"minutes": 1.0}},
+    device="cpu", changed={"ncc.rule.null_test_below": 1.0}, origin={"lat_deg": 48.0, "lon_deg": 16.0},
+    ground_m=3.5, ground_amsl_m=None, more={"closed_loop": {"minutes": 1.0}},
 )  # fmt: skip
 NAMES = [each.name for each in fields(Record) if each.name != "more"]
 WRONG = (5, True, [1], "x", {"a": None}, float("nan"))
