@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import hypothesis
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 
 from engine import Fix
 from engine.sim import paper_flight
+from tests.support import towns
 from tests.support.ground import CAMERA, Ground
 from tests.support.paths import NO_SHARED, SHARED
+from tests.support.runs import bare_runs
 from tests.support.towns import drawn_once, drawn_town, site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
@@ -36,11 +35,18 @@ def _no_home_directory(tmp_path_factory):
         yield
 
 
-@pytest.fixture
-def blank_figures(monkeypatch):
-    """Plots are one pixel: for runs in which their files count and not what is on them (a second a run)."""
-    blank = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
-    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(blank))
+@pytest.fixture(name="bare_runs")
+def _bare_runs():
+    """For tests of commands: see :func:`tests.support.runs.bare_runs`."""
+    with bare_runs():
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _workers_share_towns(tmp_path_factory, worker_id):
+    """Each worker has a folder of its own in that of the run."""
+    if worker_id != "master":
+        towns.kept_in = tmp_path_factory.getbasetemp().parent
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ def flight(tmp_path_factory):
     return folder
 
 
-@pytest.mark.usefixtures("towns_drawn_once", "blank_figures")
+@pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
 @pytest.mark.parametrize("page", [p for p in PAGES if FENCE.search(p.read_text(encoding="utf-8"))], ids=page_name)
 def test_snippets_run_as_they_stand(page, flight, monkeypatch):
     monkeypatch.chdir(flight)

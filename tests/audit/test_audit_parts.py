@@ -195,6 +195,7 @@ def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path,
     assert cv2.imread(str(tmp_path / "out" / "audit.png"), cv2.IMREAD_GRAYSCALE).std() > 5
 
 
+@pytest.mark.slow
 def test_a_huge_map_is_audited_along_a_route(huge_path, route_file, tmp_path, capsys):
     assert run(command(huge_path, tmp_path / "out", f"--route={route_file}", "--json")) == 0
     summary = json.loads(capsys.readouterr().out)

@@ -33,7 +33,7 @@ COLUMNS = (
 FRAMES = 6
 FIGURES = {"path.png", "position.png", "height.png", "error.png"}
 WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"} | FIGURES
-pytestmark = pytest.mark.usefixtures("blank_figures")  # but for `done`, which is drawn before it
+pytestmark = pytest.mark.usefixtures("bare_runs")  # but for `done`, which is drawn before it
 SCRIPT = Path(sys.executable).with_name("scenematch")
 
 
@@ -228,7 +228,7 @@ def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsy
 @pytest.mark.usefixtures("towns_drawn_once")
 def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsys):
     out = tmp_path / "demo"
-    assert run(["demo", "--frames=4", "--threads=1", f"--out={out}"]) == 0
+    assert run(["demo", "--frames=2", "--threads=1", f"--out={out}"]) == 0
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 80
     for row in ("NCC, as published", "NCC, paper's recipe", "SIFT, scenematch"):
@@ -236,9 +236,16 @@ def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsy
     runs = {"ncc-paper", "ncc-engine", "sift-paper", "sift-engine"}
     assert set(json.loads((out / "table.json").read_text(encoding="utf-8"))) == runs
     assert runs < {path.name for path in out.iterdir()}
-    # Once more and shorter: nothing of the first run is left beside the second.
-    assert run(["demo", "--frames=2", "--threads=1", f"--out={out}", "--force", "--json"]) == 0
+
+
+@pytest.mark.slow
+def test_a_second_demo_is_shorter_and_leaves_nothing_of_the_first_beside_it(tmp_path, capsys):
+    out = tmp_path / "demo"
+    for frames in (4, 2):
+        capsys.readouterr()
+        assert run(["demo", f"--frames={frames}", "--threads=1", f"--out={out}", "--force", "--json"]) == 0
     printed = capsys.readouterr()
+    runs = {"ncc-paper", "ncc-engine", "sift-paper", "sift-engine"}
     assert {name: result["frames"] for name, result in json.loads(printed.out).items()} == dict.fromkeys(runs, 2)
     assert len(list((out / "flight" / "frames").iterdir())) == 2
     assert "left out" not in printed.err

@@ -266,7 +266,7 @@ def check_readable_or_one_line(path, frames):
 # ---------------------------------------------------------------------------------------------- command line
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("bare_runs")
 def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     from engine.runs.demo import write_flight
     from engine.sim import plan_flight

@@ -33,6 +33,7 @@ from engine.values import Attitude, Truth
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
 
+pytestmark = pytest.mark.usefixtures("bare_runs")
 CAMERA = Camera.from_fov(300, 300, 60.0)  # the simulated flights'
 GROUND_M = 120.0  # level of the miniatures' ground, above whatever their heights are counted from
 

@@ -454,7 +454,7 @@ def flown(tmp_path_factory):
     return folder
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("bare_runs")
 def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd):
     def follow(out, *more):
         files = ("map", "map.tif"), ("camera", "camera.yaml"), ("frames", "frames")

@@ -23,6 +23,10 @@ OFF = [
     pytest.param(-5.0, 0.03, marks=pytest.mark.slow), pytest.param(-1.7, -0.02, marks=pytest.mark.slow),
 ]  # fmt: skip
 
+KNOWN = pytest.mark.parametrize(
+    "known", [pytest.param(True, id="prior"), pytest.param(False, id="whole map", marks=pytest.mark.slow)]
+)
+
 
 @pytest.fixture(scope="module")
 def flight():
@@ -69,7 +73,7 @@ def aligned_heights(monkeypatch):
     return heights
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 @pytest.mark.parametrize(("turn_deg", "share"), OFF)
 def test_a_wrong_heading_and_height_are_put_right(
     matcher, site, flight, error_m, aligned_heights, turn_deg, share, known
@@ -97,7 +101,7 @@ def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site,
     assert fixes >= len(PLACES) - 1
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matcher, flight, known):
     """Where the heading was told and is trusted, a search of the whole map measures no attitude either."""
     frame, truth = flight.frames[PLACES[0]], flight.truth[PLACES[0]]
@@ -109,7 +113,7 @@ def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matche
     assert unrefined.attitude is None
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
     bank = matcher(other_site, heading_search_deg=5.0, height_search_share=0.05)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
@@ -117,7 +121,7 @@ def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
         assert isinstance(bank.locate(flight.frames[k], prior), NoFix)
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_a_frame_of_another_town_is_refused_all_around(matcher, other_site, flight, known):
     bank = matcher(other_site, heading_search_deg=180.0)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None

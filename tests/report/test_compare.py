@@ -37,7 +37,7 @@ def picture(path):
         return np.asarray(opened)
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("bare_runs")
 def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
     (tmp_path / "few.toml").write_text('method = "sift"\n[sift]\nmax_keypoints = 120\n', encoding="utf-8")
     out, runs = tmp_path / "out", ["--run=ncc", "--run=sift/paper", f"--run={tmp_path / 'few.toml'}"]

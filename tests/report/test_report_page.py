@@ -24,6 +24,7 @@ from engine.runs.demo import write_flight
 from engine.runs.tracking import Settings, run_evaluate, run_track
 from engine.sim import plan_flight
 from engine.values import Reason, Window
+from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
 FRAMES = 8
@@ -214,7 +215,8 @@ def flown(tmp_path_factory):
     inputs = write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
     black = folder / "frames" / f"{DARK:06d}.jpg"
     Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
-    run_track(inputs, folder.parent / "out", Settings(device="cpu", budget_ms=60_000.0))
+    with bare_runs():
+        run_track(inputs, folder.parent / "out", Settings(device="cpu", budget_ms=60_000.0))
     return folder.parent / "out"
 
 
@@ -245,13 +247,13 @@ def test_every_frame_is_shown_with_its_match(flown):
     assert "deviate" in frames[DARK]["detail"]
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("bare_runs")
 def test_equal_tracks_give_equal_bytes(flown, again):
     run_evaluate(again, None)
     assert (again / "report.html").read_bytes() == (flown / "report.html").read_bytes()
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("bare_runs")
 def test_without_the_frames_the_page_says_so(flown, again):
     record = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     record["settings"]["frames"] = str(again / "gone")
@@ -261,7 +263,7 @@ def test_without_the_frames_the_page_says_so(flown, again):
     assert "No frames are shown" in (again / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("bare_runs")
 def test_a_run_that_left_no_notes_has_a_page_without_frames(again):
     (again / "notes.csv").unlink()
     run_evaluate(again, None)

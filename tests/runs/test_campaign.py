@@ -29,6 +29,7 @@ from engine.runs.executors import in_processes
 from engine.runs.jobs import read_result
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
+from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
 pytestmark = pytest.mark.timeout(900)  # a dozen processes, on a machine that may be busy
@@ -73,7 +74,7 @@ def in_this_process(*_):
 @pytest.fixture(scope="module")
 def whole(place):
     """The campaign in this process, from its begin to its end."""
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, bare_runs():
         patch.setattr("engine.runs.campaign._executor", in_this_process)
         code = run(["campaign", str(place / "campaign.toml"), f"--out={place / 'whole'}"])
     assert code == 1  # the flight that cannot be followed
@@ -148,6 +149,7 @@ def test_what_was_killed_half_way_is_resumed_by_more_processes_and_nothing_is_lo
     same(out, whole)
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_a_run_that_failed_is_tried_again_and_no_flight_is_drawn_for_nothing(
     place, whole, tmp_path, monkeypatch, capsys
 ):
@@ -391,6 +393,12 @@ def part(number):
     return f"said by {number}, not by {os.getppid()}"
 
 
+def test_a_job_whose_process_ends_is_answered():
+    with in_processes(1) as execute:
+        assert list(execute(part, [2])) == [(2, "its process ended with code 3")]
+
+
+@pytest.mark.slow
 def test_each_job_is_answered_once_even_where_its_process_dies():
     with in_processes(2) as execute:
         answers = list(execute(part, [1, 2, 3]))
