@@ -15,7 +15,7 @@ from engine.integrity import AssumedErrors, PeakRule
 from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.pose import PoseOptions
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from engine.values import Reason
 from tests.support.paths import ROOT

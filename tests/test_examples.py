@@ -14,7 +14,7 @@ import pytest
 
 from engine.formats.flight import open_flight
 from engine.formats.truth import read_truth
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town

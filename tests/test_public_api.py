@@ -67,7 +67,7 @@ def fresh():
         "sorted(n for n in sys.modules if n.startswith('engine.'))])); "
         "import engine.features, engine.orthomap; "
         "print('LATER', json.dumps([n for n in ('kornia', 'rasterio', 'pyproj') if n in sys.modules])); "
-        "import engine.runs.tracking, engine.runs.simulation, engine.runs.mavlink_bridge; "
+        "import engine.runs.tracking, engine.runs.closed_loop, engine.runs.mavlink_bridge; "
         "print('RUNS', json.dumps('rerun' in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from engine.device import set_threads
-from engine.runs.simulation import LoopSettings, WorldSettings, run_closed_loop
+from engine.runs import ClosedLoopSettings, WorldSettings, fly_closed_loop
 
 FLIGHTS = (
     ("noon", "ncc", "none"),
@@ -46,11 +46,9 @@ def main() -> None:
 
 
 def row(folder: Path, seed: int, minutes: float, condition: str, method: str, fault: str) -> list[str]:
-    scene, loop = (
-        WorldSettings(seed=seed, condition=condition),
-        LoopSettings(minutes=minutes, method=method, fault=fault),
-    )
-    figures = run_closed_loop(folder, scene, loop, force=True)
+    world = WorldSettings(seed=seed, condition=condition)
+    loop = ClosedLoopSettings(minutes=minutes, method=method, fault=fault)
+    figures = fly_closed_loop(folder, world, loop, force=True)
     return [
         str(seed),
         condition,

@@ -22,7 +22,7 @@ PARTS = ("Python", "import torch", "import engine", "open map and flight", "warm
 
 def startup(methods: tuple[str, ...] = ("ncc", "sift", "auto"), rounds: int = 1) -> list[Row]:
     """Every method with everything kept from an earlier start, and the last one with less."""
-    from engine.runs.demo import write_flight
+    from engine.runs.simulation import write_flight
     from engine.sim import plan_flight
 
     with tempfile.TemporaryDirectory() as name:

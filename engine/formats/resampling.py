@@ -183,7 +183,7 @@ def telemetry_at(
     if not ((moments >= begin - HOLD_NS) & (moments <= end + HOLD_NS)).any():
         raise TelemetryError(
             f"{log.path}: expected frames taken from {begin / 1e9:.3f} to {end / 1e9:.3f} s of the log, got "
-            f"frames from {moments[0] / 1e9:.3f} to {moments[-1] / 1e9:.3f} s; --log-offset-s moves them"
+            f"frames from {moments[0] / 1e9:.3f} to {moments[-1] / 1e9:.3f} s; `log_offset_s` moves them"
         )
     columns = {name: _column(log, name, moments) for name in (*_COLUMNS, *_POSITION)}
     columns["height_agl_m"], sources = _height(log, moments, columns["roll_deg"], columns["pitch_deg"])

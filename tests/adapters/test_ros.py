@@ -671,7 +671,7 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
 
 
 def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
-    from engine.runs.demo import write_flight
+    from engine.runs.simulation import write_flight
     from engine.sim import plan_flight
 
     write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))

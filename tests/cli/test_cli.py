@@ -22,7 +22,7 @@ from engine.cli.app import run
 from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
 from engine.runs import tracking as track_module
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.towns import drawn_town
 

@@ -79,7 +79,7 @@ def test_a_topic_is_of_a_bag(capsys):
 def test_a_camera_that_does_not_open_is_told(source):
     from engine.adapters.pictures import capture
 
-    with pytest.raises(TelemetryError, match=r"^--camera-source: expected a camera or stream that opens, got "):
+    with pytest.raises(TelemetryError, match=r"^camera_source: expected a camera or stream that opens, got "):
         next(capture(source))
 
 

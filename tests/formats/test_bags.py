@@ -268,7 +268,7 @@ def check_readable_or_one_line(path, frames):
 
 @pytest.mark.usefixtures("bare_runs")
 def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
-    from engine.runs.demo import write_flight
+    from engine.runs.simulation import write_flight
     from engine.sim import plan_flight
 
     folder, bag = tmp_path / "flight", tmp_path / "flight.bag"

@@ -27,7 +27,8 @@ from engine.maps.rasters import open_source
 from engine.report.published import PUBLISHED, published_cells
 from engine.runs.campaign_plan import RecordedFlight, plan_campaign
 from engine.runs.dataset_import import check_flight
-from engine.runs.tracking import Settings, run_track
+from engine.runs.settings import TrackSettings
+from engine.runs.tracking import track
 from engine.sim import picture_at, plan_flight
 from engine.values import Attitude, Truth
 from tests.support.paths import ROOT
@@ -88,8 +89,8 @@ def in_degrees(plan):
 
 def followed(flight, tmp_path, frames, truth, *, method="ncc"):
     """Every frame of the flight has a fix where the town's truth is."""
-    inputs = RecordedFlight(surface=None).inputs("flight", flight)
-    summary = run_track(inputs, tmp_path / "out", Settings(method=method), report=False)
+    files = RecordedFlight(surface=None).files("flight", flight)
+    summary = track(files, tmp_path / "out", TrackSettings(method=method), report=False)
     assert summary["fixes"] == summary["scored_fixes"] == len(frames)
     assert summary["max_m"] < 3.0  # without a surface model roofs lean
     told = read_truth(flight / "truth.csv")
@@ -562,7 +563,7 @@ def test_frames_without_truth_are_counted_and_the_telemetrys_heading_is_judged()
 
 
 def test_the_command_says_what_it_finds_and_leaves_with_one(plan, frames, truth, tmp_path, capsys):
-    from engine.runs.demo import write_flight
+    from engine.runs.simulation import write_flight
 
     write_flight(tmp_path, plan)
     assert run(["dataset", "check", str(tmp_path)]) == 0
@@ -606,11 +607,11 @@ def singles_followed(out, count):
     found = sorted(path.parent for path in out.glob("*/telemetry.csv"))
     assert len(found) == count
     for flight in found:
-        inputs = RecordedFlight().inputs(flight.name, flight)
-        assert inputs.surface is not None
+        files = RecordedFlight().files(flight.name, flight)
+        assert files.surface is not None
         for method in ("ncc", "sift"):
             tracks = out / "tracks" / flight.name / method
-            summary = run_track(inputs, tracks, Settings(method=method), report=False)
+            summary = track(files, tracks, TrackSettings(method=method), report=False)
             assert summary["fixes"] == summary["scored_fixes"] == 1
             assert summary["max_m"] < 2.0
     return found

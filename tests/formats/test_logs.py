@@ -1,6 +1,5 @@
 """Flight logs: written here byte by byte with known values, read back at the frames' moments."""
 
-import builtins
 import json
 import math
 import struct
@@ -30,7 +29,7 @@ from engine.formats.resampling import MAX_GAP_NS, Log, interpolate, make_series,
 from engine.formats.telemetry import read_telemetry
 from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.towns import drawn_town
 
@@ -374,19 +373,6 @@ def test_mutated_files_are_read_or_refused():
     done = fuzz(count=150, seed=3)
     assert len(done.outcomes) == 8
     assert all(told.total() == 150 for told in done.outcomes.values())
-
-
-def test_a_missing_extra_is_named(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(wanted, *rest):
-        if wanted.split(".")[0] == "pyulog":
-            raise ImportError(wanted)
-        return real(wanted, *rest)
-
-    path = ulog_flight(tmp_path / "a.ulg")
-    monkeypatch.setattr(builtins, "__import__", without)
-    assert "a ULog needs pyulog, the extra [logs]: pip install pyulog" in refusal(open_log, path)
 
 
 @pytest.mark.parametrize("piece", [" ", "\n", "a.", "<", "GPS(1,2,", "a  ", "1", "a:"])

@@ -9,28 +9,28 @@ from engine import OptionError
 from engine.formats.settings import changed, meanings_of, options_from_mapping, read_settings, settings_text
 from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
-from engine.runs.tracking import Settings, settings_from
+from engine.runs.settings import TrackSettings, load_settings
 
 KEY = re.compile(r"^#(\w+ = )", re.MULTILINE)
 
 
 def test_all_keys_set_to_what_the_file_shows_are_the_defaults(tmp_path):
     path = tmp_path / "all.toml"
-    text = KEY.sub(r"\1", settings_text(Settings()))
+    text = KEY.sub(r"\1", settings_text(TrackSettings()))
     path.write_text(text, encoding="utf-8")
-    assert read_settings(path, Settings) == Settings()
-    assert len(KEY.findall(settings_text(Settings()))) > 60
+    assert read_settings(path, TrackSettings) == TrackSettings()
+    assert len(KEY.findall(settings_text(TrackSettings()))) > 60
 
 
 def test_a_new_file_changes_nothing(tmp_path):
     path = tmp_path / "new.toml"
-    path.write_text(settings_text(Settings()), encoding="utf-8")
-    assert read_settings(path, Settings) == Settings()
+    path.write_text(settings_text(TrackSettings()), encoding="utf-8")
+    assert read_settings(path, TrackSettings) == TrackSettings()
 
 
 def test_every_field_that_a_file_can_hold_is_explained():
     """A key without a meaning would fail here by its name: the classes' docstrings are the file's comments."""
-    text = settings_text(Settings())
+    text = settings_text(TrackSettings())
     for line in KEY.findall(text):
         before = text[: text.index("\n#" + line)]
         assert before.splitlines()[-1].startswith("# "), line
@@ -42,7 +42,7 @@ def test_values_arrive(tmp_path):
         'method = "auto"\n[ncc]\nmargin = 2\n[ncc.rule]\nmin_sigmas = 6.5\n[sift]\nmax_turn_deg = "none"\n',
         encoding="utf-8",
     )
-    found = read_settings(path, Settings)
+    found = read_settings(path, TrackSettings)
     assert (found.method, found.ncc.margin, found.ncc.rule.min_sigmas) == ("auto", 2.0, 6.5)
     assert found.sift.max_turn_deg is None
     assert changed(found) == {
@@ -51,14 +51,14 @@ def test_values_arrive(tmp_path):
         "ncc.rule.min_sigmas": 6.5,
         "sift.max_turn_deg": None,
     }
-    assert changed(Settings()) == {}
+    assert changed(TrackSettings()) == {}
 
 
 def test_the_command_line_counts_more_than_the_file(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('method = "sift"\nbudget_ms = 40\n', encoding="utf-8")
-    found = settings_from(path, method="ncc", budget_ms=None)
-    assert found == replace(Settings(), method="ncc", budget_ms=40.0)
+    found = load_settings(path, method="ncc", budget_ms=None)
+    assert found == replace(TrackSettings(), method="ncc", budget_ms=40.0)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_what_is_wrong_is_named(tmp_path, text, message):
     path = tmp_path / "bad.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(OptionError) as caught:
-        read_settings(path, type(Settings().ncc))
+        read_settings(path, type(TrackSettings().ncc))
     assert str(caught.value).startswith(f"{path}: {message}")
     assert "\n" not in str(caught.value)
 

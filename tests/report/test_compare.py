@@ -12,9 +12,11 @@ from engine.cli.app import run
 from engine.formats.logs.readers import LogClock
 from engine.formats.track import read_track
 from engine.report.comparison import draw_comparison
-from engine.runs.comparison import USUAL, parse_runs
-from engine.runs.demo import write_flight
-from engine.runs.tracking import Settings, folder_inputs, run_track
+from engine.runs.comparison import DEFAULT_RUNS, parse_runs
+from engine.runs.inputs import FlightFiles
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import write_flight
+from engine.runs.tracking import track
 from engine.sim import plan_flight
 from tests.support.towns import drawn_town
 
@@ -51,7 +53,7 @@ def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
         assert summary == json.loads((out / name / "summary.json").read_text(encoding="utf-8"))
         assert len(read_track(out / name / "track.csv")) == summary["frames"] == 4
     assert f"{table['ncc']['rms_m']:.2f}" in printed
-    run_track(folder_inputs(flight), tmp_path / "alone", Settings(method="ncc"), report=False)
+    track(FlightFiles.in_folder(flight), tmp_path / "alone", TrackSettings(method="ncc"), report=False)
     alone, beside = (read_track(path / "track.csv") for path in (tmp_path / "alone", out / "ncc"))
     assert [replace(row, latency_ms=None) for row in alone] == [replace(row, latency_ms=None) for row in beside]
     assert (out / "comparison.png").is_file()
@@ -87,30 +89,30 @@ def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp
 
 
 def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr("engine.runs.comparison.run_compare", lambda inputs, *_, **__: told.append(inputs) or {})
-    monkeypatch.setattr("engine.runs.comparison.print_comparison", lambda *_: None)
+    compared = []
+    monkeypatch.setattr("engine.runs.comparison.compare", lambda files, *_, **__: compared.append(files) or {})
+    monkeypatch.setattr("engine.cli.tables.print_comparison", lambda *_: None)
     log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
     options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}", f"--frame-stamps={stamps}"]
     assert run(command(flight, tmp_path, *options, "--log-offset-s=-1.5", "--image-topic=/down")) == 0
-    assert (told[0].clock, told[0].image_topic) == (LogClock(stamps, -1.5), "/down")
+    assert (compared[0].clock(), compared[0].image_topic) == (LogClock(stamps, -1.5), "/down")
     assert run(command(flight, tmp_path)) == 0
-    assert (told[1].clock, told[1].image_topic) == (None, None)
+    assert (compared[1].has_clock, compared[1].image_topic) == (False, None)
     assert run(command(flight, tmp_path, "--log-offset-s=2")) == 2  # telemetry.csv is no log
 
 
 def test_the_usual_runs_are_table_one():
-    assert [run.name for run in parse_runs([])] == ["ncc-paper", "ncc-engine", "sift-paper", "sift-engine"]
-    assert len(USUAL) == 4
+    assert list(parse_runs([])) == ["ncc-paper", "ncc-engine", "sift-paper", "sift-engine"]
+    assert len(DEFAULT_RUNS) == 4
 
 
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        (["orb"], "--run: expected ncc, sift, auto, one of them with /paper, or a settings file, got 'orb'"),
-        (["ncc", "ncc"], "--run: expected runs of different names, got 'ncc' twice"),
-        (["ncc/fast"], "--profile: expected one of engine, paper, got 'fast'"),
-        (["auto/paper"], "--method: expected ncc or sift with --profile paper, got 'auto'"),
+        (["orb"], "runs: expected ncc, sift, auto, one of them with /paper, or a settings file, got 'orb'"),
+        (["ncc", "ncc"], "runs: expected runs of different names, got 'ncc' twice"),
+        (["ncc/fast"], "profile: expected one of engine, paper, got 'fast'"),
+        (["auto/paper"], "method: expected ncc or sift with `profile` paper, got 'auto'"),
     ],
 )
 def test_a_run_that_cannot_be_is_refused(runs, message):
@@ -123,7 +125,7 @@ def test_what_the_command_line_gives_holds_for_every_run(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("budget_ms = 40\n", encoding="utf-8")
     runs = parse_runs(["ncc", str(path)], budget_ms=121.0, start=None)
-    assert [run.settings.budget_ms for run in runs] == [121.0, 121.0]
+    assert [settings.budget_ms for settings in runs.values()] == [121.0, 121.0]
 
 
 def test_a_chart_without_truth_and_without_a_single_fix(flight, tmp_path):

@@ -18,10 +18,10 @@ from engine.formats.ros.messages import MessageFactory
 from engine.formats.track import read_track
 from engine.live import Answer
 from engine.navigator import NavigatorState
-from engine.runs import watching
-from engine.runs.demo import write_flight
-from engine.runs.tracking import Settings, run_track
-from engine.runs.watching import Watching
+from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import write_flight
+from engine.runs.tracking import track
 from engine.sim import plan_flight
 from tests.support.towns import drawn_town
 
@@ -62,12 +62,12 @@ def has_content(row):
 def runs(tmp_path_factory):
     """A flight with a black frame, tracked without and with a recording."""
     folder = tmp_path_factory.mktemp("live")
-    inputs = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
+    files = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
     cv2.imwrite(str(folder / "flight" / "frames" / f"{DARK:06d}.jpg"), np.zeros((300, 300, 3), np.uint8))
     for method in ("ncc", "sift"):
-        for name, wish in (("off", None), ("on", Watching(folder / f"{method}.rrd"))):
+        for name, target in (("off", NO_LIVE_VIEW), ("on", LiveViewTarget(folder / f"{method}.rrd"))):
             out = folder / f"{method}-{name}"
-            run_track(inputs, out, Settings(device="cpu", method=method), report=False, watching=wish)
+            track(files, out, TrackSettings(device="cpu", method=method), report=False, live_view=target)
     return folder
 
 
@@ -284,11 +284,11 @@ def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path,
     assert code == 1
     assert "no viewer listens" in line
     assert "rerun --bind 127.0.0.1" in line
-    monkeypatch.setattr(watching, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "rerun", None)
     code, (line,) = refusal(capsys, "--rerun", "view.rrd")
     assert (code, line) == (
         1,
-        "scenematch: --rerun: expected rerun to be installed, the extra [live]: pip install rerun-sdk",
+        "scenematch: expected rerun-sdk to be installed, got none: pip install 'scenematch-engine[live]'",
     )
 
 

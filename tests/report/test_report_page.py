@@ -20,8 +20,10 @@ from engine.report.explain import choose_frames
 from engine.report.metrics import Errors, Ground, summarise
 from engine.report.page import FinishedTrack, write_page
 from engine.report.verdict import MEANINGS, verdict_of
-from engine.runs.demo import write_flight
-from engine.runs.tracking import Settings, run_evaluate, run_track
+from engine.runs.evaluation import evaluate
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import write_flight
+from engine.runs.tracking import track
 from engine.sim import plan_flight
 from engine.values import Reason, Window
 from tests.support.runs import bare_runs
@@ -148,14 +150,14 @@ def test_notes_come_back_as_they_were(tmp_path):
 
 
 def test_settings_are_read_back_from_the_record():
-    settings = Settings(
+    settings = TrackSettings(
         method="sift",
         budget_ms=40.0,
         ncc=NccOptions(fraction=0.6, rule=PeakRule(min_sigmas=6.0)),
         sift=SiftOptions(max_turn_deg=None),
     )
     record = json.loads(json.dumps(changed(settings)))
-    assert options_from_mapping(Settings, nested(record)) == settings
+    assert options_from_mapping(TrackSettings, nested(record)) == settings
 
 
 # --------------------------------------------------------------------------------------------- single matches
@@ -212,11 +214,11 @@ def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
 def flown(tmp_path_factory):
     """A finished run over a flight with a black frame."""
     folder = tmp_path_factory.mktemp(HOSTILE.replace("/", "")) / "flight"
-    inputs = write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
+    files = write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
     black = folder / "frames" / f"{DARK:06d}.jpg"
     Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
     with bare_runs():
-        run_track(inputs, folder.parent / "out", Settings(device="cpu", budget_ms=60_000.0))
+        track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=60_000.0))
     return folder.parent / "out"
 
 
@@ -249,7 +251,7 @@ def test_every_frame_is_shown_with_its_match(flown):
 
 @pytest.mark.usefixtures("bare_runs")
 def test_equal_tracks_give_equal_bytes(flown, again):
-    run_evaluate(again, None)
+    evaluate(again, None)
     assert (again / "report.html").read_bytes() == (flown / "report.html").read_bytes()
 
 
@@ -258,7 +260,7 @@ def test_without_the_frames_the_page_says_so(flown, again):
     record = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     record["settings"]["frames"] = str(again / "gone")
     (again / "summary.json").write_text(json.dumps(record), encoding="utf-8")
-    run_evaluate(again, None)
+    evaluate(again, None)
     assert data_of(again / "report.html")["frames"] == []
     assert "No frames are shown" in (again / "report.html").read_text(encoding="utf-8")
 
@@ -266,7 +268,7 @@ def test_without_the_frames_the_page_says_so(flown, again):
 @pytest.mark.usefixtures("bare_runs")
 def test_a_run_that_left_no_notes_has_a_page_without_frames(again):
     (again / "notes.csv").unlink()
-    run_evaluate(again, None)
+    evaluate(again, None)
     assert "notes.csv" in (again / "report.html").read_text(encoding="utf-8")
 
 

@@ -23,10 +23,10 @@ from engine.formats.settings import read_settings
 from engine.formats.track import read_track
 from engine.report.campaign import Line, pooled, write_tables
 from engine.runs.campaign import _prepare
-from engine.runs.campaign_plan import Campaign, _fingerprint, plan_campaign
-from engine.runs.demo import write_flight
+from engine.runs.campaign_plan import Campaign, _content_hash, plan_campaign
 from engine.runs.executors import in_processes
 from engine.runs.jobs import read_result
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
 from tests.support.runs import bare_runs
@@ -34,7 +34,7 @@ from tests.support.towns import drawn_town
 
 pytestmark = pytest.mark.timeout(900)  # a dozen processes, on a machine that may be busy
 RUNS = ("town-1-noon/ncc", "good/ncc", "bad/ncc")
-NO_RAY = "Ray is not installed: pip install ray"
+NO_RAY = "Ray is not installed: pip install 'scenematch-engine[ray]'"
 FILE = """
 runs = ["ncc"]
 [flights.good]
@@ -184,13 +184,6 @@ def test_a_cluster_elsewhere_has_its_own_number_of_workers(place, tmp_path, caps
     assert "--workers: expected none with a cluster" in capsys.readouterr().err
 
 
-def test_without_ray_one_line_says_what_to_install(place, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    assert run(["campaign", str(place / "campaign.toml"), f"--out={tmp_path / 'out'}", "--ray=local"]) == 1
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told == "scenematch: --ray: expected Ray, got none; the extra [ray]: pip install ray"
-
-
 def test_runs_of_other_inputs_are_named_and_kept_unless_forced(place, whole, capsys):
     """Nothing is done here: what changed is found before."""
     text = (place / "campaign.toml").read_text(encoding="utf-8")
@@ -264,7 +257,7 @@ def test_an_input_that_changed_on_disk_changes_its_print(place, tmp_path):
 
     file.write_text(FILE, encoding="utf-8")
     (tmp_path / "flight" / "frames" / "0.jpg").write_bytes(b"Picture")
-    _fingerprint.cache_clear()  # another process, another day
+    _content_hash.cache_clear()  # another process, another day
     after = prints()
     assert {name for name in after["good/ncc"] if after["good/ncc"][name] != before["good/ncc"][name]} == {
         "frames"

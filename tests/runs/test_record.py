@@ -7,15 +7,15 @@ import pytest
 
 from engine.errors import OptionError, TelemetryError
 from engine.formats.settings import nested
-from engine.runs.record import Record, read_record
+from engine.runs.record import RunRecord, read_record
 
-RECORD = Record(
+RECORD = RunRecord(
     map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,
     frame_stamps="/s.csv", log_offset_s=0.5, heights={"take-off": 3}, method="ncc", profile="engine",
     device="cpu", changed={"ncc.rule.null_test_below": 1.0}, origin={"lat_deg": 48.0, "lon_deg": 16.0},
     ground_m=3.5, ground_amsl_m=None, more={"closed_loop": {"minutes": 1.0}},
 )  # fmt: skip
-NAMES = [each.name for each in fields(Record) if each.name != "more"]
+NAMES = [each.name for each in fields(RunRecord) if each.name != "more"]
 WRONG = (5, True, [1], "x", {"a": None}, float("nan"))
 FITTING = {
     "heights": {dict}, "changed": {dict}, "attitude": {dict}, "origin": set(), "ground_m": {int},

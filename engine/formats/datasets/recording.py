@@ -93,7 +93,7 @@ class ImportOptions:
         interval_s: time between pictures, where the data set has no times.
 
     Raises:
-        OptionError: a value is none that can be, by the name of its option.
+        OptionError: a value is none that can be.
     """
 
     camera: Path | float
@@ -105,12 +105,12 @@ class ImportOptions:
 
     def __post_init__(self) -> None:
         if self.datum is not None and self.datum not in DATUMS:
-            raise OptionError(f"--height-is: expected one of {', '.join(DATUMS)}, got {self.datum!r}")
+            raise OptionError(f"datum: expected one of {', '.join(DATUMS)}, got {self.datum!r}")
         hfov_deg = None if isinstance(self.camera, Path) else self.camera
         for name, unit, value, (least, most) in (
-            ("--hfov-deg", "degrees", hfov_deg, HFOV_DEG),
-            ("--interval-s", "seconds", self.interval_s, INTERVAL_S),
-            ("--ground-m", "metres", self.ground_m, GROUND_M),
+            ("hfov_deg", "degrees", hfov_deg, HFOV_DEG),
+            ("interval_s", "seconds", self.interval_s, INTERVAL_S),
+            ("ground_m", "metres", self.ground_m, GROUND_M),
         ):
             if value is not None and not least <= value <= most:
                 raise OptionError(f"{name}: expected {least:g} to {most:g} {unit}, got {value:g}")
@@ -124,8 +124,8 @@ def check_complete(recording: Recording, told: ImportOptions) -> None:
         TelemetryError, CalibrationError: there are no pictures, or the calibration cannot be read.
     """
     if told.map is None and recording.map is None:
-        raise OptionError("--map: expected a map, since the data set has none")
-    for name, path in (("--map", told.map), ("--surface", told.surface)):
+        raise OptionError("map: expected a map, since the data set has none")
+    for name, path in (("map", told.map), ("surface", told.surface)):
         if path is not None and not path.is_file():
             raise OptionError(f"{name}: expected a file that is there, got {path}")
     if isinstance(told.camera, Path):
@@ -143,7 +143,7 @@ def clear_frames(out: Path) -> None:
     """
     frames = out / "frames"
     if frames.is_symlink():
-        raise OptionError(f"--out: expected {frames} to be a folder of its own, got a link to {frames.resolve()}")
+        raise OptionError(f"out: expected {frames} to be a folder of its own, got a link to {frames.resolve()}")
     imported = _imported(out)
     for file in frames.iterdir() if frames.is_dir() else ():
         if file.is_symlink() or (file.name in imported and file.is_file()):
@@ -181,12 +181,12 @@ def write_recording(out: Path, recording: Recording, told: ImportOptions) -> tup
     datum = told.datum or recording.datum
     rows = [_telemetry_row(shot, stamp_ns, datum, told, first=not k) for k, (shot, stamp_ns) in enumerate(shots)]
     if datum is None and any(shot.height_m is not None for shot, _ in shots):
-        notes += ("heights are left out: the authors do not say what they are counted from, --height-is does",)
+        notes += ("heights are left out: the authors do not say what they are counted from, `datum` does",)
     elif told.ground_m is not None and (count := _below_ground(shots, datum, told.ground_m)):
-        notes += (f"heights of {count} of {len(shots)} pictures are left out: they are not above --ground-m",)
+        notes += (f"heights of {count} of {len(shots)} pictures are left out: they are not above `ground_m`",)
     elif datum not in (None, "agl") and told.ground_m is None:
         notes += (
-            f"heights above the ground are unknown: they are {datum}, and --ground-m gives the ground's level",
+            f"heights above the ground are unknown: they are {datum}, and `ground_m` gives the ground's level",
         )
     # First, since they say of the pictures that an import has put them there.
     about: dict[str, Any] = {"dataset": recording.dataset, "part": recording.part, "notes": notes}
@@ -217,7 +217,7 @@ def _in_time(recording: Recording, told: ImportOptions) -> tuple[list[tuple[Shot
     kept: list[tuple[Shot, int]] = []
     for shot in here:
         if shot.timestamp_ns is None:
-            raise OptionError("--interval-s: expected seconds between pictures, since the data set has no times")
+            raise OptionError("interval_s: expected seconds between pictures, since the data set has no times")
         if not kept or shot.timestamp_ns > kept[-1][1]:
             kept.append((shot, shot.timestamp_ns))
     if len(kept) < len(here):

@@ -64,7 +64,8 @@ def write_bag(
 
     Raises:
         OptionError: the kind is unknown or does not go with the name, or what is there may not be replaced.
-        TelemetryError: rosbags is not installed, a frame has no stamp, or the bag cannot be written.
+        MissingExtraError: rosbags is not installed.
+        TelemetryError: a frame has no stamp, or the bag cannot be written.
     """
     path = Path(path)
     if kind not in KINDS:
@@ -93,13 +94,13 @@ def check_place(path: Path, replace: bool) -> None:
     if not (path.exists() or path.is_symlink()):
         return
     if not replace:
-        raise OptionError(f"--out: {path} exists; choose another name, or add --force to replace it")
+        raise OptionError(f"path: {path} exists; choose another name, or add `replace` to replace it")
     if path.is_dir():
         parts = {file for pattern in _PARTS for file in path.glob(pattern)}
         others = sorted(set(path.iterdir()) - parts)
         if others or path.is_symlink():
             held = f"it holds {others[0].name} too" if others else "it is a link"
-            raise OptionError(f"--out: expected a bag in {path} to replace, but {held}")
+            raise OptionError(f"path: expected a bag in {path} to replace, but {held}")
 
 
 @contextmanager
@@ -162,7 +163,7 @@ def _write_truth(write: Write, maker: MessageFactory, row: Truth) -> None:
 @contextmanager
 def _written(path: Path, unfinished: Path, kind: str) -> Iterator[tuple[Write, MessageFactory]]:
     """What writes messages into a new bag, and makes them; ``path`` is what errors call it."""
-    _, typesys = import_rosbags(path)
+    _, typesys = import_rosbags()
     from rosbags import rosbag1, rosbag2
 
     ros1 = kind == "ros1"

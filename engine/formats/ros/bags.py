@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import CalibrationError, EngineError, TelemetryError
+from engine.errors import CalibrationError, EngineError, TelemetryError, require
 from engine.formats.frames import FrameSource
 from engine.formats.resampling import Floats, Log, Series, Stamps, make_log, make_position, make_series
 from engine.formats.ros.messages import attitude_of, camera_of, picture_of, position_of, range_of, stamp_ns
@@ -133,7 +133,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
         found = _topic(reader, _CALIBRATION, (beside, ""))
         first = None if found is None else next(_messages(path, reader, {found}, {_CALIBRATION}), None)
     if first is None:
-        raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with --camera")
+        raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with `camera`")
     try:
         return camera_of(first[2])
     except CalibrationError as error:
@@ -234,7 +234,7 @@ def _image_topic(path: Path, reader: Any, topic: str | None) -> str:
     if topic is not None and topic in names:
         return topic
     asked = "one topic with pictures" if topic is None else f"pictures on {topic}"
-    hint = "; choose with --image-topic" if topic is None and names else ""
+    hint = "; choose with `image_topic`" if topic is None and names else ""
     raise TelemetryError(f"{path}: expected {asked}, got {', '.join(names) or 'none'}{hint}")
 
 
@@ -265,7 +265,7 @@ def _messages(
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """The bag's reader."""
-    highlevel, typesys = import_rosbags(path)
+    highlevel, typesys = import_rosbags()
     if not path.exists():
         raise TelemetryError(f"{path}: no such bag")
     with _readable(path):
@@ -290,14 +290,10 @@ def _readable(path: Path) -> Iterator[None]:
         raise TelemetryError(f"{path}: expected a bag that can be read: {reason}") from None
 
 
-def import_rosbags(path: Path) -> tuple[Any, Any]:
+def import_rosbags() -> tuple[Any, Any]:
     """The library's modules for reading and for types.
 
     Raises:
-        TelemetryError: it is not installed.
+        MissingExtraError: it is not installed.
     """
-    try:
-        from rosbags import highlevel, typesys
-    except ImportError:
-        raise TelemetryError(f"{path}: a bag needs rosbags, the extra [bags]: pip install rosbags") from None
-    return highlevel, typesys
+    return require("rosbags.highlevel", "bags"), require("rosbags.typesys", "bags")

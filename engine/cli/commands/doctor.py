@@ -1,4 +1,4 @@
-"""``doctor``: what this installation is made of, and what is missing."""
+"""The command `doctor`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import re
 from importlib import metadata
 from typing import Any
 
-import torch
+import typer
+
+from engine.cli import console
+from engine.cli.options import JsonOption
 
 _DEVELOPERS = ("test", "bench", "docs", "dev")
 """Extras that add nothing to the engine."""
@@ -16,8 +19,17 @@ _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra == ["']([^"']+)["']""")
 
 
+def doctor(as_json: JsonOption = False) -> None:
+    """Versions, devices, what is missing."""
+    facts, healthy = examine()
+    console.facts(facts, as_json, title="scenematch doctor")
+    raise typer.Exit(0 if healthy else 1)
+
+
 def examine() -> tuple[dict[str, Any], bool]:
     """Facts by name, and whether nothing is missing."""
+    import torch
+
     facts: dict[str, Any] = {
         "scenematch": _version("scenematch"),
         "python": platform.python_version(),

@@ -1,12 +1,14 @@
-"""The commands of `bridge`: what each takes, and whom it calls."""
+"""The commands of `bridge`."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from engine.cli import console
 from engine.cli.options import (
     CameraOption,
     DeadlineOption,
@@ -40,7 +42,7 @@ def mavlink(
     map_path: MapOption,
     camera: CameraOption,
     surface: SurfaceOption = None,
-    map_sigma: MapSigmaOption = None,
+    map_sigma_m: MapSigmaOption = None,
     frames: Annotated[
         Path | None,
         typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
@@ -48,20 +50,20 @@ def mavlink(
     telemetry: Annotated[
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
     ] = None,
-    rate: Annotated[
+    rate_hz: Annotated[
         float | None,
-        typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless told."),
+        typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless given."),
     ] = None,
-    source: Annotated[
+    camera_source: Annotated[
         str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
     ] = None,
-    grab: Annotated[
+    exposure_to_grab_ms: Annotated[
         float | None,
         typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
     ] = None,
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
-    max_sigma: MaxSigmaOption = 10.0,
+    max_sigma_m: MaxSigmaOption = 10.0,
     system_id: Annotated[
         int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
     ] = 1,
@@ -75,20 +77,20 @@ def mavlink(
     set_origin: Annotated[
         bool, typer.Option("--set-origin/--no-set-origin", help="Give an autopilot without an origin the map's.")
     ] = True,
-    origin_alt: Annotated[
+    origin_alt_m: Annotated[
         float | None,
         typer.Option("--origin-alt-m", metavar="M", help="Its height above sea level; else the map's ground."),
     ] = None,
     use_velocity: Annotated[
-        bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is believed.")
+        bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is used.")
     ] = True,
     method: MethodOption = "auto",
     start: StartOption = None,
     device: DeviceOption = "auto",
-    deadline: DeadlineOption = 121.0,
+    deadline_ms: DeadlineOption = 121.0,
     seconds: SecondsOption = None,
-    rerun: RerunOption = None,
-    rerun_connect: RerunConnectOption = None,
+    recording: RerunOption = None,
+    viewer: RerunConnectOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -97,44 +99,51 @@ def mavlink(
     Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
     played at their own pace, until they end.
     """
-    from engine.runs.mavlink_bridge import BridgeFiles, LinkSettings, MatchSettings, run_bridge
-    from engine.runs.watching import Watching
+    from engine.runs.live_viewing import LiveViewTarget
+    from engine.runs.mavlink_bridge import BridgeFiles, BridgeSettings, MavlinkSettings, run_mavlink_bridge
 
     use_threads(threads)
-    inputs = BridgeFiles(map_path, surface, camera, frames, telemetry, source, rate, grab, map_sigma)
-    wire = LinkSettings(
+    files = BridgeFiles(
+        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
+        camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
+        map_sigma_m=map_sigma_m,
+    )  # fmt: skip
+    link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
-        message=message, max_sigma_m=max_sigma, set_origin=set_origin, origin_alt_m=origin_alt,
+        message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
         use_velocity=use_velocity,
     )  # fmt: skip
-    matching = MatchSettings(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
-    run_bridge(inputs, wire, matching, as_json=as_json, watching=Watching(rerun, rerun_connect))
+    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    live_view = LiveViewTarget(recording, viewer)
+    status = run_mavlink_bridge(files, link, settings, live_view=live_view, progress=console.PROGRESS)
+    console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
 
 
 def mavlink_params(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, made by this run.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, created by this run.")],
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
-    delay: Annotated[
+    delay_ms: Annotated[
         int, typer.Option("--delay-ms", metavar="MS", help="From capture to arrival; the bridge prints it.")
     ] = 100,
-    max_sigma: MaxSigmaOption = 10.0,
+    max_sigma_m: MaxSigmaOption = 10.0,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
 ) -> None:
     """Parameters for an autopilot.
 
     Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
     """
-    from engine.runs.mavlink_bridge import write_parameters
+    from engine.runs.mavlink_bridge import write_parameter_file
 
-    write_parameters(firmware, message, out, delay_ms=delay, max_sigma_m=max_sigma, force=force)
+    write_parameter_file(firmware, message, out, delay_ms=delay_ms, max_sigma_m=max_sigma_m, force=force)
+    console.say(f"written to {out}")
 
 
 def ros(
     map_path: MapOption,
     version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
     surface: SurfaceOption = None,
-    map_sigma: MapSigmaOption = None,
+    map_sigma_m: MapSigmaOption = None,
     camera: Annotated[
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
@@ -170,10 +179,10 @@ def ros(
     method: MethodOption = "auto",
     start: StartOption = None,
     device: DeviceOption = "auto",
-    deadline: DeadlineOption = 121.0,
+    deadline_ms: DeadlineOption = 121.0,
     seconds: SecondsOption = None,
-    rerun: RerunOption = None,
-    rerun_connect: RerunConnectOption = None,
+    recording: RerunOption = None,
+    viewer: RerunConnectOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -183,16 +192,20 @@ def ros(
     An empty name of a topic leaves it out.
     """
     from engine.adapters.ros import Topics
-    from engine.runs.mavlink_bridge import MatchSettings
-    from engine.runs.ros_bridge import RosFiles, run_bridge_ros
-    from engine.runs.watching import Watching
+    from engine.runs.live_viewing import LiveViewTarget
+    from engine.runs.mavlink_bridge import BridgeSettings
+    from engine.runs.ros_bridge import RosSettings, run_ros_bridge
 
     use_threads(threads)
     topics = Topics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
         velocity=velocity,
     )  # fmt: skip
-    matching = MatchSettings(method=method, device=device, start=start, deadline_ms=deadline, seconds=seconds)
-    inputs = RosFiles(map_path, surface, camera, topics, map_sigma)
-    watching = Watching(rerun, rerun_connect)
-    run_bridge_ros(version, inputs, matching, firmware, origin, as_json=as_json, watching=watching)
+    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    ros_settings = RosSettings(
+        map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
+        firmware=firmware, origin=origin,
+    )  # fmt: skip
+    live_view = LiveViewTarget(recording, viewer)
+    status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)
+    console.facts(asdict(status), as_json, title=f"ROS {version} on {image}")

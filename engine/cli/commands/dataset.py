@@ -1,14 +1,15 @@
-"""The commands of `dataset`: what each takes, and whom it calls."""
+"""The commands of `dataset`."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from engine.cli import console
+from engine.cli import console, tables
+from engine.cli.argument_names import as_typed
 from engine.cli.options import ForceOption, JsonOption, OutOption, SurfaceOption
 from engine.errors import OptionError
 
@@ -26,7 +27,7 @@ def import_dataset(
     camera: Annotated[
         Path | None, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
     ] = None,
-    hfov: Annotated[
+    hfov_deg: Annotated[
         float | None,
         typer.Option("--hfov-deg", metavar="DEG", help="Horizontal field of view, in place of a calibration."),
     ] = None,
@@ -34,27 +35,27 @@ def import_dataset(
         Path | None, typer.Option("--map", metavar="FILE", help="A map in place of the data set's.")
     ] = None,
     surface: SurfaceOption = None,
-    gsd: Annotated[
+    gsd_m: Annotated[
         float | None,
         typer.Option("--gsd-m", metavar="M", help="Of alto: pixel of the pictures that make the map."),
     ] = None,
-    height_is: Annotated[
+    datum: Annotated[
         str | None,
         typer.Option("--height-is", metavar="agl|amsl|ellipsoid", help="What the heights are counted from."),
     ] = None,
-    ground: Annotated[
+    ground_m: Annotated[
         float | None, typer.Option("--ground-m", metavar="M", help="Level of the ground, counted from the same.")
     ] = None,
-    interval: Annotated[
+    interval_s: Annotated[
         float | None, typer.Option("--interval-s", metavar="S", help="Time between pictures without times.")
     ] = None,
     reference: Annotated[
         str | None,
         typer.Option("--reference", metavar="aerial|satellite", help="Of anyvisloc: which of its maps."),
     ] = None,
-    max_tilt: Annotated[
+    max_tilt_deg: Annotated[
         float | None,
-        typer.Option("--max-tilt-deg", metavar="DEG", help="Of single photographs, off nadir; 30 unless told."),
+        typer.Option("--max-tilt-deg", metavar="DEG", help="Of single photographs, off nadir; 30 unless given."),
     ] = None,
     limit: Annotated[
         int | None, typer.Option("--limit", min=1, metavar="N", help="Of single photographs, evenly spread.")
@@ -64,47 +65,46 @@ def import_dataset(
 ) -> None:
     """A published data set as a flight folder.
 
-    Links its pictures, lays its map together, and says what could not be known and what is doubtful about its
+    Links its pictures, composes its map, and says what could not be known and what is doubtful about its
     truth. Single photographs become flights of one frame each, with a campaign's file that lists them.
     """
-    from engine.formats.datasets.recording import ImportOptions
-    from engine.runs.dataset_import import SINGLES, Choice, run_import, run_import_singles
+    from engine import runs
+    from engine.runs.dataset_import import PHOTOGRAPHS
 
-    of_singles = {"reference": reference, "max_tilt_deg": max_tilt, "limit": limit}
-    added = {
-        "camera": camera, "hfov_deg": hfov, "map": map_path, "surface": surface, "gsd_m": gsd,
-        "height_is": height_is, "ground_m": ground, "interval_s": interval,
+    of_flights = {
+        "camera": camera, "hfov_deg": hfov_deg, "map": map_path, "surface": surface, "gsd_m": gsd_m,
+        "datum": datum, "ground_m": ground_m, "interval_s": interval_s,
     }  # fmt: skip
-    for name, value in (added if kind in SINGLES else of_singles).items():
+    of_photographs: dict[str, Any] = {"reference": reference, "max_tilt_deg": max_tilt_deg, "limit": limit}
+    for name, value in (of_flights if kind in PHOTOGRAPHS else of_photographs).items():
         if value is not None:
-            raise OptionError(f"--{name.replace('_', '-')}: expected none with {kind}, got {value}")
-    if kind in SINGLES:
-        choice = Choice(
-            part=part,
-            reference=reference or "aerial",
-            max_tilt_deg=30.0 if max_tilt is None else max_tilt,
-            limit=limit,
-        )
-        facts = run_import_singles(kind, root, out, choice, force=force)
+            raise OptionError(f"{name}: expected none with {kind}, got {value}")
+    if kind in PHOTOGRAPHS:
+        given = {name: value for name, value in of_photographs.items() if value is not None}
+        choice = runs.PhotographOptions(part=part, **given)
+        facts = runs.import_photographs(kind, root, out, choice, force=force, progress=console.PROGRESS)
     else:
-        if (camera is None) == (hfov is None):
-            raise OptionError("--camera, --hfov-deg: expected one of the two")
-        told = ImportOptions(
-            camera=camera if camera is not None else float(hfov or 0.0),
+        if (camera is None) == (hfov_deg is None):
+            raise OptionError("camera, hfov_deg: expected one of the two")
+        options = runs.ImportOptions(
+            camera=camera if camera is not None else float(hfov_deg or 0.0),
             map=map_path,
             surface=surface,
-            datum=height_is,
-            ground_m=ground,
-            interval_s=interval,
+            datum=datum,
+            ground_m=ground_m,
+            interval_s=interval_s,
         )
-        facts = run_import(kind, root, out, told, part=part, gsd_m=gsd, force=force)
+        facts = runs.import_dataset(
+            kind, root, out, options, part=part, gsd_m=gsd_m, force=force, progress=console.PROGRESS
+        )
+        facts["notes"] = [as_typed(note) for note in facts["notes"]]
     shown = {name: value for name, value in facts.items() if as_json or name not in ("notes", "findings")}
     console.facts(shown, as_json, title=f"{kind} from {root}")
 
 
 def check(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Flight folder with a truth.csv.")],
-    max_speed: Annotated[
+    max_speed_mps: Annotated[
         float, typer.Option("--max-speed-mps", min=0.1, metavar="V", help="That the vehicle can fly over ground.")
     ] = 70.0,
     as_json: JsonOption = False,
@@ -113,11 +113,11 @@ def check(
 
     Exits with 1 where something was found.
     """
-    from engine.runs.dataset_import import check_flight, print_findings
+    from engine.runs.dataset_import import check_flight
 
-    findings = check_flight(directory, max_speed)
+    findings = check_flight(directory, max_speed_mps)
     if as_json:
         console.print_json([asdict(finding) for finding in findings])
     else:
-        print_findings(findings, f"truth of {directory}")
+        tables.print_findings(findings, f"truth of {directory}")
     raise typer.Exit(1 if findings else 0)

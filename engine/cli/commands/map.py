@@ -1,4 +1,4 @@
-"""The commands of `map`: what each takes, and whom it calls."""
+"""The commands of `map`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from engine.cli import console
+from engine.cli import console, tables
 from engine.cli.options import (
     ForceOption,
     JsonOption,
@@ -24,9 +24,10 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Size, ground sample distance, CRS, bounds."""
-    from engine.cli.arguments import open_map
+    from engine.runs.inputs import open_map
 
-    console.facts(open_map(map_path, surface).info(), as_json, title=str(map_path))
+    site = open_map(map_path, surface, progress=console.PROGRESS)
+    console.facts(site.info(), as_json, title=str(map_path))
 
 
 def audit(
@@ -37,8 +38,8 @@ def audit(
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it 300 x 300 px with 60 degrees."),
     ] = None,
-    height_agl: Annotated[
-        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground; 150 unless told.")
+    height_agl_m: Annotated[
+        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground; 150 unless given.")
     ] = None,
     route: Annotated[
         Path | None,
@@ -48,7 +49,7 @@ def audit(
         str | None,
         typer.Option("--around", metavar="LAT,LON,RADIUS_M", help="Only what lies so near to a place."),
     ] = None,
-    corridor: Annotated[
+    corridor_m: Annotated[
         float | None,
         typer.Option("--corridor-m", metavar="M", help="Only what lies so near to the route."),
     ] = None,
@@ -56,8 +57,8 @@ def audit(
         Path | None,
         typer.Option("--other", metavar="FILE", help="The same ground at another date; finds what is stale."),
     ] = None,
-    sigma: Annotated[
-        float, typer.Option("--sigma-m", metavar="M", help="How well the position is known before a match.")
+    prior_sigma_m: Annotated[
+        float, typer.Option("--sigma-m", metavar="M", help="Uncertainty of the position before a match.")
     ] = 10.0,
     threads: ThreadsOption = 1,
     force: ForceOption = False,
@@ -69,8 +70,16 @@ def audit(
     availability along it is predicted, and its poor stretches are listed. A huge map is audited in part: around a
     place, along the route, or both.
     """
-    from engine.runs.map_audit import AuditFiles, run_audit
+    from engine.runs.map_audit import AuditFiles, audit_map
 
     use_threads(threads)
-    inputs = AuditFiles(map_path, surface, camera, route, other, height_agl, around, corridor)
-    run_audit(inputs, out, sigma_m=sigma, force=force, as_json=as_json)
+    files = AuditFiles(
+        map=map_path, surface=surface, camera=camera, route=route, other=other, height_agl_m=height_agl_m,
+        around=around, corridor_m=corridor_m,
+    )  # fmt: skip
+    result = audit_map(files, out, prior_sigma_m=prior_sigma_m, force=force, progress=console.PROGRESS)
+    if as_json:
+        console.print_json(result.summary)
+    else:
+        tables.print_audit(result, str(map_path))
+        console.say(f"written to {out}")

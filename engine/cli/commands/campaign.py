@@ -1,4 +1,4 @@
-"""The command `campaign`: what it takes, and whom it calls."""
+"""The command `campaign`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def campaign(
         Path, typer.Option("--out", metavar="DIR", help="Folder of the campaign; what is finished in it stays.")
     ],
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, metavar="N", help="Runs at a time; one a core unless told.")
+        int | None, typer.Option("--workers", min=1, metavar="N", help="Runs at a time; one a core unless given.")
     ] = None,
     ray: Annotated[
         str | None,
@@ -37,7 +37,7 @@ def campaign(
     from engine.report.campaign import POOL_COLUMNS, pool_cells, pooled
     from engine.runs.campaign import run_campaign
 
-    lines = run_campaign(file, out, workers=workers, ray=ray, force=force)
+    lines = run_campaign(file, out, workers=workers, ray=ray, force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json([asdict(line) for line in lines])
     else:
