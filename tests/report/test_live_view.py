@@ -1,6 +1,7 @@
 """The live view: what a recording holds, that it changes no result, and how it looks in a real browser."""
 
 import socket
+import sys
 import threading
 import time
 from collections import defaultdict
