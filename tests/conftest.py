@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import cv2
 import hypothesis
 import numpy as np
@@ -43,9 +45,9 @@ def _bare_runs():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _workers_share_towns(tmp_path_factory, worker_id):
+def _workers_share_towns(tmp_path_factory):
     """Each worker has a folder of its own in that of the run."""
-    if worker_id != "master":
+    if "PYTEST_XDIST_WORKER" in os.environ:
         towns.kept_in = tmp_path_factory.getbasetemp().parent
 
 
