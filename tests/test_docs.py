@@ -8,6 +8,7 @@ import pytest
 from typer.main import get_command
 
 import engine
+from docs.draw_architecture import drawn, members, picture
 from docs.site_roles import on_page_content
 from engine.cli.app import app
 from engine.formats.track import COLUMNS
@@ -19,6 +20,7 @@ from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from engine.values import Reason
 from tests.support.paths import ROOT
+from tests.support.towns import drawn_town
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 FENCE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -39,10 +41,11 @@ def read(name):
 def flight(tmp_path_factory):
     """The folder in which a reader would try the snippets."""
     folder = tmp_path_factory.mktemp("docs")
-    write_flight(folder, plan_flight(frames=3))
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
     return folder
 
 
+@pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
 @pytest.mark.parametrize("page", [p for p in PAGES if FENCE.search(p.read_text(encoding="utf-8"))], ids=page_name)
 def test_snippets_run_as_they_stand(page, flight, monkeypatch):
     monkeypatch.chdir(flight)
@@ -88,6 +91,10 @@ def headings(page):
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
+def test_the_readme_is_short():
+    assert len(read("README.md").split()) <= 700
+
+
 def test_every_page_is_reached_from_the_readme():
     linked = {(ROOT / link).resolve() for link in LINK.findall(read("README.md")) if "://" not in link}
     assert {page.resolve() for page in PAGES} - {ROOT / "README.md"} <= linked
@@ -107,29 +114,48 @@ def test_pages_fit_the_line():
         assert not long, f"{page.name}: {long}"
 
 
+def test_pages_use_the_words_of_the_field():
+    private = r"laid|bank|rungs?|ladder|priced?|told|surer|leans|boastful|watchman|believe[sd]?|beliefs?"
+    for page in PAGES:
+        prose = re.sub(r"`[^`]*`", "", CODE.sub("", page.read_text(encoding="utf-8")))
+        assert re.findall(rf"\b(?:{private})\b", prose, re.IGNORECASE) == [], page.name
+
+
 # ------------------------------------------------------------------------------------------- architecture
 
 
-def rows(name, heading):
-    """Cells of the table below a heading, without its head."""
-    section = read(name).split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+PATH = re.compile(r"`(engine/[\w/]+(?:\.\w+)?)`")
 
 
-def test_floors_are_those_that_import_linter_keeps():
-    contract = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"][0]
-    kept = [{part.strip().removeprefix("engine.") for part in layer.split("|")} for layer in contract["layers"]]
-    told = [set(re.findall(r"`([a-z_0-9]+)`", cells[0])) for cells in rows("docs/architecture.md", "Floors")]
-    assert told == kept
+def test_architecture_is_drawn_from_the_code():
+    """``python docs/draw_architecture.py`` draws it anew."""
+    page = read("docs/architecture.md")
+    assert page == drawn(page)
+    assert read("docs/img/architecture.svg") == picture()
 
 
-def test_every_file_has_its_line_and_every_line_its_file():
-    files = {path.relative_to(ROOT / "engine").as_posix() for path in (ROOT / "engine").rglob("*.py")}
-    files -= {file for file in files if file.endswith("__init__.py") and file != "__init__.py"}
-    told = [cells[0].strip("`") for cells in rows("docs/architecture.md", "Files")]
-    assert sorted(set(told)) == sorted(told)
-    assert set(told) == files
+def test_floors_on_the_page_are_those_that_import_linter_keeps():
+    contracts = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    kept = [{part.strip() for part in re.split(r"[|:]", layer)} for layer in layers]
+    shown = {}
+    for floor, name in re.findall(r"^\| (\d+) \| `(\w+)/?` \|", read("docs/architecture.md"), re.MULTILINE):
+        shown.setdefault(int(floor), set()).add(f"engine.{name}")
+    assert [shown[floor] for floor in sorted(shown, reverse=True)] == kept
+    assert sorted(name for names in kept for name in names) == sorted(f"engine.{name}" for name in members())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_files_that_a_page_names_are_there(page):
+    named = PATH.findall(page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name).exists()] == []
+    assert named or page.name != "architecture.md"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_benchmarks_that_a_page_names_are_there(page):
+    named = re.findall(r"python\s+-m\s+(bench(?:\.\w+)+)", page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name.replace(".", "/")).with_suffix(".py").is_file()] == []
 
 
 # ------------------------------------------------------------------------------------------ lists and values
@@ -172,7 +198,7 @@ def command_options():
             continue
         words = {word for option in command.params for word in (*option.opts, *option.secondary_opts)}
         options = {word for word in words if word.startswith("--")}
-        yield name, options - {"--help", "--json", "--threads", "--force"}
+        yield name, sorted(options - {"--help", "--json", "--threads", "--force"})
 
 
 @pytest.mark.parametrize(("command", "options"), sorted(command_options()), ids=lambda value: str(value)[:20])
@@ -180,7 +206,7 @@ def test_every_option_is_in_the_lines_of_its_command(command, options):
     section = read("docs/command-line.md").split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
     lines = next(iter(re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)), "")
     told = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force", "--threads"}
-    assert told == options
+    assert told == set(options)
 
 
 def test_the_changelog_names_the_version():

@@ -453,6 +453,7 @@ def test_keys_are_bytes_or_hexadecimal(tmp_path):
         read_key(bad)
 
 
+@pytest.mark.slow
 def test_hours_of_traffic_leave_nothing_behind():
     from bench.live.fuzz_mavlink import growth_bytes
 
@@ -895,7 +896,7 @@ def wait_until(holds, timeout_s=10.0):
 
 
 def test_the_table_of_traps_names_tests_and_code_that_are_there():
-    page = (ROOT / "docs" / "mavlink.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "mavlink-measured.md").read_text(encoding="utf-8")
     rows = [
         line for line in page.split("## The traps", 1)[1].split("\n## ", 1)[0].splitlines() if "`test_" in line
     ]
