@@ -27,7 +27,7 @@ from bench.inputs.scenes import mosaic
 from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.align import view_of
-from engine.audit.availability import Audit, audit_map, features
+from engine.audit.availability import Audit, audit_map, regressors
 from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.sim import build_town
@@ -188,8 +188,8 @@ def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator
     site = ground.site
     found = audit_map(site, CAMERA, height_m, other=ground.other)
     matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
-    evidence = found.evidence
-    at_places = features(evidence.texture, evidence.score, evidence.lead)
+    statistics = found.statistics
+    at_places = regressors(statistics.texture, statistics.score, statistics.lead)
     out: list[Trial] = []
     edge = np.hypot(*found.plan.view.footprint_px) * 2.0**found.plan.level / 2.0 + 2.0
     low, high = np.full(2, edge), np.array([site.width_px, site.height_px]) - edge

@@ -112,7 +112,7 @@ class Sample:
 
 def town(seed: int, light: str = "noon") -> Flight:
     """A flight over a simulated town, whose map is of noon and says that it is exact."""
-    plan = plan_flight(seed, rate_hz=0.45, light=light)
+    plan = plan_flight(seed, rate_hz=0.45, condition=light)
     site = plan.town.site()
     frames, truth = list(plan.iter_frames()), plan.truth_rows()
     places = [site.frame.enu_from_geodetic(t.lat_deg, t.lon_deg) for t in truth]

@@ -79,7 +79,7 @@ class Trial:
 
 def simulated(light: str) -> Iterator[Flight]:
     for seed in SEEDS:
-        plan = plan_flight(seed, rate_hz=0.28, light=light)
+        plan = plan_flight(seed, rate_hz=0.28, condition=light)
         site = plan.town.site()
         places = [(row.lat_deg, row.lon_deg) for row in plan.truth_rows()]
         yield Flight(f"{seed}", site, plan.camera, list(zip(plan.iter_frames(), places, strict=True)))
