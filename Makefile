@@ -1,10 +1,14 @@
-# make demo | test | check | package | extras | bench | bench-flights | bench-latency: each sets itself up in .venv and is quick the second time.
+# make demo | test | test-all | check | package | extras | bench | bench-flights | bench-latency: each sets itself up in
+# .venv and is quick the second time.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+WORKERS ?= 2
+# A worker takes whole files, so that what a file draws is drawn once, and one thread.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test check package extras docs bench integrity simulated bench-flights bench-latency clean
+.PHONY: demo test test-slow test-all check package extras docs bench integrity simulated bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -24,7 +28,13 @@ demo: $(VENV)/run.stamp
 	$(BIN)/scenematch demo --force
 
 test: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest
+	$(PYTEST) -m "not slow"
+
+test-slow: $(VENV)/dev.stamp
+	$(PYTEST) -m slow
+
+test-all: $(VENV)/dev.stamp
+	$(PYTEST)
 
 check: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

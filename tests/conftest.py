@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import cv2
 import hypothesis
 import numpy as np
@@ -9,10 +11,12 @@ import pytest
 import torch
 
 from engine import Fix
-from engine.sim import build_town, plan_flight
+from engine.sim import plan_flight
+from tests.support import towns
 from tests.support.ground import CAMERA, Ground
 from tests.support.paths import NO_SHARED, SHARED
-from tests.support.towns import site_of
+from tests.support.runs import bare_runs
+from tests.support.towns import drawn_once, drawn_town, site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
@@ -33,6 +37,28 @@ def _no_home_directory(tmp_path_factory):
         yield
 
 
+@pytest.fixture(name="bare_runs")
+def _bare_runs():
+    """For tests of commands: see :func:`tests.support.runs.bare_runs`."""
+    with bare_runs():
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _workers_share_towns(tmp_path_factory):
+    """Each worker has a folder of its own in that of the run."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        towns.kept_in = tmp_path_factory.getbasetemp().parent
+
+
+@pytest.fixture
+def towns_drawn_once(monkeypatch):
+    """Commands that draw a town take the one that was drawn before."""
+    monkeypatch.setattr("engine.sim.flight.build_town", drawn_once)
+    monkeypatch.setattr("engine.runs.simulation.build_town", drawn_once)
+    monkeypatch.setattr("engine.sim.build_town", drawn_once)
+
+
 @pytest.fixture(scope="session")
 def shared():
     """The folder of the shared flights; tests that ask for it are skipped where it is missing."""
@@ -44,7 +70,7 @@ def shared():
 @pytest.fixture(scope="session")
 def sim_flight():
     """The first 24 frames of the paper's flight over a simulated town."""
-    return plan_flight(1, frames=24).draw()
+    return plan_flight(1, town=drawn_town(1), frames=24).draw()
 
 
 @pytest.fixture(scope="session")
@@ -61,7 +87,7 @@ def sim_site(sim_town):
 @pytest.fixture(scope="session")
 def other_site():
     """The map of another town with the same kind of streets."""
-    return site_of(build_town(7))
+    return site_of(drawn_town(7))
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,7 @@ from engine.formats.truth import read_truth
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
+from tests.support.towns import drawn_town
 
 EXAMPLES = ROOT / "examples"
 FRAMES = 8
@@ -26,7 +27,7 @@ FRAMES = 8
 def flight(tmp_path_factory):
     """A flight folder."""
     folder = tmp_path_factory.mktemp("examples")
-    write_flight(folder, plan_flight(frames=FRAMES, rate_hz=2.0))
+    write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES, rate_hz=2.0))
     return folder
 
 
@@ -45,6 +46,7 @@ def test_your_own_loop_fixes_every_frame(flight, monkeypatch, capsys):
     assert all("NCC" in line for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")

@@ -65,12 +65,26 @@ def fresh():
         "loaded = sorted({name.split('.')[0] for name in sys.modules}); "
         "reach = [callable(engine.ncc_fft.ncc), callable(engine.features.sift)]; "
         "print('REPORT', json.dumps([loaded, reach, torch.cuda.is_initialized(), "
-        "sorted(n for n in sys.modules if n.startswith('engine.'))]))"
+        "sorted(n for n in sys.modules if n.startswith('engine.'))])); "
+        "import engine.features, engine.orthomap; "
+        "print('LATER', json.dumps([n for n in ('kornia', 'rasterio', 'pyproj') if n in sys.modules])); "
+        "import engine.runs.tracking, engine.runs.closed_loop, engine.runs.mavlink_bridge; "
+        "print('RUNS', json.dumps('rerun' in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)
     before, _, rest = done.stdout.partition("REPORT ")
+    rest, _, later = rest.partition("LATER ")
+    later, _, rerun = later.partition("RUNS ")
     loaded, reach, cuda, modules = json.loads(rest)
-    return {"printed": before + done.stderr, "loaded": loaded, "reach": reach, "cuda": cuda, "modules": modules}
+    return {
+        "later": json.loads(later),
+        "rerun": json.loads(rerun),
+        "printed": before + done.stderr,
+        "loaded": loaded,
+        "reach": reach,
+        "cuda": cuda,
+        "modules": modules,
+    }
 
 
 def test_importing_the_engine_prints_nothing(fresh):
@@ -80,6 +94,14 @@ def test_importing_the_engine_prints_nothing(fresh):
 @pytest.mark.parametrize("package", UNUSED)
 def test_importing_the_engine_does_not_load(fresh, package):
     assert package not in fresh["loaded"]
+
+
+def test_maps_and_features_load_neither_rasters_nor_projections_nor_kornia(fresh):
+    assert fresh["later"] == []
+
+
+def test_nothing_of_rerun_is_loaded_where_nobody_watches(fresh):
+    assert fresh["rerun"] is False
 
 
 def test_importing_the_engine_does_not_touch_the_gpu(fresh):

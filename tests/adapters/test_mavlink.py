@@ -453,6 +453,7 @@ def test_keys_are_bytes_or_hexadecimal(tmp_path):
         read_key(bad)
 
 
+@pytest.mark.slow
 def test_hours_of_traffic_leave_nothing_behind():
     from bench.live.fuzz_mavlink import growth_bytes
 

@@ -35,6 +35,7 @@ from engine.formats.ros.messages import (
 from engine.live import LiveOptions
 from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.support.ground import body_axes
+from tests.support.towns import drawn_town
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
 NOW_NS = 1_700_000_000_123_456_789
@@ -673,7 +674,7 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
     from engine.runs.simulation import write_flight
     from engine.sim import plan_flight
 
-    write_flight(tmp_path, plan_flight(frames=1))
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
     for name in ("rospy", "rclpy"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setenv("ROS_IP", "127.0.0.1")

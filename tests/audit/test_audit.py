@@ -18,7 +18,7 @@ from engine.cli.app import run
 from engine.errors import OptionError, TelemetryError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
-from engine.sim import build_town
+from tests.support.towns import drawn_town
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 HEIGHT_M = 75.0
@@ -30,7 +30,7 @@ HALF = SIDE // 2
 
 @pytest.fixture(scope="module")
 def town_gray():
-    return cv2.cvtColor(build_town(5).ortho, cv2.COLOR_RGB2GRAY)[:SIDE, :SIDE]
+    return cv2.cvtColor(drawn_town(5).ortho, cv2.COLOR_RGB2GRAY)[:SIDE, :SIDE]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from engine.audit.availability import Flag, audit_map, predict_route
 from engine.audit.plan import AuditOptions, MapPart, plan_audit
 from engine.cli.app import run
 from engine.errors import OptionError
-from engine.sim import build_town
+from tests.support.towns import drawn_town
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 HEIGHT_M = 75.0
@@ -30,7 +30,7 @@ MIDDLE = (CORNER[0] + 450, CORNER[1] + 450)
 
 @pytest.fixture(scope="module")
 def gray():
-    town = cv2.cvtColor(build_town(5).ortho, cv2.COLOR_RGB2GRAY)[:900, :900]
+    town = cv2.cvtColor(drawn_town(5).ortho, cv2.COLOR_RGB2GRAY)[:900, :900]
     return np.maximum(town, 1)
 
 
@@ -195,6 +195,7 @@ def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path,
     assert cv2.imread(str(tmp_path / "out" / "audit.png"), cv2.IMREAD_GRAYSCALE).std() > 5
 
 
+@pytest.mark.slow
 def test_a_huge_map_is_audited_along_a_route(huge_path, route_file, tmp_path, capsys):
     assert run(command(huge_path, tmp_path / "out", f"--route={route_file}", "--json")) == 0
     summary = json.loads(capsys.readouterr().out)

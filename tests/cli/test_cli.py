@@ -24,6 +24,7 @@ from engine.formats.geotiff import write_geotiff
 from engine.runs import tracking as track_module
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
+from tests.support.towns import drawn_town
 
 COLUMNS = (
     "timestamp_ns,frame,status,reason,lat_deg,lon_deg,east_m,north_m,up_m,sigma_east_m,sigma_north_m,"
@@ -32,6 +33,7 @@ COLUMNS = (
 FRAMES = 6
 FIGURES = {"path.png", "position.png", "height.png", "error.png"}
 WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"} | FIGURES
+pytestmark = pytest.mark.usefixtures("bare_runs")  # but for `done`, which is drawn before it
 SCRIPT = Path(sys.executable).with_name("scenematch")
 
 
@@ -39,7 +41,7 @@ SCRIPT = Path(sys.executable).with_name("scenematch")
 def flight(tmp_path_factory):
     """A flight folder of six frames, to be read and not written."""
     folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, plan_flight(frames=FRAMES))
+    write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
     return folder
 
 
@@ -223,9 +225,10 @@ def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsy
     assert "deadlines missed" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("towns_drawn_once")
 def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsys):
     out = tmp_path / "demo"
-    assert run(["demo", "--frames=4", "--threads=1", f"--out={out}"]) == 0
+    assert run(["demo", "--frames=2", "--threads=1", f"--out={out}"]) == 0
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 80
     for row in ("NCC, as published", "NCC, paper's recipe", "SIFT, scenematch"):
@@ -233,9 +236,16 @@ def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsy
     runs = {"ncc-paper", "ncc-engine", "sift-paper", "sift-engine"}
     assert set(json.loads((out / "table.json").read_text(encoding="utf-8"))) == runs
     assert runs < {path.name for path in out.iterdir()}
-    # Once more and shorter: nothing of the first run is left beside the second.
-    assert run(["demo", "--frames=2", "--threads=1", f"--out={out}", "--force", "--json"]) == 0
+
+
+@pytest.mark.slow
+def test_a_second_demo_is_shorter_and_leaves_nothing_of_the_first_beside_it(tmp_path, capsys):
+    out = tmp_path / "demo"
+    for frames in (4, 2):
+        capsys.readouterr()
+        assert run(["demo", f"--frames={frames}", "--threads=1", f"--out={out}", "--force", "--json"]) == 0
     printed = capsys.readouterr()
+    runs = {"ncc-paper", "ncc-engine", "sift-paper", "sift-engine"}
     assert {name: result["frames"] for name, result in json.loads(printed.out).items()} == dict.fromkeys(runs, 2)
     assert len(list((out / "flight" / "frames").iterdir())) == 2
     assert "left out" not in printed.err
@@ -617,9 +627,12 @@ def test_an_interrupted_run_keeps_its_rows(flight, tmp_path, capsys, monkeypatch
     assert "summary.json" in error_line(capsys, ["evaluate", out], 1)
 
 
+NARROW = {"COLUMNS": "30", "TERM": "dumb"}
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-def test_the_console_script_in_a_narrow_pipe_and_under_ctrl_c(flight, tmp_path):
-    environment = os.environ | {"COLUMNS": "30", "TERM": "dumb"}
+def test_the_console_script_in_a_narrow_pipe(flight, tmp_path):
+    environment = os.environ | NARROW
     gone = flight / ("a-folder-with-a-rather-long-name/" * 3 + "map.tif")
     command = [str(SCRIPT), *track(flight, tmp_path / "out", map=gone)]
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -627,15 +640,22 @@ def test_the_console_script_in_a_narrow_pipe_and_under_ctrl_c(flight, tmp_path):
     assert result.stderr.count("\n") == 1
     assert str(gone) in result.stderr
 
+
+@pytest.mark.slow
+def test_the_decoders_own_words_stay_off_standard_error(flight, tmp_path):
     (tmp_path / "flight.mp4").write_bytes(b"no video at all")
     command = [str(SCRIPT), *track(flight, tmp_path / "out", frames=tmp_path / "flight.mp4")]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    result = subprocess.run(command, env=os.environ | NARROW, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout, result.stderr.count("\n")) == (1, "", 1), result.stderr
 
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_the_console_script_under_ctrl_c(tmp_path):
     out = tmp_path / "demo"
     command = [str(SCRIPT), "demo", "--threads=1", f"--out={out}"]
     with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | NARROW
     ) as process:
         assert process.stderr.readline().startswith("drawing")
         for _ in range(20):  # as a user does it: C code may swallow the first

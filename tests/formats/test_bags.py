@@ -26,6 +26,7 @@ from engine.formats.ros.bag_writer import KINDS, write_bag
 from engine.formats.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
 from engine.formats.ros.messages import MessageFactory
 from engine.values import Frame, Prior, Truth
+from tests.support.towns import drawn_town
 
 STEP_NS = 100_000_000
 CAMERA = Camera(
@@ -265,13 +266,14 @@ def check_readable_or_one_line(path, frames):
 # ---------------------------------------------------------------------------------------------- command line
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     from engine.runs.simulation import write_flight
     from engine.sim import plan_flight
 
     folder, bag = tmp_path / "flight", tmp_path / "flight.bag"
     folder.mkdir()
-    write_flight(folder, plan_flight(frames=3))
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
     assert main(["bag", str(folder), "--out", str(bag)]) == 0
     assert main(["bag", str(folder), "--out", str(bag)]) == 2
     assert main(["bag", str(folder), "--out", str(bag), "--force"]) == 0

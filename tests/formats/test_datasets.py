@@ -32,7 +32,9 @@ from engine.runs.tracking import track
 from engine.sim import picture_at, plan_flight
 from engine.values import Attitude, Truth
 from tests.support.paths import ROOT
+from tests.support.towns import drawn_town
 
+pytestmark = pytest.mark.usefixtures("bare_runs")
 CAMERA = Camera.from_fov(300, 300, 60.0)  # the simulated flights'
 GROUND_M = 120.0  # level of the miniatures' ground, above whatever their heights are counted from
 
@@ -40,7 +42,7 @@ GROUND_M = 120.0  # level of the miniatures' ground, above whatever their height
 @pytest.fixture(scope="module")
 def plan():
     """Four frames of a flight that is under way."""
-    return plan_flight(frames=12)
+    return plan_flight(town=drawn_town(), frames=12)
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
+from tests.support.towns import drawn_town
 
 
 def at(log, *seconds):
@@ -421,7 +422,7 @@ def test_dataflash_is_read_as_pymavlink_reads_it(tmp_path):
 def flown(tmp_path_factory):
     """A flight folder of three frames, and the same telemetry as a DataFlash log with camera messages."""
     folder = tmp_path_factory.mktemp("flown")
-    write_flight(folder, plan_flight(frames=3))
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
     rows = read_telemetry(folder / "telemetry.csv")
     truth = read_truth(folder / "truth.csv")
     messages = []
@@ -439,6 +440,7 @@ def flown(tmp_path_factory):
     return folder
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd):
     def follow(out, *more):
         files = ("map", "map.tif"), ("camera", "camera.yaml"), ("frames", "frames")

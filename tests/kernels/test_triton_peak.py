@@ -181,6 +181,7 @@ def compile_for(capability):
 
 
 @needs_triton
+@pytest.mark.slow
 def test_the_kernel_compiles_without_a_gpu(tmp_path):
     """The interpreter takes what the compiler refuses."""
     with in_process(False, tmp_path) as pool:

@@ -1,8 +1,6 @@
 """The map: where its pixels lie, what is nodata, and what is refused."""
 
 import json
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -20,7 +18,7 @@ from engine.formats.geotiff import write_geotiff
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
-from tests.support.paths import ROOT, SHARED
+from tests.support.paths import SHARED
 
 UTM = "EPSG:32636"
 STEP_M = 0.5
@@ -69,12 +67,6 @@ def _own_cache(tmp_path_factory, monkeypatch):
 def site():
     y, x = np.mgrid[0:90, 0:120]
     return OrthoMap.from_arrays(noise(90, 120), CENTRED, UTM, surface_m=(0.25 * x + 0.5 * y).astype(np.float32))
-
-
-def test_import_loads_neither_rasterio_nor_pyproj():
-    code = "import sys, engine.orthomap; print([m for m in ('rasterio', 'pyproj') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 # --- where pixels lie ---------------------------------------------------------------------------------------

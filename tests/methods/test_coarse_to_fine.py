@@ -16,7 +16,7 @@ import torch
 from engine import ShapeError, ncc_fft
 from engine.align import enhance
 from engine.ncc_fft import match_template, prepare
-from engine.sim import build_town
+from tests.support.towns import drawn_town
 
 KINDS = ("fine", "broad", "mixed", "town", "tiles", "flat")
 CASES_A_KIND = 60
@@ -30,7 +30,7 @@ def texture(rng, size, correlation_px):
 
 @pytest.fixture(scope="module")
 def town():
-    return cv2.cvtColor(build_town(7).ortho, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(drawn_town(7).ortho, cv2.COLOR_RGB2GRAY)
 
 
 def ground(rng, kind, size, town):

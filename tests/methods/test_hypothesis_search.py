@@ -10,7 +10,7 @@ from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.methods.ncc import Ncc
 from engine.methods.options import NccOptions
 from engine.sim import FlightStyle, SensorNoise, plan_flight
-from tests.support.towns import site_of
+from tests.support.towns import drawn_town, site_of
 
 EXACT = SensorNoise(
     height_sd_m=0.0, height_drift_sd_m=0.0, heading_sd_deg=0.0, heading_bias_deg=0.0, tilt_sd_deg=0.0,
@@ -18,13 +18,21 @@ EXACT = SensorNoise(
 )  # fmt: skip
 PLACES = (0, 5, 9, 13)
 # (degrees, share) by which the telemetry is off; the bank is told 5 and 0.05
-OFF = [(5.0, 0.05), (-5.0, 0.03), (3.3, -0.05), (-1.7, -0.02), (0.0, 0.0)]
+OFF = [
+    (5.0, 0.05), (0.0, 0.0), (3.3, -0.05),
+    pytest.param(-5.0, 0.03, marks=pytest.mark.slow), pytest.param(-1.7, -0.02, marks=pytest.mark.slow),
+]  # fmt: skip
+
+KNOWN = pytest.mark.parametrize(
+    "known", [pytest.param(True, id="prior"), pytest.param(False, id="whole map", marks=pytest.mark.slow)]
+)
 
 
 @pytest.fixture(scope="module")
 def flight():
     """A flight whose telemetry is the truth: what is off, the tests put there."""
-    return plan_flight(3, frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9)).draw()
+    plan = plan_flight(3, town=drawn_town(3), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    return plan.draw()
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +74,7 @@ def aligned_heights(monkeypatch):
     return heights
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 @pytest.mark.parametrize(("turn_deg", "share"), OFF)
 def test_a_wrong_heading_and_height_are_put_right(
     matcher, site, flight, error_m, aligned_heights, turn_deg, share, known
@@ -94,7 +102,7 @@ def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site,
     assert fixes >= len(PLACES) - 1
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matcher, flight, known):
     """Where the heading was told and is trusted, a search of the whole map measures no attitude either."""
     frame, truth = flight.frames[PLACES[0]], flight.truth[PLACES[0]]
@@ -106,7 +114,7 @@ def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matche
     assert unrefined.attitude is None
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
     bank = matcher(other_site, heading_search_deg=5.0, height_search_share=0.05)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
@@ -114,7 +122,7 @@ def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
         assert isinstance(bank.locate(flight.frames[k], prior), NoFix)
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_a_frame_of_another_town_is_refused_all_around(matcher, other_site, flight, known):
     bank = matcher(other_site, heading_search_deg=180.0)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None

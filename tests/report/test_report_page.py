@@ -26,6 +26,8 @@ from engine.runs.simulation import write_flight
 from engine.runs.tracking import track
 from engine.sim import plan_flight
 from engine.values import Reason, Window
+from tests.support.runs import bare_runs
+from tests.support.towns import drawn_town
 
 FRAMES = 8
 DARK = 5  # a frame that shows nothing
@@ -212,10 +214,11 @@ def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
 def flown(tmp_path_factory):
     """A finished run over a flight with a black frame."""
     folder = tmp_path_factory.mktemp(HOSTILE.replace("/", "")) / "flight"
-    files = write_flight(folder, plan_flight(frames=FRAMES))
+    files = write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
     black = folder / "frames" / f"{DARK:06d}.jpg"
     Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
-    track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=60_000.0))
+    with bare_runs():
+        track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=60_000.0))
     return folder.parent / "out"
 
 
@@ -246,11 +249,13 @@ def test_every_frame_is_shown_with_its_match(flown):
     assert "deviate" in frames[DARK]["detail"]
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_equal_tracks_give_equal_bytes(flown, again):
     evaluate(again, None)
     assert (again / "report.html").read_bytes() == (flown / "report.html").read_bytes()
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_without_the_frames_the_page_says_so(flown, again):
     record = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     record["settings"]["frames"] = str(again / "gone")
@@ -260,6 +265,7 @@ def test_without_the_frames_the_page_says_so(flown, again):
     assert "No frames are shown" in (again / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_a_run_that_left_no_notes_has_a_page_without_frames(again):
     (again / "notes.csv").unlink()
     evaluate(again, None)
@@ -307,6 +313,7 @@ def browser():
 PICTURES = "return [...document.querySelectorAll('#pictures image')].map(i => i.getAttribute('href'))"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width_px", [1280, 420])
 def test_the_page_loads_without_complaint_or_network_and_fits(browser, flown, width_px):
     page = flown / "report.html"
@@ -320,6 +327,7 @@ def test_the_page_loads_without_complaint_or_network_and_fits(browser, flown, wi
     assert all(browser.run("return [...document.querySelectorAll('svg[role]')].map(s => !!s.ariaLabel)"))
 
 
+@pytest.mark.slow
 def test_keys_move_through_the_frames(browser, flown):
     browser.open(flown / "report.html", 1280)
     seen = [browser.run(PICTURES)]
@@ -337,6 +345,7 @@ def test_keys_move_through_the_frames(browser, flown):
     assert browser.complaints() == []
 
 
+@pytest.mark.slow
 def test_a_refusal_is_found_from_its_reason(browser, flown):
     browser.open(flown / "report.html", 1280)
     browser.run("document.querySelector('[data-goto]').click()")
@@ -344,6 +353,7 @@ def test_a_refusal_is_found_from_its_reason(browser, flown):
     assert browser.run("return document.querySelector('#facts .answer').textContent") == "Refused: no texture"
 
 
+@pytest.mark.slow
 def test_the_map_zooms_about_the_frame_shown(browser, flown):
     browser.open(flown / "report.html", 1280)
     box = "return document.getElementById('map').getAttribute('viewBox').split(' ').map(Number)"

@@ -1,5 +1,6 @@
 """campaign: many flights by several methods; the same on one process, on several and on Ray, killed or not."""
 
+import contextlib
 import csv
 import importlib.util
 import json
@@ -28,6 +29,8 @@ from engine.runs.jobs import read_result
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
+from tests.support.runs import bare_runs
+from tests.support.towns import drawn_town
 
 pytestmark = pytest.mark.timeout(900)  # a dozen processes, on a machine that may be busy
 RUNS = ("town-1-noon/ncc", "good/ncc", "bad/ncc")
@@ -50,7 +53,7 @@ frames = 2
 def place(tmp_path_factory):
     """A campaign's file, with a flight of two frames and a calibration that does not fit it."""
     folder = tmp_path_factory.mktemp("campaign")
-    write_flight(folder / "flight", plan_flight(frames=2))
+    write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=2))
     text = (folder / "flight" / "camera.yaml").read_text(encoding="utf-8")
     other = text.replace("image_width: 300", "image_width: 320")
     (folder / "flight" / "other.yaml").write_text(other, encoding="utf-8")
@@ -62,13 +65,19 @@ def command(place, out, *more):
     return [sys.executable, "-m", "engine.cli", "campaign", str(place / "campaign.toml"), f"--out={out}", *more]
 
 
+@contextlib.contextmanager
+def in_this_process(*_):
+    """An executor without processes: each of them would load PyTorch anew."""
+    yield lambda do, jobs: ((job, do(job)) for job in jobs)
+
+
 @pytest.fixture(scope="module")
 def whole(place):
-    """The campaign on one process at a time, from its begin to its end."""
-    done = subprocess.run(
-        command(place, place / "whole", "--workers=1"), capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 1, done.stderr  # the flight that cannot be followed
+    """The campaign in this process, from its begin to its end."""
+    with pytest.MonkeyPatch.context() as patch, bare_runs():
+        patch.setattr("engine.runs.campaign._executor", in_this_process)
+        code = run(["campaign", str(place / "campaign.toml"), f"--out={place / 'whole'}"])
+    assert code == 1  # the flight that cannot be followed
     return place / "whole"
 
 
@@ -105,6 +114,15 @@ def test_every_run_is_told_once_and_a_flight_that_fails_costs_no_other(whole):
     assert "300 x 300" in page
 
 
+@pytest.mark.slow
+def test_one_process_at_a_time_gives_the_same(place, whole):
+    out = place / "processes"
+    done = subprocess.run(command(place, out, "--workers=1"), capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stderr
+    same(out, whole)
+
+
+@pytest.mark.slow
 def test_what_was_killed_half_way_is_resumed_by_more_processes_and_nothing_is_lost_or_doubled(place, whole):
     out = place / "resumed"
     begun = subprocess.Popen(command(place, out, "--workers=1"), stderr=subprocess.DEVNULL, start_new_session=True)
@@ -131,10 +149,14 @@ def test_what_was_killed_half_way_is_resumed_by_more_processes_and_nothing_is_lo
     same(out, whole)
 
 
-def test_a_run_that_failed_is_tried_again_and_no_flight_is_drawn_for_nothing(place, whole, tmp_path, capsys):
+@pytest.mark.usefixtures("bare_runs")
+def test_a_run_that_failed_is_tried_again_and_no_flight_is_drawn_for_nothing(
+    place, whole, tmp_path, monkeypatch, capsys
+):
     out = tmp_path / "again"
     shutil.copytree(whole, out)
     shutil.rmtree(out / "flights")
+    monkeypatch.setattr("engine.runs.campaign._executor", in_this_process)
     assert run(["campaign", str(place / "campaign.toml"), f"--out={out}", "--workers=1"]) == 1
     told = capsys.readouterr().err
     assert "3 runs, 2 of them finished before" in told
@@ -143,6 +165,7 @@ def test_a_run_that_failed_is_tried_again_and_no_flight_is_drawn_for_nothing(pla
     same(out, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason=NO_RAY)
 def test_a_ray_cluster_gives_the_same(place, whole):
     out = place / "ray"
@@ -363,6 +386,12 @@ def part(number):
     return f"said by {number}, not by {os.getppid()}"
 
 
+def test_a_job_whose_process_ends_is_answered():
+    with in_processes(1) as execute:
+        assert list(execute(part, [2])) == [(2, "its process ended with code 3")]
+
+
+@pytest.mark.slow
 def test_each_job_is_answered_once_even_where_its_process_dies():
     with in_processes(2) as execute:
         answers = list(execute(part, [1, 2, 3]))

@@ -14,6 +14,7 @@ from engine.formats.flight import open_flight
 from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.orthomap import OrthoMap
+from tests.support.runs import bare_runs
 
 FOLDER = {"frames", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif"}
 LOOP = {"track.csv", "loop.csv", "summary.json", "loop.json", "loop.png", "loop-path.png", "path.png"}
@@ -36,7 +37,8 @@ def loop(folder, tmp_path_factory):
     """Six seconds by the engine's fixes, over the map of that flight."""
     out = tmp_path_factory.mktemp("closed") / "flight"
     arguments = ["simulate", "--out", str(out), *own_map(folder), "--closed-loop", "--minutes", "0.1"]
-    assert run([*arguments, "--method", "ncc"]) == 0
+    with bare_runs():
+        assert run([*arguments, "--method", "ncc"]) == 0
     return out
 
 
@@ -55,6 +57,7 @@ def test_a_flight_folder_is_what_track_reads(folder):
         assert 0 < y < site.height_px
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_track_finds_the_way_through_it(folder, tmp_path):
     arguments = ["track", *own_map(folder), "--camera", str(folder / "camera.yaml")]
     arguments += ["--frames", str(folder / "frames")]

@@ -1,8 +1,6 @@
 """Truths about the features: where a blob lies, what a rotation does, what OpenCV and kornia find."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import cv2
@@ -402,8 +400,3 @@ def test_wrong_arguments_are_named(images, options, error, text):
 def test_a_wrong_ratio_is_named(pair):
     with pytest.raises(OptionError, match="ratio"):
         match(*pair, ratio=1.5)
-
-
-def test_importing_does_not_load_kornia():
-    code = "import sys, engine.features; sys.exit(bool('kornia' in sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

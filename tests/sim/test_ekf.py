@@ -227,6 +227,7 @@ def flights():
     return [fly(seed, 12.0) for seed in range(200, 210)]
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says(flights):
     """The NEES at the end of every flight lies in the 99.9 % interval of its chi-square, whole and by parts."""
     parts = [POSITION, VELOCITY, TURN, ACCEL, GYRO, slice(0, STATES)]

@@ -149,6 +149,7 @@ def test_an_engine_that_is_killed_for_ten_seconds_is_coasted_over():
     assert distance(flown.plan_error_m[-20:]).max() < 2.0
 
 
+@pytest.mark.slow
 def test_beyond_its_limit_it_holds_and_when_fixes_return_it_flies_on():
     flown = fly(50.0, Fault(kind="killed", start_s=12.0, duration_s=18.0))
     held = [row for row in flown.record if row.mode is Mode.HOLD]
@@ -161,6 +162,7 @@ def test_beyond_its_limit_it_holds_and_when_fixes_return_it_flies_on():
     assert distance(flown.plan_error_m[-20:]).max() < 3.0
 
 
+@pytest.mark.slow
 def test_without_an_engine_the_flight_is_handed_over_before_nothing_is_known():
     flown = fly(58.0, Fault(kind="killed", start_s=8.0, duration_s=math.inf))
     last = flown.record[-1]

@@ -25,11 +25,12 @@ from engine.sim.render import grid_from_enu, transformer
 from engine.sim.vehicle import COURSE_STEP_S, fly_waypoints, leg_accelerations
 from engine.values import Attitude
 from tests.support.patches import CAMERA, EPSG, ORIGIN, TO_CRS, centre_of_bright, patch_world, project
+from tests.support.towns import drawn_town
 
 
 @pytest.fixture(scope="module")
 def town():
-    return build_town(1)
+    return drawn_town(1)
 
 
 @pytest.fixture(scope="module")

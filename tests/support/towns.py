@@ -2,9 +2,39 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import pickle
+from functools import cache
+from pathlib import Path
+from typing import Any
+
 import cv2
 
 from engine import OrthoMap
+from engine.sim import Town, build_town
+
+kept_in: Path | None = None
+"""The folder that the workers of a run share."""
+
+
+def drawn_town(seed: int = 1) -> Town:
+    """The town of a seed, drawn once a process (two seconds): nobody writes into it."""
+    return drawn_once(seed)
+
+
+@cache
+def drawn_once(*seed: Any, **options: Any) -> Town:
+    """What ``build_town`` draws, kept in a file where the workers of a run share a folder."""
+    if kept_in is None:
+        return build_town(*seed, **options)
+    name = hashlib.sha256(repr((seed, sorted(options.items()))).encode()).hexdigest()[:16]
+    path = kept_in / f"town-{name}.pickle"
+    if not path.exists():
+        unfinished = path.with_suffix(f".{os.getpid()}")
+        unfinished.write_bytes(pickle.dumps(build_town(*seed, **options)))
+        unfinished.replace(path)
+    return pickle.loads(path.read_bytes())
 
 
 def site_of(town, *, surface=True):
