@@ -42,6 +42,17 @@ from engine.sim.quadrotor import STEP_S, Airframe, State, Wind, WindField, advan
 from engine.sim.sensors import GpsSample, Instruments, SensorSuite, steps_between
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
 
+__all__ = [
+    "ClosedLoop",
+    "Fault",
+    "LoopAnswer",
+    "LoopOptions",
+    "LoopResult",
+    "LoopSample",
+    "Mode",
+    "fly_closed_loop",
+]
+
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 View = Callable[[State], Image]

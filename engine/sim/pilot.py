@@ -14,6 +14,8 @@ from engine.sim.vehicle import STEP_S as COURSE_STEP_S
 from engine.sim.vehicle import FlightStyle, course
 from engine.values import check_positive
 
+__all__ = ["Gains", "Pilot", "Route", "Setpoint", "plan_rounds", "plan_route"]
+
 Array = NDArray[np.float64]
 
 
