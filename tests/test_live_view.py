@@ -231,9 +231,11 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
     if bridge == "mavlink":
         mavlink = pytest.importorskip("engine.adapters.mavlink", reason="pymavlink is not installed")
         from engine.adapters.links import Connection
-        from engine.adapters.mavlink_out import Outgoing
+        from engine.adapters.mavlink_out import MavlinkOptions
 
-        made = mavlink.Bridge(Connection("udpin", "127.0.0.1", 0), quiet, Outgoing(), watch=told.append)
+        made = mavlink.MavlinkBridge(
+            Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=told.append
+        )
     else:
         made = RosBridge(SilentNode(), sim_site, quiet, RosOptions(), watch=told.append)
     made.deliver(answer)
@@ -244,12 +246,12 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
 class SilentNode:
     """A node to which nobody listens."""
 
-    maker = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
+    messages = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
 
     def now_ns(self):
         return 1
 
-    def is_wanted(self, output):
+    def has_subscribers(self, output):
         return False
 
     def publish(self, output, message):
@@ -298,7 +300,8 @@ def test_a_simulated_flight_that_nobody_flies_has_no_view(capsys):
 
 
 def test_nothing_of_rerun_is_loaded_where_nobody_watches():
-    script = "import sys, engine.runs.tracking, engine.runs.simulation, engine.runs.mavlink_bridge; print('rerun' in sys.modules)"
+    modules = "engine.runs.tracking, engine.runs.simulation, engine.runs.mavlink_bridge"
+    script = f"import sys, {modules}; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

@@ -182,13 +182,13 @@ def ros(
     Hears pictures, attitude and height, and publishes poses, fixes, diagnostics and the window that was searched.
     An empty name of a topic leaves it out.
     """
-    from engine.adapters.ros import Topics
+    from engine.adapters.ros import RosTopics
     from engine.runs.mavlink_bridge import MatchSettings
     from engine.runs.ros_bridge import RosFiles, run_bridge_ros
     from engine.runs.watching import Watching
 
     use_threads(threads)
-    topics = Topics(
+    topics = RosTopics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
         velocity=velocity,
     )  # fmt: skip

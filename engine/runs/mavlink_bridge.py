@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from engine.adapters.links import parse_connection
 from engine.adapters.parameters import parameter_file
-from engine.adapters.pictures import Picture, capture, replay
-from engine.adapters.vehicle import Origin
+from engine.adapters.pictures import CapturedImage, capture, replay
+from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import (
@@ -31,8 +31,8 @@ from engine.runs.checks import check_place
 from engine.runs.watching import Watching, watched_beside
 
 if TYPE_CHECKING:
-    from engine.adapters.mavlink import Bridge, Status
-    from engine.adapters.mavlink_out import Outgoing
+    from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
+    from engine.adapters.mavlink_out import MavlinkOptions
 
 _SAY_EVERY_S = 5.0
 _HEAR_S = 10.0
@@ -68,7 +68,7 @@ class BridgeFiles:
                 f"--exposure-to-grab-ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
             )
 
-    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[Picture]:
+    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage]:
         """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
         if self.frames is not None:
             return replay(self.frames, self.telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
@@ -137,7 +137,7 @@ def run_bridge(
     """Bridge until the pictures end, the time is over or somebody interrupts, and print what was done."""
     _need_pymavlink()
     watching.check()
-    from engine.adapters.mavlink import Bridge
+    from engine.adapters.mavlink import MavlinkBridge
     from engine.adapters.packets import read_key
 
     connection = parse_connection(wire.connect, listen_anywhere=wire.listen_anywhere)
@@ -152,7 +152,7 @@ def run_bridge(
 
     with watched_beside(matcher, watching) as (make_navigator, watcher):
         try:
-            bridge = Bridge(
+            bridge = MavlinkBridge(
                 connection, make_navigator, options, start, matching.live_options(),
                 origin=_origin(site, wire), use_velocity=wire.use_velocity, system_id=wire.system_id, key=key,
                 watch=watcher,
@@ -188,22 +188,24 @@ def _need_pymavlink() -> None:
         ) from None
 
 
-def _outgoing(firmware: str, message: str, max_sigma_m: float) -> Outgoing:
-    from engine.adapters.mavlink_out import Outgoing
+def _outgoing(firmware: str, message: str, max_sigma_m: float) -> MavlinkOptions:
+    from engine.adapters.mavlink_out import MavlinkOptions
 
     with named_as_typed(firmware="--firmware", message="--message", max_sigma_m="--max-sigma-m"):
-        return Outgoing(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
+        return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
 
 
-def _origin(site: OrthoMap, wire: LinkSettings) -> Origin | None:
+def _origin(site: OrthoMap, wire: LinkSettings) -> NedOrigin | None:
     """The map's, at the height of its ground where none is told."""
     if not wire.set_origin:
         return None
     alt_m = site.ground_m if wire.origin_alt_m is None else wire.origin_alt_m
-    return Origin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
+    return NedOrigin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
 
 
-def _follow(bridge: Bridge, pictures: Iterator[Picture], camera: Camera, seconds: float | None) -> None:
+def _follow(
+    bridge: MavlinkBridge, pictures: Iterator[CapturedImage], camera: Camera, seconds: float | None
+) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
     begin = said = time.monotonic()
     count = 0
@@ -225,7 +227,7 @@ def _follow(bridge: Bridge, pictures: Iterator[Picture], camera: Camera, seconds
     _wait_for_answers(lambda: bridge.status.answered, count)
 
 
-def _wait_for_autopilot(bridge: Bridge) -> None:
+def _wait_for_autopilot(bridge: MavlinkBridge) -> None:
     """A flight that is played begins with the autopilot's: where it was earlier, nobody would have told."""
     if not bridge.connected:
         console.say(f"the pictures wait for the autopilot, {_HEAR_S:g} s at most")
@@ -242,7 +244,7 @@ def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
         time.sleep(0.3)
 
 
-def _line(status: Status) -> str:
+def _line(status: MavlinkStatus) -> str:
     from engine.adapters.mavlink import MIN_RATE_HZ
 
     reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"

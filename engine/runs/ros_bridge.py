@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from engine.adapters.ros import RosBridge, RosNode, Topics
+from engine.adapters.ros import RosBridge, RosNode, RosTopics
 from engine.adapters.ros_out import RosOptions
-from engine.adapters.vehicle import Origin
+from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.cli import console
 from engine.cli.arguments import named_as_typed, open_map, parse_position
 from engine.errors import BackendError, CalibrationError, OptionError
-from engine.formats.ros.messages import camera_of
+from engine.formats.ros.messages import camera_from_message
 from engine.matcher import SceneMatcher
 from engine.runs.checks import check_place
 from engine.runs.mavlink_bridge import MatchSettings
@@ -28,7 +28,7 @@ class RosFiles:
     map: Path
     surface: Path | None
     camera: Path | None
-    topics: Topics
+    topics: RosTopics
     map_sigma_m: float | None = None  # how well the map lies, where it does not say
 
     def __post_init__(self) -> None:
@@ -49,7 +49,7 @@ def run_bridge_ros(
     """Run the node until ROS, the time or somebody ends it, and print what was done."""
     watching.check()
     start, place = parse_position("--start", matching.start), parse_position("--origin", origin)
-    begin = None if place is None else Origin(place.lat_deg or 0.0, place.lon_deg or 0.0, 0.0)
+    begin = None if place is None else NedOrigin(place.lat_deg or 0.0, place.lon_deg or 0.0, 0.0)
     with named_as_typed(firmware="--firmware"):
         options = RosOptions(firmware=firmware, origin=begin)
     site = open_map(inputs.map, inputs.surface, inputs.map_sigma_m)
@@ -65,7 +65,7 @@ def run_bridge_ros(
         bridge = RosBridge(node, site, make_navigator, options, start, matching.live_options(), watch=watcher)
         console.say(f"listening to {inputs.topics.image}")
         try:
-            node.spin(bridge.handlers(inputs.topics), bridge.beat, matching.seconds)
+            node.spin(bridge.handlers(inputs.topics), bridge.check_input, matching.seconds)
         finally:
             bridge.close()
     console.facts(asdict(bridge.status), as_json, title=f"ROS {version} on {inputs.topics.image}")
@@ -93,4 +93,4 @@ def _told(node: RosNode, topic: str) -> Camera:
         raise BackendError(
             f"--camera-info-topic: expected a calibration on {topic} within {_PATIENCE_S:g} s, got none"
         )
-    return camera_of(message)
+    return camera_from_message(message)
