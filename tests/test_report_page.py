@@ -10,16 +10,16 @@ from PIL import Image
 
 from bench.browser import missing, open_browser
 from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.formats.notes import Note, note_of, read_notes, write_notes
+from engine.formats.notes import FrameNote, frame_note, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.integrity import PeakRule
 from engine.matcher import MatcherOptions
 from engine.methods.hypothesis import NccOptions
 from engine.methods.sift import SiftOptions
-from engine.report.charts import Plot, ticks
+from engine.report.charts import ChartArea, ticks
 from engine.report.explain import choose_frames
-from engine.report.metrics import Errors, Ground, summarise
+from engine.report.metrics import Ground, TrackErrors, summarise
 from engine.report.page import FinishedTrack, write_page
 from engine.report.verdict import MEANINGS, verdict_of
 from engine.runs.demo import write_flight
@@ -106,7 +106,7 @@ def test_ticks_are_round_and_inside(low, span):
 
 
 def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
-    plot = Plot((0.0, 4.0), (0.0, 1.0))
+    plot = ChartArea((0.0, 4.0), (0.0, 1.0))
     time, values = np.arange(5.0), np.array([0.0, 0.5, np.nan, 0.5, 7.0])
     assert plot.line(time, values, "truth").count("M") == 2
     assert plot.dots(time, values, "fix").count("h0") == 3
@@ -116,7 +116,7 @@ def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
 def errors_of(distances_m):
     east = np.array(distances_m, float)
     error = np.column_stack([east, np.where(np.isfinite(east), 0.0, np.nan)])
-    return Errors(np.zeros_like(error), error, error, np.full((len(east), 2, 2), np.nan))
+    return TrackErrors(np.zeros_like(error), error, error, np.full((len(east), 2, 2), np.nan))
 
 
 def test_wrong_frames_are_shown_before_refusals_before_others():
@@ -139,8 +139,8 @@ def test_notes_come_back_as_they_were(tmp_path):
     window = Window(3, 4, 50, 60)
     refusal = NoFix(reason=Reason.AMBIGUOUS, detail='0.41 against 0.40, "here"', window=window)
     notes = [
-        note_of("a.jpg", refusal, "lost"),
-        Note(frame="b.jpg", state="tracking", heading_deg=12.5, stage="fine"),
+        frame_note("a.jpg", refusal, "lost"),
+        FrameNote(frame="b.jpg", state="tracking", heading_deg=12.5, stage="fine"),
     ]
     write_notes(tmp_path / "notes.csv", notes)
     assert read_notes(tmp_path / "notes.csv") == notes
@@ -275,7 +275,7 @@ def test_without_truth_nothing_is_claimed(flown, tmp_path):
     site = OrthoMap.open(record["settings"]["map"])
     write_page(tmp_path / "report.html", FinishedTrack(rows, None, site, Ground(), summary, None))
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "Without truth nobody can say" in text
+    assert "Without truth their accuracy is unknown" in text
     assert "median error" not in text
 
 

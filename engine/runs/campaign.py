@@ -12,7 +12,7 @@ from pathlib import Path
 from engine.cli import console
 from engine.cli.arguments import check_folder
 from engine.errors import OptionError
-from engine.report.campaign import TABLE, TABLE_HEAD, Line, write_tables
+from engine.report.campaign import TABLE, TABLE_HEAD, CampaignRow, write_tables
 from engine.runs.campaign_plan import RUNS, WORKSHOP, CampaignPlan, plan_campaign
 from engine.runs.executors import Execute, in_processes, on_ray
 from engine.runs.jobs import Job, do, read_result
@@ -24,7 +24,7 @@ _SHOWN = 5  # names in a message
 
 def run_campaign(
     path: Path, out: Path, *, workers: int | None = None, ray: str | None = None, force: bool = False
-) -> list[Line]:
+) -> list[CampaignRow]:
     """Do what is left of a campaign, and write its tables.
 
     Args:
@@ -138,10 +138,10 @@ def _work(execute: Execute, jobs: Sequence[Job], what: str) -> dict[str, str]:
     return failures
 
 
-def _line(job: Job, groups: dict[str, str], failures: dict[str, str]) -> Line:
+def _line(job: Job, groups: dict[str, str], failures: dict[str, str]) -> CampaignRow:
     flight, _, run = job.name.partition("/")
     failure = failures.get(job.name) or failures.get(flight)
     result = None if failure else read_result(job)
     if result is None:
-        return Line(groups[flight], flight, run, None, None, failure)
-    return Line(groups[flight], flight, run, result.figures, result.latency_ms, None)
+        return CampaignRow(groups[flight], flight, run, None, None, failure)
+    return CampaignRow(groups[flight], flight, run, result.figures, result.latency_ms, None)

@@ -14,7 +14,7 @@ from typing import Any
 
 from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
-from engine.report.campaign import are_figures, are_times
+from engine.report.campaign import are_valid_figures, are_valid_latencies
 from engine.runs.simulation import WorldSettings, run_simulate
 from engine.runs.tracking import FlightFiles, Settings, run_track
 
@@ -139,11 +139,11 @@ def read_result(job: Job) -> Result | None:
     inputs, figures, latency_ms = told["inputs"], told["figures"], None
     whole = isinstance(inputs, dict) and all(isinstance(value, str) for value in inputs.values())
     followed = isinstance(job.task, Follow)
-    if not (whole and isinstance(figures, dict) and (not followed or are_figures(figures))):
+    if not (whole and isinstance(figures, dict) and (not followed or are_valid_figures(figures))):
         raise _damaged(job.folder / RESULT)
     if followed:
         latency_ms = _read(job.folder / "summary.json", "latency_ms")["latency_ms"]
-        if not are_times(latency_ms):
+        if not are_valid_latencies(latency_ms):
             raise _damaged(job.folder / "summary.json")
     return Result(inputs, figures, latency_ms)
 
