@@ -67,7 +67,7 @@ def import_dataset(
     Links its pictures, lays its map together, and says what could not be known and what is doubtful about its
     truth. Single photographs become flights of one frame each, with a campaign's file that lists them.
     """
-    from engine.formats.datasets.recording import ImportOptions
+    from engine.formats.datasets.sequence import ImportOptions
     from engine.runs.dataset_import import SINGLES, Choice, run_import, run_import_singles
 
     of_singles = {"reference": reference, "max_tilt_deg": max_tilt, "limit": limit}

@@ -10,7 +10,7 @@ from engine.cli import console
 from engine.cli.arguments import check_choice
 from engine.errors import OptionError
 from engine.formats.flight import open_flight
-from engine.formats.ros.bag_writer import KINDS, check_place, write_bag
+from engine.formats.ros.bag_writer import BAG_KINDS, check_replaceable, write_bag
 from engine.formats.truth import read_truth
 
 
@@ -20,7 +20,7 @@ def run_bag(directory: Path, out: Path, kind: str | None, *, force: bool = False
     Args:
         directory: the flight folder.
         out: the bag.
-        kind: one of :data:`engine.formats.ros.bag_writer.KINDS`; None is ros1 for a name that ends in .bag, else
+        kind: one of :data:`engine.formats.ros.bag_writer.BAG_KINDS`; None is ros1 for a name in .bag, else
             ros2-mcap.
         force: whether the bag may be there already; it stays until the new one is whole.
 
@@ -32,10 +32,10 @@ def run_bag(directory: Path, out: Path, kind: str | None, *, force: bool = False
         TelemetryError, CalibrationError: the folder is no flight, or the bag cannot be written.
     """
     kind = ("ros1" if out.suffix.lower() == ".bag" else "ros2-mcap") if kind is None else kind
-    check_choice("--format", kind, KINDS)
+    check_choice("--format", kind, BAG_KINDS)
     if (out.suffix.lower() == ".bag") != (kind == "ros1"):
         raise OptionError(f"--out: expected a name that ends in .bag for ros1 and for no other format, got {out}")
-    check_place(out, force)
+    check_replaceable(out, force)
     camera = Camera.load(directory / "camera.yaml")
     flight = open_flight(directory / "frames", directory / "telemetry.csv", camera)
     truth_path = directory / "truth.csv"

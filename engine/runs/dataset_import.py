@@ -12,24 +12,24 @@ from engine.cli import console
 from engine.cli.arguments import check_choice, check_folder, prepare_folder
 from engine.errors import OptionError, TelemetryError
 from engine.formats.datasets.alto import read_alto
-from engine.formats.datasets.anyvisloc import MODES, find_anyvisloc, read_anyvisloc, read_place
+from engine.formats.datasets.anyvisloc import MODES, find_anyvisloc, read_anyvisloc, read_local_map
 from engine.formats.datasets.ortholoc import find_ortholoc, read_ortholoc
-from engine.formats.datasets.recording import (
-    ABOUT,
-    OWNED,
+from engine.formats.datasets.sequence import (
+    MANIFEST,
+    WRITTEN_FILES,
+    DatasetSequence,
     ImportOptions,
-    Recording,
     check_complete,
     clear_frames,
-    write_recording,
+    write_sequence,
 )
-from engine.formats.datasets.singles import campaign_text, write_place, write_single
+from engine.formats.datasets.single_photos import campaign_text, write_local_map, write_single_photo
 from engine.formats.datasets.uav_visloc import read_uav_visloc
 from engine.formats.datasets.vpair import read_vpair
 from engine.formats.datasets.wildnav import read_wildnav
 from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
-from engine.formats.truth_checks import Finding, check_truth
+from engine.formats.truth_checks import TruthFinding, check_truth
 from engine.maps.rasters import open_source
 
 FLIGHTS, SINGLES = ("uav-visloc", "wildnav", "vpair", "alto"), ("anyvisloc", "ortholoc")
@@ -66,10 +66,10 @@ def run_import(
     _check_apart(out, ("DIR", root), ("--camera", camera), ("--map", told.map), ("--surface", told.surface))
     recording = _read(kind, root, part, gsd_m)
     check_complete(recording, told)
-    _check_apart(out, *(("a picture of DIR", shot.picture) for shot in recording.shots))
+    _check_apart(out, *(("a picture of DIR", image.path) for image in recording.images))
     clear_frames(out)
-    prepare_folder(out, force, OWNED)
-    notes = write_recording(out, recording, told)
+    prepare_folder(out, force, WRITTEN_FILES)
+    notes = write_sequence(out, recording, told)
     findings = check_flight(out)
     for text in (*notes, *(finding.text for finding in findings)):
         console.say(f"note: {text}")
@@ -95,7 +95,7 @@ def _check_apart(out: Path, *inputs: tuple[str, Path | None]) -> None:
             raise OptionError(f"--out: expected a folder without {name}, whose files it replaces, got {out}")
 
 
-def _read(kind: str, root: Path, part: str | None, gsd_m: float | None) -> Recording:
+def _read(kind: str, root: Path, part: str | None, gsd_m: float | None) -> DatasetSequence:
     if (kind in ("uav-visloc", "alto")) != (part is not None):
         raise OptionError(
             f"--part: expected {'one' if part is None else 'none'} with {kind}, got {part or 'none'}"
@@ -161,12 +161,12 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
         raise TelemetryError(f"{scene}: expected samples of {kind}, got none")
     limit = min(choice.limit or len(paths), len(paths))
     paths = [paths[k * len(paths) // limit] for k in range(limit)]
-    shared = read_place(scene, choice.reference) if kind == "anyvisloc" else None
+    shared = read_local_map(scene, choice.reference) if kind == "anyvisloc" else None
     for path in paths:
         _check_replaceable(out / path.stem)
     prepare_folder(out, force, (CAMPAIGN, *(f"{_MAPS}/{name}" for name in ("map.tif", "dsm.tif"))))
     if shared is not None:
-        write_place(out / _MAPS, shared)
+        write_local_map(out / _MAPS, shared)
     names = []
     for path in console.progress(paths, len(paths), kind):
         single, place = read_ortholoc(path) if shared is None else (read_anyvisloc(path), shared)
@@ -175,9 +175,9 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
         folder = out / single.name
         if folder.exists():
             shutil.rmtree(folder)
-        write_single(folder, single, place, folder if shared is None else out / _MAPS, _NAMES[kind])
+        write_single_photo(folder, single, place, folder if shared is None else out / _MAPS, _NAMES[kind])
         if shared is None:
-            write_place(folder, place)
+            write_local_map(folder, place)
         names.append(single.name)
     if not names:
         raise OptionError(
@@ -197,7 +197,7 @@ def run_import_singles(kind: str, root: Path, out: Path, choice: Choice, *, forc
 
 def _check_replaceable(folder: Path) -> None:
     """Refuse a folder in a flight's place that no import made."""
-    if folder.is_symlink() or (folder.exists() and not (folder / ABOUT).is_file()):
+    if folder.is_symlink() or (folder.exists() and not (folder / MANIFEST).is_file()):
         raise OptionError(f"--out: expected flights of an earlier import to replace, but {folder} is no such one")
 
 
@@ -208,7 +208,7 @@ _SINGLE_NOTES = (
 )
 
 
-def check_flight(folder: Path, max_speed_mps: float = 70.0) -> list[Finding]:
+def check_flight(folder: Path, max_speed_mps: float = 70.0) -> list[TruthFinding]:
     """What is doubtful about the truth of a flight folder.
 
     Raises:
@@ -225,7 +225,7 @@ def check_flight(folder: Path, max_speed_mps: float = 70.0) -> list[Finding]:
     return check_truth(read_truth(truth), rows, site=site, surface=surface, max_speed_mps=max_speed_mps)
 
 
-def print_findings(findings: Sequence[Finding], title: str) -> None:
+def print_findings(findings: Sequence[TruthFinding], title: str) -> None:
     """A line a finding."""
     pairs = [(finding.kind, finding.text) for finding in findings] or [("nothing found", "")]
     console.print_pairs(title, pairs)

@@ -25,7 +25,7 @@ from engine.cli.arguments import (
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.flight import Flight, FlightFrame, open_flight
 from engine.formats.logs.readers import LogClock, is_log, open_truth
-from engine.formats.notes import note_of, read_notes, write_notes
+from engine.formats.notes import frame_note, read_notes, write_notes
 from engine.formats.ros.bags import is_bag, read_bag_camera
 from engine.formats.settings import changed, nested, options_from_mapping, read_settings
 from engine.formats.telemetry import ground_amsl_m
@@ -342,7 +342,7 @@ def follow(
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
             attitudes.append(attitude_row(item.frame, result))
-            notes.append(note_of(item.name, result, navigator.state.value))
+            notes.append(frame_note(item.name, result, navigator.state.value))
             if view is not None:
                 view.show(index, item.name, item.frame, result, navigator.state, latency_ms)
     write_notes(path.with_name(NOTES), notes)
@@ -390,7 +390,7 @@ def _write_page(path: Path, flown: FinishedTrack, replay: Replay) -> None:
         return write_page(path, flown, why_not=f"No frames are shown: {replay.why_not}")
     if flown.notes is None or [note.frame for note in flown.notes] != [row.frame for row in flown.rows]:
         return write_page(path, flown, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
-    errors = flown.scene().errors
+    errors = flown.plot_data().errors
     chosen = choose_frames(flown.rows, errors)
     try:
         shown = explain_frames(replay.flight, replay.matcher, flown.rows, flown.notes, chosen, errors)
