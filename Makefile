@@ -48,21 +48,21 @@ docs: $(VENV)/dev.stamp
 
 bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks
-	$(BIN)/python -m pytest bench --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
-	$(BIN)/python -m bench.report .benchmarks/run.json
+	$(BIN)/python -m pytest bench/speed --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
+	$(BIN)/python -m bench.pages.report .benchmarks/run.json
 
 integrity: $(VENV)/dev.stamp
-	$(BIN)/python -m bench.integrity
-	$(BIN)/python -m bench.nees
+	$(BIN)/python -m bench.accuracy.integrity
+	$(BIN)/python -m bench.accuracy.nees
 
 simulated: $(VENV)/dev.stamp
-	$(BIN)/python -m bench.simulated
+	$(BIN)/python -m bench.accuracy.simulated
 
 bench-flights: $(VENV)/dev.stamp
-	$(BIN)/python -m bench.flights
+	$(BIN)/python -m bench.accuracy.flights
 
 bench-latency: $(VENV)/dev.stamp
-	$(BIN)/python -m bench.latency
+	$(BIN)/python -m bench.live.latency
 
 clean:
 	rm -rf $(VENV) demo-report build dist *.egg-info

@@ -1,1 +1,7 @@
 """Benchmarks: a speed is a ratio against a named peer, in one run, on one input, beside its accuracy."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+SHARED = ROOT.parent / "shared" / "data"

@@ -11,6 +11,7 @@ from engine.errors import (
     DtypeError,
     EngineError,
     MapError,
+    MissingExtraError,
     OptionError,
     ShapeError,
     StateError,
@@ -18,9 +19,8 @@ from engine.errors import (
 )
 from engine.integrity import AssumedErrors, PeakRule
 from engine.live import Answer, Live, LiveOptions
-from engine.matcher import MatcherOptions, SceneMatcher
-from engine.methods.hypothesis import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.matcher import SceneMatcher
+from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
 from engine.navigator import Navigator, NavigatorOptions, NavigatorState
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions
@@ -43,6 +43,7 @@ __all__ = [
     "LiveOptions",
     "MapError",
     "MatcherOptions",
+    "MissingExtraError",
     "Navigator",
     "NavigatorOptions",
     "NavigatorState",

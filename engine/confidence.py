@@ -1,9 +1,9 @@
-"""What a peak or a pose has to say for itself, and how probable it is then that it is the right place.
+"""The confidence model: how probable it is that a peak or a pose is of the right place.
 
-A peak is high over a wrong place too, where streets or furrows run alike. What tells the two apart is how far it
-stands out from chance, how near its best rival comes, and whether the place is where it was expected. One logistic
-function of these gives the probability; its constants were fitted by ``python -m bench.confidence`` on
-simulated towns. Votes of the frame's blocks, each on its own shift, were tried there too and added nothing.
+A peak is high over a wrong place too, where streets or furrows look alike. Three features tell the two apart: how
+far the peak stands out from chance, how near its best rival comes, and how well its position agrees with the
+prior. A logistic function of these gives the probability; its weights were fitted by ``python -m
+bench.accuracy.confidence`` on simulated towns. Votes of the frame's blocks, each with its shift, added nothing.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from engine.geo import chi_square
 from engine.values import Fix, Peak
 
-_MAX_LOG10_ALARMS = 60.0  # powers of ten; beyond them nothing is surer
-_MAX_CHI_SQUARE = 12.0  # chi-square against the prior: beyond it the prior may be the one that is wrong
+_MAX_LOG10_ALARMS = 60.0  # beyond that nothing becomes more probable
+_MAX_CHI_SQUARE = 12.0  # beyond that the prior may be the one that is wrong
 
 
 @dataclass(frozen=True, slots=True)
 class PriorAgreement:
-    """How a place lies to where it was expected.
+    """How well a position agrees with the prior.
 
     Attributes:
         prior_chi_square: of the position against the prior by the errors of both, with two degrees of freedom.
-        spread_m: one standard deviation of these errors, the mean of both axes: the wider, the more places would
-            have done as well.
+        spread_m: one standard deviation of these errors, the mean of both axes: the larger, the more wrong places
+            would agree as well.
     """
 
     prior_chi_square: float
@@ -37,25 +37,25 @@ class PriorAgreement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeakFeatures:
-    """What was measured of one peak.
+    """The features of one peak.
 
     Attributes:
         sigmas: Fisher's z of the score, in standard deviations of chance.
         ratio: the best rival's score as a share of the peak's, in [0, 1].
-        expected: how its place lies to the prior.
+        agreement: of its position with the prior.
     """
 
     sigmas: float
     ratio: float
-    expected: PriorAgreement
+    agreement: PriorAgreement
 
 
 @dataclass(frozen=True, slots=True)
 class PoseFeatures:
-    """What was measured of a pose by matched features.
+    """The features of a pose by matched keypoints.
 
     Attributes:
-        log10_nfa: log10 of how many poses chance would support as well.
+        log10_nfa: log10 of the number of false alarms, the poses that chance would support as well.
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
         height_chi_square: of the height against the telemetry's, with one degree of freedom; None where the
             height is unknown or doubted.
@@ -78,7 +78,7 @@ class PeakModel:
 
 
 PEAK_MODEL = PeakModel(constant=16.158, log_sigmas=0.536, ratio=-14.075, prior_chi_square=-0.568, log_spread=-1.39)
-"""Of 6,000 matches over six towns, half of them without an answer."""
+"""Fitted on 6,000 matches over six towns, half of them of frames that show no place in their window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,57 +101,72 @@ POSE_MODEL = PoseModel(
     height_chi_square=-0.264,
     no_height=0.511,
 )
-"""Of 4,200 matches, with what telemetry tells left out in turns and the frame reduced as budgets ask."""
+"""Fitted on 4,200 matches, with parts of the telemetry left out in turns and frames reduced as for budgets."""
 
 
-def peak_features(peak: Peak, sigma: float, expected: PriorAgreement) -> PeakFeatures:
-    """The evidence of a peak.
+def peak_features(peak: Peak, sigma: float, agreement: PriorAgreement) -> PeakFeatures:
+    """The features of a correlation peak.
 
     Args:
         peak: the peak.
         sigma: one standard deviation of a score of chance, from :func:`engine.integrity.score_sigma`.
-        expected: how its place lies to the prior.
+        agreement: of its position with the prior.
     """
     z = math.atanh(min(max(peak.score, 0.0), 0.999))
     ratio = max(peak.second_score, 0.0) / max(peak.score, 1e-3)
-    return PeakFeatures(sigmas=z / sigma, ratio=min(ratio, 1.0), expected=expected)
+    return PeakFeatures(sigmas=z / sigma, ratio=min(ratio, 1.0), agreement=agreement)
 
 
 def prior_agreement(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> PriorAgreement:
-    """How a fix lies to a prior (2,) east and north with one standard deviation per axis."""
+    """How well a fix agrees with a prior.
+
+    Args:
+        fix: not accepted yet.
+        prior_m: (2,) east and north in metres.
+        sigma_m: standard deviation of the prior, per axis.
+
+    Returns:
+        PriorAgreement: by the covariances of both.
+    """
     apart = np.array([fix.east_m, fix.north_m]) - prior_m
     allowed = fix.covariance_m2[:2, :2] + sigma_m**2 * np.eye(2)
     return PriorAgreement(chi_square(apart, allowed), float(np.linalg.det(allowed)) ** 0.25)
 
 
-def regressors(evidence: PeakFeatures | PoseFeatures) -> NDArray[np.float64]:
-    """(5,) of a peak or (6,) of a pose: what the weights are multiplied by.
+def regressors(features: PeakFeatures | PoseFeatures) -> NDArray[np.float64]:
+    """What the weights are multiplied by.
 
-    Sigmas and false alarms enter by their logarithms: 20 sigmas instead of 10 say as much as 10 instead of 5.
+    Sigmas and false alarms enter by their logarithms: from 10 to 20 sigmas is the same step as from 5 to 10.
+
+    Args:
+        features: of a peak or of a pose.
+
+    Returns:
+        (5,) of a peak or (6,) of a pose, in the order of the model's weights.
     """
-    if isinstance(evidence, PeakFeatures):
-        prior_chi_square, spread_m = evidence.expected.prior_chi_square, evidence.expected.spread_m
-        sigmas = math.log(max(evidence.sigmas, 0.5))
+    if isinstance(features, PeakFeatures):
+        prior_chi_square, spread_m = features.agreement.prior_chi_square, features.agreement.spread_m
+        sigmas = math.log(max(features.sigmas, 0.5))
         return np.array(
-            [1.0, sigmas, evidence.ratio, min(prior_chi_square, _MAX_CHI_SQUARE), math.log(max(spread_m, 1.0))]
+            [1.0, sigmas, features.ratio, min(prior_chi_square, _MAX_CHI_SQUARE), math.log(max(spread_m, 1.0))]
         )
-    known = [_known(evidence.prior_chi_square), _known(evidence.height_chi_square)]
-    alarms = min(max(-evidence.log10_nfa, 0.0), _MAX_LOG10_ALARMS)
+    known = [_known(features.prior_chi_square), _known(features.height_chi_square)]
+    alarms = min(max(-features.log10_nfa, 0.0), _MAX_LOG10_ALARMS)
     return np.array([1.0, math.sqrt(alarms), *known[0], *known[1]])
 
 
 def _known(off: float | None) -> tuple[float, float]:
-    """What a chi-square says, and what it says that there is none."""
+    """A chi-square, limited, and whether it is missing."""
     return (0.0, 1.0) if off is None else (min(off, _MAX_CHI_SQUARE), 0.0)
 
 
-def probability(evidence: PeakFeatures | PoseFeatures, model: PeakModel | PoseModel | None = None) -> float:
-    """Probability in (0, 1) that the place is right, where every second frame has an answer.
+def probability(features: PeakFeatures | PoseFeatures, model: PeakModel | PoseModel | None = None) -> float:
+    """Probability in (0, 1) that the place is right, where every second frame shows a place in its window.
 
     Args:
-        evidence: of a peak or of a pose.
-        model: other weights than those fitted.
+        features: of a peak or of a pose.
+        model: weights; None takes the fitted ones.
     """
-    model = model or (PEAK_MODEL if isinstance(evidence, PeakFeatures) else POSE_MODEL)
-    logit = float(np.dot(astuple(model), regressors(evidence)))
+    model = model or (PEAK_MODEL if isinstance(features, PeakFeatures) else POSE_MODEL)
+    logit = float(np.dot(astuple(model), regressors(features)))
     return 1.0 / (1.0 + math.exp(-logit))

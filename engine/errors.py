@@ -11,11 +11,17 @@
     ├── CalibrationError                a camera file that cannot be read, or does not fit its frames
     ├── TelemetryError                  telemetry, truth or frames that cannot be read or contradict each other
     ├── StateError        (RuntimeError) a call at the wrong time, such as to something that was closed
-    └── BackendError                    a fast path that could not do its work
+    └── BackendError                    something outside the engine that could not do its work
+        └── MissingExtraError           a package of an extra that is not installed
 
 A message is one line and names the argument, what was expected and what came.
 A frame that cannot be matched is no error: it is the value :class:`engine.values.NoFix`.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
 
 
 class EngineError(Exception):
@@ -55,4 +61,31 @@ class StateError(EngineError, RuntimeError):
 
 
 class BackendError(EngineError):
-    """A fast path could not do its work."""
+    """Something outside the engine, such as a link, a cluster or a kernel, could not do its work."""
+
+
+class MissingExtraError(BackendError):
+    """A package that an extra of the distribution brings is not installed."""
+
+
+def require(module: str, extra: str, package: str | None = None) -> Any:
+    """Import an optional module.
+
+    Args:
+        module: its full name.
+        extra: of the distribution that brings it.
+        package: that holds it, where that is not the part of the module's name before its first dot.
+
+    Returns:
+        The module.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        name = package or module.partition(".")[0]
+        raise MissingExtraError(
+            f"expected {name} to be installed, got none: pip install 'scenematch-engine[{extra}]'"
+        ) from None

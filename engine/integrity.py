@@ -12,21 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.confidence import PeakFeatures, PoseFeatures, probability
+from engine.confidence import PeakFeatures, PoseFeatures
 from engine.errors import OptionError
-from engine.geo import transport_covariance
+from engine.geo import chi_square, transport_covariance
 from engine.orthomap import OrthoMap
-from engine.values import MAX_SIGMA_M, Frame, Peak, Reason, check_positive
+from engine.values import MAX_SIGMA_M, GridPose, Peak, Reason, check_positive
 
 Array = NDArray[np.float64]
 
 CONSISTENT_CHI_SQUARE = 13.8
-"""Chi-square of two places, by the errors of both, that chance exceeds once in a thousand."""
+"""Chi-square of the difference of two positions that chance exceeds once in a thousand, two degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AssumedErrors:
-    """One standard deviation of what the engine is told, where nobody says it better.
+    """One standard deviation of the telemetry, the map and the ground, where they do not state their own.
 
     Attributes:
         height_m: of the height, besides its share below.
@@ -34,8 +34,8 @@ class AssumedErrors:
         heading_deg: of the heading.
         tilt_deg: of roll and of pitch, where the frame came with them.
         unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
-        map_m: of the map's georeference, per axis, where the map does not say it (:func:`with_map_accuracy`).
-        surface_slope_deg: of the ground under one frame, where a surface model gives its height and does not say.
+        map_m: georeferencing accuracy per axis, where the map does not state it (:func:`with_map_accuracy`).
+        surface_slope_deg: slope accuracy of the surface model under one frame, where it does not state it.
         unknown_slope_deg: the same where flat ground is assumed.
     """
 
@@ -58,14 +58,14 @@ class AssumedErrors:
         """Of a height."""
         return math.hypot(self.height_m, self.height_share * height_m)
 
-    def tilts_deg(self, frame: Frame) -> tuple[float, float]:
-        """Of a frame's roll and of its pitch, each by whether the frame came with it."""
-        unknown, told = self.unknown_tilt_deg, self.tilt_deg
-        return (unknown if frame.roll_deg is None else told, unknown if frame.pitch_deg is None else told)
+    def tilts_deg(self, pose: GridPose) -> tuple[float, float]:
+        """Of the roll and of the pitch that a frame came with, or did not."""
+        unknown, known = self.unknown_tilt_deg, self.tilt_deg
+        return (unknown if pose.roll_deg is None else known, unknown if pose.pitch_deg is None else known)
 
 
 def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
-    """The errors with what the map says of itself in place of what is assumed of any map."""
+    """The errors with the accuracy that the map states in place of the one assumed of any map."""
     return replace(
         errors,
         map_m=errors.map_m if site.georeference_sigma_m is None else site.georeference_sigma_m,
@@ -87,7 +87,7 @@ def score_sigma(pixels: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeakRule:
-    """When a correlation peak is believed.
+    """When a correlation peak is accepted.
 
     Scores are counted in :func:`score_sigma`, so that a rule holds for small patches as for large ones. Over two
     simulated towns right places lead by 8 and more, with a quarter of the frame hidden by 2.3 and more; on another
@@ -99,13 +99,14 @@ class PeakRule:
         min_margin_sigmas: how far the best rival must stay below the peak.
         min_margin_sigmas_whole_map: the same where the whole map was searched, or the place contradicts the prior,
             and nothing else vouches for it.
-        max_prior_chi_square: of a place against its prior, above which it contradicts it; chance exceeds this once
-            in ten thousand.
+        max_prior_chi_square: of a position against its prior, above which the two contradict each other; chance
+            exceeds this once in ten thousand.
         min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
             another town, turned until they fit, look like these.
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
-        min_confidence: probability of :func:`engine.confidence.probability` below which a peak is not believed.
-        sure: above this the peak is not compared with the patch upside down; 1 always compares.
+        min_confidence: probability of :func:`engine.confidence.probability` below which a peak is not accepted.
+        null_test_below: confidence below which the peak must also beat the null hypothesis, its own template
+            upside down in the same window; 1 always asks for it.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
@@ -117,7 +118,7 @@ class PeakRule:
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
     min_confidence: float = 0.98
-    sure: float = 0.995
+    null_test_below: float = 0.995
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 
@@ -125,63 +126,102 @@ class PeakRule:
         check_positive(self, *self.__dataclass_fields__)
         if not self.min_confidence < 1.0:
             raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
-        if not self.sure <= 1.0:
-            raise OptionError(f"sure: expected a probability of at most 1, got {self.sure}")
+        if not self.null_test_below <= 1.0:
+            raise OptionError(f"null_test_below: expected a probability of at most 1, got {self.null_test_below}")
+
+
+Refusal = tuple[Reason, str]
+"""Why a match is not accepted, and the figures behind it."""
 
 
 def judge_peak(
-    peak: Peak, pixels: int, rule: PeakRule, *, whole_map: bool, searched: bool = False
-) -> tuple[Reason, str] | None:
-    """The reason to refuse a peak, with its figures, or None where it is believed.
+    peak: Peak,
+    pixels: int,
+    features: PeakFeatures | None,
+    confidence: float | None,
+    rule: PeakRule,
+    *,
+    searched: bool = False,
+) -> Refusal | None:
+    """The reason to refuse a correlation peak, or None where it is accepted.
 
     Args:
         peak: the peak.
-        pixels: of the patch.
+        pixels: of the template.
+        features: of the confidence model; None where nothing was known of the position, or more was searched
+            than a window at one heading and height.
+        confidence: that the model gives them; None without them.
         rule: the thresholds.
-        whole_map: nothing was known of the position, or the peak contradicts what was.
         searched: the heading or the height was searched for.
     """
     sigma = score_sigma(pixels)
-    least = sigma * (rule.min_sigmas_searched if searched else rule.min_sigmas)
-    if peak.score < least:
-        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f} may be chance; {least:.3f} is asked for"
+    min_score = sigma * (rule.min_sigmas_searched if searched else rule.min_sigmas)
+    if peak.score < min_score:
+        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f} may be chance; {min_score:.3f} is asked for"
     if not peak.curvature.any():
         return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
-    margin = rule.min_margin_sigmas_whole_map if whole_map else rule.min_margin_sigmas
+    # A position that contradicts the prior is vouched for by the match alone, as in a search of the whole map.
+    alone = features is None or features.agreement.prior_chi_square > rule.max_prior_chi_square
+    margin = rule.min_margin_sigmas_whole_map if alone else rule.min_margin_sigmas
     margin = sigma * (rule.min_margin_sigmas_searched if searched else margin)
     if peak.score - peak.second_score < margin:
         rival = f"a rival reaches {peak.second_score:.3f}"
         return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
-    return None
+    if features is None or confidence is None or confidence >= rule.min_confidence:
+        return None
+    figures = f"NCC {features.sigmas:.1f} sigmas, rival at {features.ratio:.0%}"
+    chi_square_text = f"{features.agreement.prior_chi_square:.1f}"
+    return Reason.AMBIGUOUS, _improbable(confidence, rule.min_confidence, figures, chi_square_text)
 
 
-def judge_confidence(evidence: PeakFeatures | PoseFeatures, min_confidence: float) -> tuple[Reason, str] | None:
-    """The reason to refuse a peak or a pose that is not probable enough, with its figures; None if it is believed.
+def judge_pose(features: PoseFeatures, confidence: float, min_confidence: float) -> Refusal | None:
+    """The reason to refuse a pose by matched features, or None where it is accepted.
 
     Args:
-        evidence: of either.
-        min_confidence: probability of :func:`engine.confidence.probability` that is asked for.
+        features: of the confidence model.
+        confidence: that the model gives them.
+        min_confidence: that is asked for.
     """
-    confidence = probability(evidence)
     if confidence >= min_confidence:
         return None
-    if isinstance(evidence, PoseFeatures):
-        reason, prior_chi_square = Reason.BAD_POSE, evidence.prior_chi_square
-        figures = f"log10 of false alarms {evidence.log10_nfa:.1f}"
-    else:
-        reason, prior_chi_square = Reason.AMBIGUOUS, evidence.expected.prior_chi_square
-        figures = f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.ratio:.0%}"
-    off = "unknown" if prior_chi_square is None else f"{prior_chi_square:.1f}"
-    asked = f"{min_confidence:g} is asked for ({figures}, chi-square {off} from the prior)"
-    return reason, f"right with a probability of {confidence:.3f}, {asked}"
+    figures = f"log10 of false alarms {features.log10_nfa:.1f}"
+    off = features.prior_chi_square
+    return Reason.BAD_POSE, _improbable(
+        confidence, min_confidence, figures, "unknown" if off is None else f"{off:.1f}"
+    )
+
+
+def _improbable(confidence: float, min_confidence: float, figures: str, prior_chi_square: str) -> str:
+    asked = f"{min_confidence:g} is asked for ({figures}, chi-square {prior_chi_square} from the prior)"
+    return f"right with a probability of {confidence:.3f}, {asked}"
+
+
+def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
+    """Whether two estimates of one position agree.
+
+    Args:
+        apart_m: (2,) from one to the other, in metres.
+        covariance_m2: (2, 2) sum of their covariances.
+
+    Returns:
+        bool: False where chance alone would set them so far apart less than once in a thousand.
+    """
+    return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
 
 
 def peak_covariance_px(peak: Peak, pixels: int) -> Array:
-    """(2, 2) covariance of a correlation peak, in square pixels.
+    """Covariance of a correlation peak (Cramer-Rao).
 
     For a picture that is the map plus Gaussian noise, the log-likelihood of a shift is N/2 log(1 - rho^2), whose
-    second derivative at the peak is N rho rho'' / (1 - rho^2); its inverse is the covariance (Cramer-Rao).
-    N is that of :func:`score_sigma`.
+    second derivative at the peak is N rho rho'' / (1 - rho^2); its inverse is the covariance. N is that of
+    :func:`score_sigma`.
+
+    Args:
+        peak: the peak.
+        pixels: of the template.
+
+    Returns:
+        (2, 2) in square pixels, x before y.
     """
     independent = 1.0 / score_sigma(pixels) ** 2
     rho = min(max(peak.score, 0.05), 0.999)
@@ -195,17 +235,20 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
 def misalignment_covariance_px2(
     peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors
 ) -> Array:
-    """(2, 2) covariance, in square pixels, of a peak whose patch is turned or scaled against the map.
+    """Covariance of a peak whose template is turned or scaled against the map.
 
     An error of heading or height moves every part of the patch by an amount of its own. Where the parts stay
     within the width of the peak, it lies at their mean, and nothing is lost; where they do not, it follows the
-    part that is seen best, which may lie anywhere. The share between the two is u^2 / (u^2 + width^2).
+    part with the strongest texture, which may be anywhere. The share between the two is u^2 / (u^2 + width^2).
 
     Args:
         peak: of the patch.
         shape: (rows, columns) of the patch.
         height_m: above the ground.
         errors: what is assumed of height and heading.
+
+    Returns:
+        (2, 2) in square pixels.
     """
     share = math.hypot(errors.height_share, errors.height_m / height_m, math.radians(errors.heading_deg))
     apart = share**2 * (shape[0] ** 2 + shape[1] ** 2) / 24.0  # mean over the patch of one axis
@@ -215,19 +258,32 @@ def misalignment_covariance_px2(
 
 
 def ncc_covariance_m2(
-    peak_px2: Array, frame: Frame, camera: Camera, enu_jacobian: Array, errors: AssumedErrors
+    peak_px2: Array, pose: GridPose, camera: Camera, enu_jacobian: Array, errors: AssumedErrors
 ) -> Array:
-    """(3, 3) east-north-up covariance of a fix by correlation.
+    """Covariance of a fix by correlation.
 
-    The nadir is the place of the patch less the offset that height and attitude give it, so their errors move
-    the fix: half a degree of tilt is 1.3 m at 150 m.
+    The nadir is the position of the template less an offset by height and attitude, so their errors move the fix:
+    half a degree of tilt is 1.3 m at 150 m.
+
+    Args:
+        peak_px2: (2, 2) covariance of the peak in square pixels.
+        pose: height and attitude by which the frame was aligned.
+        camera: its mount tells where the optical axis points.
+        enu_jacobian: (2, 2) metres east and north per pixel.
+        errors: of the telemetry and the map.
+
+    Returns:
+        (3, 3) east, north, up in square metres.
+
+    Raises:
+        OptionError: the pose lacks its height or its heading.
     """
-    attitude, height = frame.attitude, frame.height_agl_m
+    attitude, height = pose.grid_attitude, pose.height_agl_m
     if attitude is None or height is None:
-        raise OptionError("frame: expected a height and a heading for a fix by correlation")
+        raise OptionError("pose: expected a height and a heading for a fix by correlation")
     values = np.array([height, attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg])
     height_sigma = errors.height_sigma_m(height)
-    sigmas = np.array([height_sigma, *errors.tilts_deg(frame), errors.heading_deg])
+    sigmas = np.array([height_sigma, *errors.tilts_deg(pose), errors.heading_deg])
     aims = _aim_m(camera, np.concatenate([values + np.diag(sigmas), values - np.diag(sigmas)]))
     spread = (aims[:4] - aims[4:]).T / 2.0  # each column is already scaled by its sigma
     horizontal = spread @ spread.T + transport_covariance(enu_jacobian, peak_px2) + errors.map_m**2 * np.eye(2)

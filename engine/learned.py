@@ -69,9 +69,9 @@ class Loftr:
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
         """Match two pictures; see :class:`PairMatcher`."""
         _check(frame, crop)
-        place = _device_of(self.network)
+        device = _device_of(self.network)
         with torch.inference_mode():
-            images = {"image0": _padded(frame.to(place), 8), "image1": _padded(crop.to(place), 8)}
+            images = {"image0": _padded(frame.to(device), 8), "image1": _padded(crop.to(device), 8)}
             found = self.network(images)
             first, second = found["keypoints0"], found["keypoints1"]
             kept = found["confidence"] >= self.min_confidence
@@ -96,15 +96,15 @@ class DiskLightGlue:
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
         """Match two pictures; see :class:`PairMatcher`."""
         _check(frame, crop)
-        place = _device_of(self.disk)
+        device = _device_of(self.disk)
         with torch.inference_mode():
             data = {}
-            for name, image in (("image0", frame.to(place)), ("image1", crop.to(place))):
+            for name, image in (("image0", frame.to(device)), ("image1", crop.to(device))):
                 rgb = image.expand(-1, 3, -1, -1)
                 found = self.disk(rgb, n=self.max_keypoints, pad_if_not_divisible=True)[0]
-                if len(found.keypoints) < 2:  # LightGlue weighs a keypoint against another
+                if len(found.keypoints) < 2:  # LightGlue compares a keypoint with others
                     return frame.new_zeros(0, 2), frame.new_zeros(0, 2)
-                size = torch.tensor([[image.shape[3], image.shape[2]]], device=place)
+                size = torch.tensor([[image.shape[3], image.shape[2]]], device=device)
                 data[name] = {
                     "keypoints": found.keypoints[None],
                     "descriptors": found.descriptors[None],
@@ -196,20 +196,20 @@ def _tensors(path: str | Path) -> Mapping[str, Tensor]:
 
 
 def _filled(network: nn.Module, tensors: Mapping[str, Tensor], path: str | Path, device: str) -> nn.Module:
-    """The network with these weights, ready to be asked; every name and shape must fit."""
-    place, wanted = devices.resolve(device), network.state_dict()
+    """The network with these weights, ready for inference; every name and shape must fit."""
+    target, wanted = devices.resolve(device), network.state_dict()
     lacking = [n for n in wanted if n not in tensors and not n.endswith(_DERIVED)]
     unknown = [n for n in tensors if n not in wanted]
-    bent = [n for n in wanted if n in tensors and tensors[n].shape != wanted[n].shape]
+    misshapen = [n for n in wanted if n in tensors and tensors[n].shape != wanted[n].shape]
     faults = [
         f"{what} {_listed(names)}"
-        for what, names in (("lacks", lacking), ("has unknown", unknown), ("has other shapes of", bent))
+        for what, names in (("lacks", lacking), ("has unknown", unknown), ("has other shapes of", misshapen))
         if names
     ]
     if faults:
         raise OptionError(f"weights: {path} does not fit {type(network).__name__}: {'; '.join(faults)}")
     network.load_state_dict(dict(tensors), strict=False)
-    return network.to(place).eval().requires_grad_(False)
+    return network.to(target).eval().requires_grad_(False)
 
 
 def _listed(names: list[str]) -> str:
@@ -231,7 +231,7 @@ def _device_of(network: nn.Module) -> torch.device:
 
 
 def _padded(image: Tensor, multiple: int) -> Tensor:
-    """The picture continued at the right and at the bottom to whole cells."""
+    """The picture, its edge replicated at the right and at the bottom to whole cells."""
     height, width = image.shape[2:]
     return pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 

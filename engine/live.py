@@ -1,7 +1,7 @@
 """Live: frames as they are captured, answers in time. A queue of one, in which the newest frame wins.
 
-A worker thread matches; a watchman answers for it when the deadline comes first, and replaces it where it hangs or
-dies. What a worker finds after its frame was answered for is never put out.
+A worker thread matches. A watchdog answers in its place when the deadline comes first, and replaces it where it
+hangs or dies. The result of a worker whose frame was already answered is discarded.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positi
 
 _log = logging.getLogger("scenematch")
 
-_LEAVE_S = 5.0  # that closing waits for workers that were given up; one that hangs for good is left behind
-_MAX_MS = 60_000.0  # that anything may be waited for in flight
-_MAX_DOUBLINGS = 10  # of the patience with one maker of navigators after the other
+_JOIN_S = 5.0  # that closing waits for abandoned workers; one that hangs for good is left behind
+_MAX_MS = 60_000.0  # of any wait in flight
+_MAX_DOUBLINGS = 10  # of the time that one attempt to create a navigator gets after another
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,9 +31,9 @@ class LiveOptions:
 
     Attributes:
         deadline_ms: age, counted from capture, by which a frame is answered.
-        patience_ms: beyond the deadline, after which a worker is taken to hang and is replaced. One that makes its
-            navigator has the same time from when it began, and twice as much after every one that hung in that.
-        max_speed_mps: of the vehicle, by which a new worker's search grows while there was none.
+        patience_ms: beyond the deadline, after which a worker counts as hanging and is replaced. One that creates
+            its navigator has as long from its start, and twice as long after each that hung in doing so.
+        max_speed_mps: of the vehicle, by which the uncertainty at a new worker's start grows with time.
     """
 
     deadline_ms: float = 121.0
@@ -85,8 +85,8 @@ class Live:
     """Answers a stream of frames.
 
     Args:
-        make_navigator: makes a navigator that begins at a prior, or anywhere where that is None; called once by
-            the constructor, and in its own thread by every worker that replaces one.
+        make_navigator: creates a navigator that starts at a prior, or anywhere where that is None; called once by
+            the constructor, and in its own thread by every worker that replaces another.
         deliver: takes each answer, one at a time, from one of the engine's threads.
         start: where the flight begins.
         options: settings.
@@ -110,9 +110,9 @@ class Live:
         self._delivering = threading.Lock()
         self._waiting: _Job | None = None
         self._working: _Job | None = None
-        self._number = 0  # of the worker that counts
-        self._making_since_ns: int | None = None  # by that worker its navigator; None where it has one, or pauses
-        self._hung_makers = 0  # in a row
+        self._number = 0  # of the present worker
+        self._creating_since_ns: int | None = None  # its navigator; None where it has one, or pauses
+        self._hung_creations = 0  # in a row
         self._counts = Counts()
         self._closed = False
         self._threads: list[threading.Thread] = []
@@ -130,7 +130,7 @@ class Live:
 
         Args:
             frame: newer than every frame before it.
-            prior: what somebody else knows of its place.
+            prior: of its position by another source.
             captured_ns: when it was captured, on ``time.monotonic_ns``; None is now.
 
         Raises:
@@ -149,7 +149,7 @@ class Live:
     def close(self) -> None:
         """Take no more frames; the one in work is answered still, one that waits is dropped.
 
-        Waits for the workers too whose frames were answered without them: a process that ends while one of its
+        Waits also for workers whose frames were answered without them: a process that ends while one of its
         threads is within compiled code is aborted.
         """
         with self._changed:
@@ -160,7 +160,7 @@ class Live:
             self._changed.notify_all()
             job, due_s = self._working, (self._options.deadline_ms + self._options.patience_ms) * 1e-3
             self._changed.wait_for(lambda: self._working is None and (job is None or job.answered), timeout=due_s)
-        until = time.monotonic() + _LEAVE_S
+        until = time.monotonic() + _JOIN_S
         for thread in self._threads:
             if thread is not threading.current_thread():  # a receiver may close, too
                 thread.join(max(0.0, until - time.monotonic()))
@@ -172,9 +172,9 @@ class Live:
         self.close()
 
     def _work(self, navigator: Navigator | None, number: int) -> None:
-        """The worker: takes the newest frame, matches it, and puts out what it found if it is not too late."""
+        """The worker: takes the newest frame, matches it, and delivers the result if it is not too late."""
         if navigator is None:
-            navigator = self._made(number)
+            navigator = self._create_navigator(number)
         if navigator is None:
             self._replace(number)
             return
@@ -198,8 +198,8 @@ class Live:
                 self._replace(number)
                 return
 
-    def _made(self, number: int) -> Navigator | None:
-        """A navigator that begins at the last fix; None, after a pause, where it cannot be made."""
+    def _create_navigator(self, number: int) -> Navigator | None:
+        """A navigator that starts at the last fix; None, after a pause, where creating it failed."""
         navigator = None
         try:
             navigator = self._make_navigator(self._resume())
@@ -207,19 +207,19 @@ class Live:
             _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
         with self._changed:
             if self._number == number:  # not replaced meanwhile
-                self._making_since_ns, self._hung_makers = None, 0
+                self._creating_since_ns, self._hung_creations = None, 0
             if navigator is None:
                 pause_s = self._options.patience_ms * 1e-3
                 self._changed.wait_for(lambda: self._closed or self._number != number, timeout=pause_s)
         return navigator
 
     def _match(self, navigator: Navigator, job: _Job) -> tuple[Result, bool]:
-        """The result of one frame, and whether the navigator can be used on."""
+        """The result of one frame, and whether the navigator is still usable."""
         left_ms = self._options.deadline_ms - _age_ms(job)
         if left_ms <= 0:
             return _refusal(job, Reason.LATE, "the frame waited until its deadline"), True
         try:
-            # A search of the whole map may go on after its frame was answered for: the next frame gains by it.
+            # A search of the whole map may outlast its frame's deadline: the next frame profits from it.
             budget = Budget(total_ms=left_ms, search_ms=left_ms + self._options.patience_ms)
             return navigator.update(job.frame, job.prior, budget), True
         except EngineError as error:  # this frame cannot be used; the next may
@@ -228,7 +228,7 @@ class Live:
             return _refusal(job, Reason.FAILED, f"{type(error).__name__}: {error}"), False
 
     def _watch(self) -> None:
-        """The watchman: answers for what is due and replaces a worker that hangs."""
+        """The watchdog: answers frames that are due and replaces a worker that hangs."""
         while True:
             with self._changed:
                 if self._closed and self._working is None:
@@ -249,18 +249,18 @@ class Live:
                 self._replace(number)
 
     def _hangs_in_ms(self) -> float:
-        """Time until the worker is taken to hang, in a frame that was answered for or in making its navigator."""
+        """Time until the worker counts as hanging, in an answered frame or in creating its navigator."""
         deadline_ms, patience_ms = self._options.deadline_ms, self._options.patience_ms
-        if self._making_since_ns is not None:
-            made_for_ms = (time.monotonic_ns() - self._making_since_ns) * 1e-6
-            # A maker that is only slow would never come through if each were waited for alike.
-            return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_makers, _MAX_DOUBLINGS) - made_for_ms
+        if self._creating_since_ns is not None:
+            creating_for_ms = (time.monotonic_ns() - self._creating_since_ns) * 1e-6
+            # A creation that is only slow would never finish if each attempt got the same time.
+            return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_creations, _MAX_DOUBLINGS) - creating_for_ms
         if self._working is None or not self._working.answered:
             return math.inf
         return deadline_ms + patience_ms - _age_ms(self._working)
 
     def _answer(self, job: _Job, result: Result) -> None:
-        """Put out one answer a frame; a fix that came too late is none."""
+        """Deliver one answer a frame; a fix that came too late becomes a refusal."""
         with self._delivering:
             age_ms = _age_ms(job)
             late = age_ms > self._options.deadline_ms
@@ -274,7 +274,7 @@ class Live:
                 result = _refusal(job, Reason.LATE, f"the fix came {age_ms:.0f} ms after capture")
             try:
                 self._deliver(Answer(job.frame, result, age_ms))
-            except Exception:  # the receiver's own fault, and no reason to stop answering
+            except Exception:  # the receiver's error is no reason to stop answering
                 _log.exception("deliver failed")
 
     def _replace(self, number: int) -> None:
@@ -285,21 +285,21 @@ class Live:
             self._changed.notify_all()
             if self._closed:
                 return
-            self._hung_makers += self._making_since_ns is not None
-            self._making_since_ns = time.monotonic_ns()
+            self._hung_creations += self._creating_since_ns is not None
+            self._creating_since_ns = time.monotonic_ns()
             self._number += 1
             self._count("workers_replaced")
         self._start_thread(self._work, None, number + 1)
 
     def _resume(self) -> Prior | None:
-        """Where a new worker begins: at the last fix, as far around it as the vehicle came since."""
+        """Where a new worker starts: at the last fix, as uncertain as the vehicle may have moved since."""
         with self._changed:
             last = self._last
         if last is None:
             return None
         fix, captured_ns = last
-        way_m = self._options.max_speed_mps * (time.monotonic_ns() - captured_ns) * 1e-9
-        return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + way_m)
+        moved_m = self._options.max_speed_mps * (time.monotonic_ns() - captured_ns) * 1e-9
+        return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + moved_m)
 
     def _count(self, *names: str) -> None:
         self._counts = replace(self._counts, **{name: getattr(self._counts, name) + 1 for name in names})

@@ -1,4 +1,4 @@
-"""Dead reckoning: the way flown between fixes, by measured velocities or by none, and how far it may be off."""
+"""Dead reckoning: the displacement between fixes by odometry, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class OdometrySample:
-    """A moment on the way.
+    """Time and displacement at one frame.
 
     Attributes:
         time_s: since the first frame.
-        moved_m: (2,) east and north since then, by dead reckoning.
-        blind_s: of that time, how long no velocity was measured.
+        moved_m: (2,) displacement east and north since then.
+        blind_s: the part of that time without a measured velocity.
     """
 
     time_s: float
@@ -40,7 +40,7 @@ class VelocityEstimate:
 
 
 class DeadReckoning:
-    """When the frames were taken, and the way flown meanwhile.
+    """Integrates the frames' velocities over their stamps.
 
     Args:
         late_s: how much older than the newest frame a frame may be.
@@ -49,15 +49,15 @@ class DeadReckoning:
 
     def __init__(self, late_s: float, default_interval_s: float) -> None:
         self._late_s, self._default_interval_s = late_s, default_interval_s
-        self._moments: deque[OdometrySample] = deque()  # of the last late_s
+        self._samples: deque[OdometrySample] = deque()  # of the last late_s
         self._stamps: deque[int] = deque()  # of the same
         self._newest_ns: int | None = None
         self._measured: Array | None = None  # velocity of the newest frame, where it had one
 
     @property
     def last(self) -> OdometrySample | None:
-        """The moment of the newest frame, or None before the first."""
-        return self._moments[-1] if self._moments else None
+        """The sample of the newest frame, or None before the first."""
+        return self._samples[-1] if self._samples else None
 
     def is_late(self, frame: Frame) -> bool:
         """Whether a frame is older than the newest one.
@@ -77,12 +77,12 @@ class DeadReckoning:
             )
         return True
 
-    def moment(self, frame: Frame, velocity: VelocityEstimate | None) -> OdometrySample:
-        """Where on the way a frame was taken; the way is left as it is.
+    def sample(self, frame: Frame, velocity: VelocityEstimate | None) -> OdometrySample:
+        """The sample of a frame; nothing is changed by it.
 
         Args:
             frame: a new one, or a late one.
-            velocity: taken where the frame came without one; None stands still.
+            velocity: assumed where the frame came without one; None assumes none.
         """
         last = self.last
         if last is None:
@@ -99,8 +99,8 @@ class DeadReckoning:
         step = np.zeros(2) if velocity is None else velocity.mps * interval_s
         return OdometrySample(last.time_s + interval_s, last.moved_m + step, last.blind_s + interval_s)
 
-    def note(self, frame: Frame, moment: OdometrySample) -> None:
-        """Take in a frame that was matched."""
+    def append(self, frame: Frame, sample: OdometrySample) -> None:
+        """Add a frame that was matched."""
         stamp, newest = frame.timestamp_ns, self._newest_ns
         if stamp is not None:
             self._stamps.append(stamp)
@@ -109,21 +109,21 @@ class DeadReckoning:
             self._newest_ns = stamp
             self._stamps = deque(known for known in self._stamps if known >= stamp - self._late_s * 1e9)
         self._measured = _velocity_of(frame)
-        self._moments.append(moment)
-        while len(self._moments) > 2 and self._moments[1].time_s < moment.time_s - self._late_s:
-            self._moments.popleft()
+        self._samples.append(sample)
+        while len(self._samples) > 2 and self._samples[1].time_s < sample.time_s - self._late_s:
+            self._samples.popleft()
 
     def _between(self, time_s: float) -> OdometrySample:
-        """A moment between two frames; the first of all before them."""
-        times = [moment.time_s for moment in self._moments]
-        rows = np.array([(*moment.moved_m, moment.blind_s) for moment in self._moments])
+        """The sample at a time between two frames; of an earlier time the first of all."""
+        times = [sample.time_s for sample in self._samples]
+        rows = np.array([(*sample.moved_m, sample.blind_s) for sample in self._samples])
         east, north, blind = (float(np.interp(time_s, times, column)) for column in rows.T)
         return OdometrySample(time_s, np.array([east, north]), blind)
 
 
 @dataclass(frozen=True, slots=True)
 class DriftModel:
-    """How fast dead reckoning is led astray.
+    """How the error of dead reckoning grows.
 
     Attributes:
         measured_sigma_mps: of a measured velocity. Such errors last: they add up with time, not with its root.
@@ -139,12 +139,12 @@ class DriftModel:
     def sigma_m(
         self, start: OdometrySample, end: OdometrySample, velocity: VelocityEstimate | None = None
     ) -> float:
-        """One standard deviation, per axis, of the way between two moments.
+        """Standard deviation, per axis, of the displacement between two samples.
 
         Args:
             start: either of the two.
             end: the other.
-            velocity: with which the way goes on where none was measured; None where it stands still.
+            velocity: that was assumed where none was measured; None where none was.
         """
         blind_s = abs(end.blind_s - start.blind_s)
         measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s)
@@ -168,7 +168,7 @@ class DriftModel:
 
 @dataclass(frozen=True, slots=True)
 class PositionEstimate:
-    """Where the vehicle should be: (2,) east and north, and one standard deviation of each."""
+    """A position (2,) east and north, and one standard deviation of each."""
 
     en_m: Array
     sigma_m: float
@@ -178,7 +178,7 @@ class PositionEstimate:
         return chi_square(en_m(fix) - self.en_m, fix.covariance_m2[:2, :2] + self.sigma_m**2 * np.eye(2))
 
     def prior(self, widened: float = 1.0, moved_m: Array | None = None) -> Prior:
-        """The same as a matcher is told it, ``widened`` times as uncertain; no wider than any map."""
+        """The same as a prior, ``widened`` times as uncertain; no vaguer than any map is wide."""
         east, north = (float(v) for v in self.en_m)
         moved_east, moved_north = (0.0, 0.0) if moved_m is None else (float(v) for v in moved_m)
         sigma_m = min(self.sigma_m * widened, MAX_SIGMA_M)
@@ -192,8 +192,8 @@ def en_m(fix: Fix) -> Array:
     return np.array([fix.east_m, fix.north_m])
 
 
-def is_valid_fix(fix: Fix) -> bool:
-    """Whether the place is finite and the covariance positive definite."""
+def is_valid(fix: Fix) -> bool:
+    """Whether the position is finite and the covariance positive definite."""
     finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
     return finite and bool(np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0)
 

@@ -20,7 +20,7 @@ from engine.motion import (
     PositionEstimate,
     VelocityEstimate,
     en_m,
-    is_valid_fix,
+    is_valid,
 )
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, check_positive
@@ -55,7 +55,7 @@ class NavigatorState(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NavigatorOptions:
-    """How a position is carried from frame to frame, and what is believed; ``docs/integrity.md`` has the rules.
+    """How a position is carried from frame to frame, and what is accepted; ``docs/integrity.md`` has the rules.
 
     Attributes:
         measured_velocity_sigma_mps: of a velocity that came with the frame.
@@ -98,39 +98,39 @@ class NavigatorOptions:
 
 
 ACCEPT_ALL = NavigatorOptions(gate=1e12, confirm=1)
-"""Every match is handed out, as the paper's recipe does: the baseline."""
+"""Every match is accepted, as by the paper's recipe: the baseline."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Anchor:
-    """What dead reckoning begins at: the last fix that is believed, or the start of the flight.
+    """Where dead reckoning starts: the last accepted fix, or the start of the flight.
 
     Attributes:
-        place: at that moment.
-        moment: on the way; None where the way has not begun.
+        position: there.
+        sample: its odometry; None before the first frame.
         fix: None for a start.
         support: fixes that agreed one after the other up to this one.
     """
 
-    place: PositionEstimate
-    moment: OdometrySample | None
+    position: PositionEstimate
+    sample: OdometrySample | None
     fix: Fix | None = None
     support: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class _PendingFix:
-    """The last of some fixes that agree with each other and are not believed yet."""
+    """The last of some fixes that agree with each other and are not accepted yet."""
 
     fix: Fix
-    moment: OdometrySample
+    sample: OdometrySample
     count: int
 
 
 class Navigator:
-    """Follows a flight: each frame is matched in the window where the last fixes say it must lie.
+    """Follows a flight: each frame is matched in the window that dead reckoning from the last fix gives.
 
-    A fix is handed out where a prediction confirms it, or others in a row; see ``docs/integrity.md``.
+    A fix is accepted where a prediction or several fixes in a row confirm it; see ``docs/integrity.md``.
 
     Args:
         matcher: matches single frames.
@@ -150,11 +150,11 @@ class Navigator:
         self._budget = budget
         self._options = o = options or NavigatorOptions()
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
-        self._way = DeadReckoning(o.late_s, o.default_interval_s)
+        self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._velocity: VelocityEstimate | None = None  # by the last fixes
         self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
-        self._anchor = None if start is None else _Anchor(self._place(start), None)
-        self._held: _PendingFix | None = None
+        self._anchor = None if start is None else _Anchor(self._position(start), None)
+        self._pending: _PendingFix | None = None
         self._refusals = 0  # in a row
         self._frames_lost = 0
         self._fixed = self._lost = False  # whether the newest frame was; whether the flight is
@@ -177,10 +177,10 @@ class Navigator:
     @property
     def anchor_age_s(self) -> float | None:
         """Age of the last fix when the newest frame was taken, or None before the first."""
-        anchor, now = self._anchor, self._way.last
-        if anchor is None or anchor.fix is None or anchor.moment is None or now is None:
+        anchor, now = self._anchor, self._odometry.last
+        if anchor is None or anchor.fix is None or anchor.sample is None or now is None:
             return None
-        return now.time_s - anchor.moment.time_s
+        return now.time_s - anchor.sample.time_s
 
     @property
     def healthy(self) -> bool:
@@ -190,15 +190,15 @@ class Navigator:
 
     @property
     def reset_count(self) -> int:
-        """How often the position was taken up anew, where dead reckoning did not lead; for MAVLink's counter."""
+        """How often the position jumped away from dead reckoning; for MAVLink's reset counter."""
         return self._resets
 
     @property
     def prediction(self) -> Prior | None:
-        """Dead reckoning at the newest frame, with its honest sigma; None where there is nothing to begin at."""
-        now = self._way.last
-        place = None if now is None else self._reckoned(now)
-        return None if place is None else place.prior()
+        """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
+        now = self._odometry.last
+        estimate = None if now is None else self._reckoned(now)
+        return None if estimate is None else estimate.prior()
 
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
@@ -206,32 +206,31 @@ class Navigator:
         Args:
             frame: the newest, or one that comes late by at most ``late_s``. A late one is matched where the
                 vehicle was then, and moves nothing back.
-            prior: what somebody else knows of this frame's place; used where it is tighter than what the last
-                fixes say.
+            prior: of this frame's position by another source; used where it is tighter than dead reckoning.
             budget: of this frame, in place of the navigator's.
 
         Raises:
             TelemetryError: the frame came before, or is older than ``late_s``.
             CalibrationError: the frame is not of the camera's resolution.
         """
-        late = self._way.is_late(frame)
-        now = self._way.moment(frame, self._velocity)
-        given = None if prior is None else self._place(prior)
-        asked = self._asked(now, late=late)
-        if prior is not None and given is not None and (asked is None or prior.sigma_m < asked.sigma_m):
-            asked = prior
-        result = self._matcher.locate(self._with_height(frame), asked, budget or self._budget)
-        if self._anchor is not None and self._anchor.moment is None:
-            self._anchor = replace(self._anchor, moment=now)
-        self._way.note(frame, now)
+        late = self._odometry.is_late(frame)
+        now = self._odometry.sample(frame, self._velocity)
+        given = None if prior is None else self._position(prior)
+        chosen = self._matcher_prior(now, late=late)
+        if prior is not None and given is not None and (chosen is None or prior.sigma_m < chosen.sigma_m):
+            chosen = prior
+        result = self._matcher.locate(self._with_height(frame), chosen, budget or self._budget)
+        if self._anchor is not None and self._anchor.sample is None:
+            self._anchor = replace(self._anchor, sample=now)
+        self._odometry.append(frame, now)
         if isinstance(result, Fix):
             result = self._judge(result, now, given, late=late)
         elif not late and result.reason is not Reason.LATE:
-            self._held = None  # nobody confirmed it
+            self._pending = None  # nobody confirmed it
         if not late:
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
-                self._refusals += 1  # no time to look says nothing of where the vehicle is
+                self._refusals += 1  # a lack of time says nothing of the position
             self._note_loss(now)
         return result
 
@@ -240,44 +239,44 @@ class Navigator:
     def _reckoned(self, now: OdometrySample, anchor: _Anchor | None = None) -> PositionEstimate | None:
         """Dead reckoning from an anchor, or from the last one."""
         anchor = anchor or self._anchor
-        if anchor is None or anchor.moment is None:
-            return None if anchor is None else anchor.place
-        drift_m = self._drift.sigma_m(anchor.moment, now, self._velocity)
-        sigma_m = min(math.hypot(anchor.place.sigma_m, drift_m), MAX_SIGMA_M)
-        return PositionEstimate(anchor.place.en_m + now.moved_m - anchor.moment.moved_m, sigma_m)
+        if anchor is None or anchor.sample is None:
+            return None if anchor is None else anchor.position
+        drift_m = self._drift.sigma_m(anchor.sample, now, self._velocity)
+        sigma_m = min(math.hypot(anchor.position.sigma_m, drift_m), MAX_SIGMA_M)
+        return PositionEstimate(anchor.position.en_m + now.moved_m - anchor.sample.moved_m, sigma_m)
 
-    def _asked(self, now: OdometrySample, *, late: bool) -> Prior | None:
-        """What the matcher is told; None to search the whole map."""
-        place, options = self._reckoned(now), self._options
-        if self._lost or place is None:
-            held = self._pending_position(now)
-            if held is not None:
-                return held.prior()
-            vague = place is None or place.sigma_m > options.lost_sigma_m
+    def _matcher_prior(self, now: OdometrySample, *, late: bool) -> Prior | None:
+        """The prior for the matcher; None to search the whole map."""
+        estimate, options = self._reckoned(now), self._options
+        if self._lost or estimate is None:
+            pending = self._pending_position(now)
+            if pending is not None:
+                return pending.prior()
+            vague = estimate is None or estimate.sigma_m > options.lost_sigma_m
             turn = vague or self._frames_lost % options.search_every == 0
-            if place is None or (turn and self._matcher.site.is_searchable):
+            if estimate is None or (turn and self._matcher.site.is_searchable):
                 return None
         growth = options.growth ** min(self._refusals, options.lost_after)
-        last = self._way.last
-        return place.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
+        last = self._odometry.last
+        return estimate.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
 
     def _pending_position(self, now: OdometrySample) -> PositionEstimate | None:
-        """Where a fix that is not believed yet would lead, or None where that says little."""
-        held = self._held
-        if held is None:
+        """Dead reckoning from the pending fix, or None where it is too uncertain."""
+        pending = self._pending
+        if pending is None:
             return None
-        sigma_m = math.hypot(held.fix.sigma_m, self._drift.sigma_m(held.moment, now))
+        sigma_m = math.hypot(pending.fix.sigma_m, self._drift.sigma_m(pending.sample, now))
         if sigma_m > self._options.trusted_sigma_m:
             return None
-        return PositionEstimate(en_m(held.fix) + now.moved_m - held.moment.moved_m, sigma_m)
+        return PositionEstimate(en_m(pending.fix) + now.moved_m - pending.sample.moved_m, sigma_m)
 
-    def _place(self, prior: Prior) -> PositionEstimate:
+    def _position(self, prior: Prior) -> PositionEstimate:
         if prior.east_m is not None and prior.north_m is not None:
             return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
         assert prior.lat_deg is not None  # a Prior has one of the two
         assert prior.lon_deg is not None
-        place = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
-        return PositionEstimate(np.asarray(place[:2], np.float64), prior.sigma_m)
+        estimate = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
+        return PositionEstimate(np.asarray(estimate[:2], np.float64), prior.sigma_m)
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
@@ -288,12 +287,12 @@ class Navigator:
         height = fix.up_m - site.ground_at(site.pixel_from_enu(en_m(fix)))
         return replace(frame, height_agl_m=height) if height > 0 else frame
 
-    # ---------------------------------------------------------------------------------------------- beliefs
+    # ---------------------------------------------------------------------------------------------- acceptance
 
     def _judge(self, fix: Fix, now: OdometrySample, given: PositionEstimate | None, *, late: bool) -> Fix | NoFix:
-        """The fix where it is believed; else it is held, and refused for now."""
-        if not is_valid_fix(fix):
-            return _refusal(fix, Reason.BAD_POSE, "the covariance of the match is not positive definite")
+        """The fix where it is accepted; else it is pending, and refused for now."""
+        if not is_valid(fix):
+            return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
         own, against = self._reckoned(now), self._against(fix, now)
         contradicted = against is not None
         confirmed = own is not None and not self._lost and not contradicted and self._confirms(own, fix)
@@ -306,85 +305,84 @@ class Navigator:
             return self._refuse_match(fix, against, 0)
         before = self._pending_position(now)
         agree = before is not None and self._confirms(before, fix)
-        held = _PendingFix(fix, now, self._held.count + 1 if agree and self._held is not None else 1)
-        if held.count >= self._options.confirm and not (
-            contradicted and self._dead_reckoning_outweighs(now, held.count)
-        ):
-            self._accept(fix, now, held.count, jump=contradicted)
+        pending = _PendingFix(fix, now, self._pending.count + 1 if agree and self._pending is not None else 1)
+        outweighed = contradicted and self._dead_reckoning_outweighs(now, pending.count)
+        if pending.count >= self._options.confirm and not outweighed:
+            self._accept(fix, now, pending.count, jump=contradicted)
             return fix
-        self._held = held
-        return self._refuse_match(fix, against, held.count)
+        self._pending = pending
+        return self._refuse_match(fix, against, pending.count)
 
-    def _confirms(self, place: PositionEstimate, fix: Fix) -> bool:
-        return place.sigma_m <= self._options.trusted_sigma_m and place.chi_square(fix) <= self._options.gate
+    def _confirms(self, estimate: PositionEstimate, fix: Fix) -> bool:
+        return estimate.sigma_m <= self._options.trusted_sigma_m and estimate.chi_square(fix) <= self._options.gate
 
     def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
-        """A well-known prediction that a fix contradicts: by the last fix, or by one some seconds ago.
+        """A trusted prediction that a fix contradicts: from the last fix, or from one some seconds ago.
 
-        Step by step a wrong match may lead away slowly enough; over seconds, measured velocities show it.
+        From frame to frame wrong matches may drift slowly enough; over seconds, measured velocities show it.
         """
         predictions = [self._reckoned(now)]
-        if self._recent and now.blind_s == _moment(self._recent[0]).blind_s:
+        if self._recent and now.blind_s == _sample(self._recent[0]).blind_s:
             predictions.append(self._reckoned(now, self._recent[0]))
-        for place in predictions:
-            known = place is not None and place.sigma_m <= self._options.trusted_sigma_m
-            if place is not None and known and place.chi_square(fix) > self._options.gate:
-                return place
+        for estimate in predictions:
+            known = estimate is not None and estimate.sigma_m <= self._options.trusted_sigma_m
+            if estimate is not None and known and estimate.chi_square(fix) > self._options.gate:
+                return estimate
         return None
 
     def _dead_reckoning_outweighs(self, now: OdometrySample, against: int) -> bool:
-        """Whether dead reckoning outweighs so many fixes that agree with each other and not with it."""
+        """Whether dead reckoning counts more than so many fixes that agree with each other and not with it."""
         anchor = self._anchor
-        if anchor is None or anchor.moment is None or now.blind_s > anchor.moment.blind_s:
+        if anchor is None or anchor.sample is None or now.blind_s > anchor.sample.blind_s:
             return False  # it was not measured
-        return against <= anchor.support and now.time_s - anchor.moment.time_s <= self._options.hold_s
+        return against <= anchor.support and now.time_s - anchor.sample.time_s <= self._options.hold_s
 
     def _accept(self, fix: Fix, now: OdometrySample, count: int, *, jump: bool) -> None:
         """Dead reckoning goes on from this fix."""
         last = self._anchor
         known = last is not None and last.fix is not None
-        if known and last is not None and last.moment is not None and now.time_s < last.moment.time_s:
+        if known and last is not None and last.sample is not None and now.time_s < last.sample.time_s:
             return  # a late one
         jump = jump or self._lost
         self._resets += known and jump
         support = count if last is None or jump else last.support + count
         self._anchor = _Anchor(PositionEstimate(en_m(fix), fix.sigma_m), now, fix, support)
         self._note_velocity(self._anchor, jump=jump)
-        self._refusals, self._frames_lost, self._held, self._lost = 0, 0, None, False
+        self._refusals, self._frames_lost, self._pending, self._lost = 0, 0, None, False
 
     def _note_velocity(self, anchor: _Anchor, *, jump: bool) -> None:
         """The velocity by the fixes of about the last second."""
         if jump:
             self._recent.clear()
         self._recent.append(anchor)
-        now_s = _moment(anchor).time_s
-        while len(self._recent) > 2 and _moment(self._recent[1]).time_s <= now_s - _MEMORY_S:
+        now_s = _sample(anchor).time_s
+        while len(self._recent) > 2 and _sample(self._recent[1]).time_s <= now_s - _MEMORY_S:
             self._recent.popleft()
-        long_ago = (a for a in reversed(self._recent) if _moment(a).time_s <= now_s - _VELOCITY_S)
+        long_ago = (a for a in reversed(self._recent) if _sample(a).time_s <= now_s - _VELOCITY_S)
         first = next(long_ago, self._recent[0])
-        interval_s = now_s - _moment(first).time_s
+        interval_s = now_s - _sample(first).time_s
         self._velocity = None
         if interval_s > 0.0:
-            sigma_m = math.hypot(anchor.place.sigma_m, first.place.sigma_m)
-            self._velocity = self._drift.velocity(anchor.place.en_m - first.place.en_m, sigma_m, interval_s)
+            sigma_m = math.hypot(anchor.position.sigma_m, first.position.sigma_m)
+            self._velocity = self._drift.velocity(anchor.position.en_m - first.position.en_m, sigma_m, interval_s)
 
     def _refuse_match(self, fix: Fix, against: PositionEstimate | None, count: int) -> NoFix:
-        """What is said of a match that is not believed."""
+        """The refusal of a match that is not accepted."""
         if against is not None:
             apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
             sigma_m = math.hypot(against.sigma_m, fix.sigma_m)
             detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
-            return _refusal(fix, Reason.INCONSISTENT, detail)
+            return fix.refused(Reason.INCONSISTENT, detail)
         detail = f"{count} of the {self._options.confirm} matches in a row that must agree"
-        return _refusal(fix, Reason.UNCONFIRMED, detail)
+        return fix.refused(Reason.UNCONFIRMED, detail)
 
     def _note_loss(self, now: OdometrySample) -> None:
-        """Declare the flight lost, or its start forgotten, where it is time to."""
+        """Declare the flight lost, or drop its start, after too many refusals or too much uncertainty."""
         anchor, options = self._anchor, self._options
         if anchor is None or self._fixed:
             return
-        place = self._reckoned(now)
-        far = place is not None and place.sigma_m > options.lost_sigma_m
+        estimate = self._reckoned(now)
+        far = estimate is not None and estimate.sigma_m > options.lost_sigma_m
         if anchor.fix is not None:
             self._frames_lost += self._lost
             self._lost = self._lost or far or self._refusals >= options.lost_after
@@ -392,18 +390,6 @@ class Navigator:
             self._anchor = None
 
 
-def _moment(anchor: _Anchor) -> OdometrySample:
-    assert anchor.moment is not None  # a fix has one
-    return anchor.moment
-
-
-def _refusal(fix: Fix, reason: Reason, detail: str) -> NoFix:
-    return NoFix(
-        reason=reason,
-        detail=detail,
-        timestamp_ns=fix.timestamp_ns,
-        method=fix.method,
-        score=fix.score,
-        window=fix.window,
-        timings=fix.timings,
-    )
+def _sample(anchor: _Anchor) -> OdometrySample:
+    assert anchor.sample is not None  # a fix has one
+    return anchor.sample

@@ -94,6 +94,36 @@ class Frame:
         return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.heading_deg % 360.0 % 360.0)
 
 
+@dataclass(frozen=True, slots=True)
+class GridPose:
+    """Height and attitude by which a frame is projected onto the map; None where unknown.
+
+    Attributes:
+        height_agl_m: above the ground.
+        grid_heading_deg: clockwise from grid north, the north of the map's plane. From true north it differs by
+            the meridian convergence (:meth:`engine.geo.LocalFrame.convergence_deg`).
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+    """
+
+    height_agl_m: float | None
+    grid_heading_deg: float | None
+    roll_deg: float | None
+    pitch_deg: float | None
+
+    @property
+    def has_tilt(self) -> bool:
+        """Whether roll and pitch are known."""
+        return self.roll_deg is not None and self.pitch_deg is not None
+
+    @property
+    def grid_attitude(self) -> Attitude | None:
+        """The attitude about grid north, unknown roll and pitch taken as level; None without a heading."""
+        if self.grid_heading_deg is None:
+            return None
+        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.grid_heading_deg % 360.0 % 360.0)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prior:
     """Where the vehicle is believed to be when a frame is taken.
@@ -248,6 +278,18 @@ class Fix:
     def sigma_m(self) -> float:
         """Horizontal standard deviation, the larger of the two axes of the ellipse."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2[:2, :2])[-1]))
+
+    def refused(self, reason: Reason, detail: str) -> NoFix:
+        """The refusal of this fix, with what was measured of it."""
+        return NoFix(
+            reason=reason,
+            detail=detail,
+            timestamp_ns=self.timestamp_ns,
+            method=self.method,
+            score=self.score,
+            window=self.window,
+            timings=self.timings,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,10 +1,11 @@
-"""The adaptive window: how large a crop of the map each frame is matched against (equations 4 and 5)."""
+"""The adaptive window: how large a crop of the map a frame is matched against (eq. 4, 5), and on which level."""
 
 from __future__ import annotations
 
 import math
 
 from engine.errors import OptionError
+from engine.orthomap import OrthoMap
 from engine.values import Window
 
 SPREAD_SIGMAS = 3.0
@@ -48,3 +49,27 @@ def place_window(
             return None
         spans.append((low, high - low))
     return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
+
+
+def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) -> Window:
+    """The part of one pyramid level that a window in map pixels covers.
+
+    Args:
+        site: the map.
+        window: in full-resolution pixels, inside the map.
+        level: of the pyramid.
+        step_px: width and height are rounded up to a multiple of this where the level is large enough, so that
+            a flight meets few different sizes and nothing is planned anew in flight.
+    """
+    rows, columns = site.level_shape(level)
+    spans = []
+    for start, size, limit in ((window.x0, window.width_px, columns), (window.y0, window.height_px, rows)):
+        low, high = start >> level, min(limit, max((start + size) >> level, (start >> level) + 1))
+        length = min(limit, -(-(high - low) // step_px) * step_px)
+        spans.append((min(low, limit - length), length))
+    return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
+
+
+def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int) -> int:
+    """The pyramid level whose pixels are nearest to the wanted size without being much coarser."""
+    return min(max(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + 0.25), 0), levels - 1)

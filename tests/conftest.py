@@ -1,34 +1,21 @@
-"""What the tests share: a simulated town and flight, and a ground whose pictures are drawn ray by ray.
-
-The ground's pictures share no line with the engine: rays are turned vector by vector, places on the Earth go
-through PROJ's own topocentric frame, and grey levels come from a spline, for the map and for the frames alike.
-"""
+"""Fixtures that many tests use: the shared flights, a simulated town and flight, and a ground drawn ray by ray."""
 
 from __future__ import annotations
-
-import math
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 
 import cv2
 import hypothesis
 import numpy as np
 import pytest
 import torch
-from pyproj import Transformer
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from engine import Camera, Fix, Frame, OrthoMap, Prior
+from engine import Fix
 from engine.sim import build_town, paper_flight
-
-SHARED = Path(__file__).parents[2] / "shared" / "data"
-NO_SHARED = f"the shared flights are not there: {SHARED}"
+from tests.support.ground import CAMERA, Ground
+from tests.support.paths import NO_SHARED, SHARED
+from tests.support.towns import site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
-
-LATTICE_M = 0.5
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -54,13 +41,6 @@ def shared():
     return SHARED
 
 
-def site_of(town, *, surface=True):
-    """The map that a simulated town is photographed as."""
-    gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
-    heights = town.surface_m if surface else None
-    return OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=heights)
-
-
 @pytest.fixture(scope="session")
 def sim_flight():
     """The first 24 frames of the paper's flight over a simulated town."""
@@ -84,120 +64,6 @@ def other_site():
     return site_of(build_town(7))
 
 
-def body_axes(roll_deg, pitch_deg, heading_deg):
-    """Forward, right and down of the body in east-north-up: the nose turned, then lifted, then a wing dropped."""
-    r, p, h = map(math.radians, (roll_deg, pitch_deg, heading_deg))
-    forward = np.array([math.sin(h), math.cos(h), 0.0])
-    right = np.array([math.cos(h), -math.sin(h), 0.0])
-    down = np.array([0.0, 0.0, -1.0])
-    forward, down = math.cos(p) * forward - math.sin(p) * down, math.cos(p) * down + math.sin(p) * forward
-    right, down = math.cos(r) * right + math.sin(r) * down, math.cos(r) * down - math.sin(r) * right
-    return forward, right, down
-
-
-def ground_hits(camera, xy_px, height_m, *, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0):
-    """East and north (..., 2) in metres from the nadir where the rays of pixels (..., 2) meet flat ground.
-
-    The camera hangs below the body and its picture's top points to the nose: right in the picture is right of
-    the body, down in the picture is to the tail, into the picture is down.
-    """
-    forward, right, down = body_axes(roll_deg, pitch_deg, heading_deg)
-    x = (np.asarray(xy_px, float)[..., 0] - camera.matrix[0, 2]) / camera.matrix[0, 0]
-    y = (np.asarray(xy_px, float)[..., 1] - camera.matrix[1, 2]) / camera.matrix[1, 1]
-    ray = down + x[..., None] * right - y[..., None] * forward
-    return ray[..., :2] * (height_m / -ray[..., 2:])
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Flat ground with a random smooth texture, its map, and pictures of it from anywhere.
-
-    The texture is a function of true east and north about the map's centre, so that the map's projection
-    enters only where PROJ puts it.
-    """
-
-    epsg: int = 32633
-    lat_deg: float = 48.25
-    lon_deg: float = 15.0
-    gsd_m: float = 0.5
-    size: tuple[int, int] = (600, 640)
-    seed: int = 5
-
-    @cached_property
-    def _texture(self):
-        rng = np.random.default_rng(self.seed)
-        count = int(2.2 * max(self.size) * self.gsd_m / LATTICE_M)
-        fine = gaussian_filter(rng.standard_normal((count, count)), 2.0)
-        broad = gaussian_filter(rng.standard_normal((count, count)), 6.0)
-        mixed = fine / fine.std() + broad / broad.std()
-        return spline_filter(128.0 + 40.0 * mixed / mixed.std(), order=3)
-
-    def levels(self, east_m, north_m):
-        """Grey level, unrounded, at true east and north."""
-        middle = (self._texture.shape[0] - 1) / 2
-        at = np.stack([middle - north_m / LATTICE_M, middle + east_m / LATTICE_M])
-        return map_coordinates(self._texture, at, order=3, mode="mirror", prefilter=False)
-
-    @cached_property
-    def _grid(self):
-        return Transformer.from_crs(4326, self.epsg, always_xy=True)
-
-    @cached_property
-    def pixel_to_crs(self):
-        """(2, 3): the map's middle lies on the ground's latitude and longitude."""
-        x, y = self._grid.transform(self.lon_deg, self.lat_deg)
-        rows, columns = self.size
-        left, top = x - self.gsd_m * (columns - 1) / 2, y + self.gsd_m * (rows - 1) / 2
-        return np.array([[self.gsd_m, 0.0, left], [0.0, -self.gsd_m, top]])
-
-    @cached_property
-    def _topocentric(self):
-        place = f"+lat_0={self.lat_deg} +lon_0={self.lon_deg} +ellps=WGS84"
-        return Transformer.from_pipeline(
-            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-            f"+step +proj=cart +ellps=WGS84 +step +proj=topocentric {place}"
-        )
-
-    def enu_from_pixel(self, xy_px):
-        """True east and north (..., 2) about the map's centre, by PROJ."""
-        grid = np.asarray(xy_px, float) @ self.pixel_to_crs[:, :2].T + self.pixel_to_crs[:, 2]
-        lon, lat = self._grid.transform(grid[..., 0], grid[..., 1], direction="INVERSE")
-        east, north, _ = self._topocentric.transform(lon, lat, np.zeros_like(lon))
-        return np.stack([east, north], axis=-1)
-
-    @cached_property
-    def gray(self):
-        rows, columns = self.size
-        x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-        enu = self.enu_from_pixel(np.stack([x, y], axis=-1))
-        return np.clip(np.rint(self.levels(enu[..., 0], enu[..., 1])), 0, 255).astype(np.uint8)
-
-    @cached_property
-    def site(self):
-        return OrthoMap.from_arrays(self.gray, self.pixel_to_crs, f"EPSG:{self.epsg}")
-
-    def picture(self, camera, nadir_px, height_m, **attitude):
-        """What the camera sees above a map pixel (x, y): one ray a pixel, onto flat ground."""
-        x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-        hits = ground_hits(camera, np.stack([x, y], axis=-1), height_m, **attitude)
-        hits = hits + self.enu_from_pixel(nadir_px)
-        return np.clip(np.rint(self.levels(hits[..., 0], hits[..., 1])), 0, 255).astype(np.uint8)
-
-    def frame(self, camera, nadir_px, height_m=150.0, *, timestamp_ns=0, **attitude):
-        """The picture with the telemetry that is true of it."""
-        told = {"roll_deg": 0.0, "pitch_deg": 0.0, "heading_deg": 0.0, **attitude}
-        image = self.picture(camera, nadir_px, height_m, **attitude)
-        return Frame(image, timestamp_ns=timestamp_ns, height_agl_m=height_m, **told)
-
-    def prior(self, nadir_px, sigma_m=8.0, off_m=(5.0, -4.0)):
-        """A prior some metres off a map pixel."""
-        east, north = self.enu_from_pixel(nadir_px) + off_m
-        return Prior(east_m=float(east), north_m=float(north), sigma_m=sigma_m)
-
-
-CAMERA = Camera.from_fov(300, 300, 60.0)
-
-
 @pytest.fixture(scope="session")
 def camera():
     """The paper's: 300 x 300 px, 60 degrees, straight down."""
@@ -208,17 +74,6 @@ def camera():
 def ground():
     """Ground on the central meridian: the map's up is true north to 0.003 degrees."""
     return Ground()
-
-
-@pytest.fixture(scope="session")
-def make_ground():
-    return Ground
-
-
-@pytest.fixture(scope="session")
-def cast():
-    """Where rays meet the ground, by vectors; see :func:`ground_hits`."""
-    return ground_hits
 
 
 @pytest.fixture(scope="session")

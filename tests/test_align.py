@@ -18,6 +18,7 @@ from rasterio.transform import Affine
 
 from engine import Attitude, Camera, Fix, Frame, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.align import MAX_RAY_DEG, enhance, rectify, to_gray, view_of
+from tests.support.ground import Ground, ground_hits
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 UPRIGHT = np.array([[0.5, 0.0], [0.0, -0.5]])  # metres east and north per map pixel
@@ -71,11 +72,9 @@ def test_half_pixel_of_the_map_a_geotiff_counts_from_the_corner_of_the_first_pix
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("lon_deg", "sign"), [(17.9, 1.0), (12.1, -1.0)])
-def test_meridian_convergence_heading_is_from_true_north_and_not_from_the_maps_up(
-    make_ground, camera, method, lon_deg, sign
-):
+def test_meridian_convergence_heading_is_from_true_north_and_not_from_the_maps_up(camera, method, lon_deg, sign):
     """At 60 degrees north and 2.9 degrees off the central meridian the map's up is 2.5 degrees off north."""
-    ground = make_ground(lat_deg=60.0, lon_deg=lon_deg)
+    ground = Ground(lat_deg=60.0, lon_deg=lon_deg)
     assert ground.site.info()["convergence_deg"] == pytest.approx(sign * 2.51, abs=0.02)
     tilted = {"pitch_deg": 12.0, "heading_deg": 20.0}  # the aim lies 32 m ahead: 1.4 m aside for 2.5 degrees
     result = locate(ground, camera, ground.frame(camera, NADIR, **tilted), method)
@@ -218,18 +217,18 @@ def test_an_off_centre_principal_point_is_honoured(ground, method):
     height=st.floats(2.0, 2000.0),
     convergence=st.floats(-3.0, 3.0),
 )
-def test_the_view_is_what_rays_do(cast, roll, pitch, heading, height, convergence):
+def test_the_view_is_what_rays_do(roll, pitch, heading, height, convergence):
     c, s = math.cos(math.radians(convergence)), math.sin(math.radians(convergence))
     jacobian = np.array([[c, s], [-s, c]]) @ UPRIGHT
     attitude = {"roll_deg": roll, "pitch_deg": pitch, "heading_deg": heading}
     view = view_of(CAMERA, Attitude(**attitude), height, jacobian)
     pixels = np.array([[0.0, 0.0], [299.0, 0.0], [40.0, 250.0], [149.5, 149.5]])
-    hits_m = cast(CAMERA, pixels, height, **attitude)
+    hits_m = ground_hits(CAMERA, pixels, height, **attitude)
     hits_px = np.linalg.solve(jacobian, hits_m.T).T
     seen = np.c_[hits_px, np.ones(4)] @ view.image_from_map.T
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], pixels, atol=1e-6)
     np.testing.assert_allclose(view.center_px, hits_px[3], atol=1e-6 * height)
-    corners = cast(CAMERA, [[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]], height, **attitude)
+    corners = ground_hits(CAMERA, [[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]], height, **attitude)
     corners = np.linalg.solve(jacobian, corners.T).T
     np.testing.assert_allclose(view.footprint_px, np.ptp(corners, axis=0), rtol=1e-9)
     x, y = corners.T

@@ -19,11 +19,11 @@ from engine.confidence import (
     prior_agreement,
     probability,
 )
-from engine.integrity import PeakRule, judge_confidence
+from engine.integrity import PeakRule, judge_peak, judge_pose
 from engine.values import Peak, Timings, Window
 
 NEAR = PriorAgreement(prior_chi_square=4.0, spread_m=8.0)
-MIDDLING = PeakFeatures(sigmas=10.0, ratio=0.6, expected=NEAR)
+MIDDLING = PeakFeatures(sigmas=10.0, ratio=0.6, agreement=NEAR)
 
 
 def made_fix(east_m, north_m, variance_m2):
@@ -52,7 +52,7 @@ def test_a_score_is_counted_in_sigmas_of_fishers_z():
     found = peak_features(peak(0.5, 0.2), 0.1, NEAR)
     assert found.sigmas == pytest.approx(math.atanh(0.5) / 0.1)
     assert found.ratio == pytest.approx(0.4)
-    assert found.expected is NEAR
+    assert found.agreement is NEAR
 
 
 @pytest.mark.parametrize(("score", "second", "ratio"), [(0.5, -1.0, 0.0), (0.5, 0.5, 1.0), (-0.2, -0.3, 0.0)])
@@ -65,8 +65,8 @@ def test_the_ratio_of_a_rival_is_a_share(score, second, ratio):
     [
         ({"sigmas": 20.0}, {"sigmas": 5.0}),
         ({"ratio": 0.3}, {"ratio": 0.9}),
-        ({"expected": PriorAgreement(0.0, 8.0)}, {"expected": PriorAgreement(9.0, 8.0)}),
-        ({"expected": PriorAgreement(4.0, 4.0)}, {"expected": PriorAgreement(4.0, 20.0)}),
+        ({"agreement": PriorAgreement(0.0, 8.0)}, {"agreement": PriorAgreement(9.0, 8.0)}),
+        ({"agreement": PriorAgreement(4.0, 4.0)}, {"agreement": PriorAgreement(4.0, 20.0)}),
     ],
 )
 def test_more_evidence_makes_a_peak_more_probable(better, worse):
@@ -76,8 +76,8 @@ def test_more_evidence_makes_a_peak_more_probable(better, worse):
 
 def test_a_prior_that_is_far_off_does_not_outweigh_a_plain_match():
     """The prior may be the one that is wrong; how far it is off then says nothing more."""
-    plain = PeakFeatures(sigmas=25.0, ratio=0.1, expected=PriorAgreement(50.0, 8.0))
-    farther = replace(plain, expected=PriorAgreement(5000.0, 8.0))
+    plain = PeakFeatures(sigmas=25.0, ratio=0.1, agreement=PriorAgreement(50.0, 8.0))
+    farther = replace(plain, agreement=PriorAgreement(5000.0, 8.0))
     assert probability(plain) == probability(farther) > PeakRule().min_confidence
 
 
@@ -100,23 +100,23 @@ def test_every_pose_has_a_probability(log10_nfa, prior_chi_square, height_chi_sq
 
 
 def test_a_refusal_tells_its_figures():
-    asked = PeakRule().min_confidence
-    verdict = judge_confidence(replace(MIDDLING, ratio=0.9), asked)
+    clear, rule = peak(0.9, 0.1), PeakRule()
+    verdict = judge_peak(clear, 2500, replace(MIDDLING, ratio=0.9), 0.979, rule)
     assert verdict is not None
     assert verdict[0] is Reason.AMBIGUOUS
-    for figure in ("0.98", "10.0 sigmas", "90%", "4.0"):
+    for figure in ("0.979", "0.98", "10.0 sigmas", "90%", "4.0"):
         assert figure in verdict[1]
-    assert judge_confidence(PeakFeatures(sigmas=20.0, ratio=0.2, expected=PriorAgreement(1.0, 8.0)), asked) is None
+    assert judge_peak(clear, 2500, MIDDLING, 0.98, rule) is None
 
 
 def test_a_refusal_of_a_pose_tells_its_figures():
-    verdict = judge_confidence(PoseFeatures(-1.5, None, None), 0.995)
+    verdict = judge_pose(PoseFeatures(-1.5, None, None), 0.991, 0.995)
     assert verdict is not None
     assert verdict[0] is Reason.BAD_POSE
-    for figure in ("0.995", "-1.5", "chi-square unknown"):
+    for figure in ("0.991", "0.995", "-1.5", "chi-square unknown"):
         assert figure in verdict[1]
-    assert "chi-square 3.2" in judge_confidence(PoseFeatures(-1.5, 3.2, None), 0.995)[1]
-    assert judge_confidence(PoseFeatures(-40.0, 1.0, 1.0), 0.97) is None
+    assert "chi-square 3.2" in judge_pose(PoseFeatures(-1.5, 3.2, None), 0.991, 0.995)[1]
+    assert judge_pose(PoseFeatures(-40.0, 1.0, 1.0), 0.97, 0.97) is None
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(1e-3, 1), st.floats(0, 1e9))
@@ -128,7 +128,7 @@ def test_every_peak_has_a_probability(score, second, sigma, prior_chi_square):
 
 def test_the_fit_finds_the_weights_that_drew_the_labels():
     """Labels drawn with known weights: the fit has them again, to the scatter of 20,000 draws."""
-    from bench.confidence import fitted
+    from bench.accuracy.confidence import fitted
 
     rng = np.random.default_rng(0)
     x = np.c_[np.ones(20_000), rng.uniform(0.5, 3.0, 20_000), rng.random(20_000), rng.uniform(0, 12, 20_000)]
@@ -139,7 +139,7 @@ def test_the_fit_finds_the_weights_that_drew_the_labels():
 
 def test_scores_are_ranked():
     """Right ones 3 and 1, wrong ones 2 and 0: of four pairs three are in order; 1 is kept, so 2 passes."""
-    from bench.integrity_page import auc, calibration_error, false_positives
+    from bench.pages.integrity import auc, calibration_error, false_positives
 
     score, right = np.array([3.0, 1.0, 2.0, 0.0]), np.array([True, True, False, False])
     assert auc(score, right) == 0.75

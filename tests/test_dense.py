@@ -15,7 +15,7 @@ from engine.errors import ShapeError
 from engine.geo import enu_from_body
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import BLOCK_PX, SampleMap
-from engine.methods.hypothesis import NccOptions
+from engine.methods.options import NccOptions
 from engine.values import Window
 
 NADIR = np.array([315.0, 296.0])

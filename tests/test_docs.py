@@ -3,7 +3,6 @@
 import re
 import tomllib
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from typer.main import get_command
@@ -12,14 +11,14 @@ from docs.site_roles import on_page_content
 from engine.cli.app import app
 from engine.formats.track import COLUMNS
 from engine.integrity import AssumedErrors, PeakRule
-from engine.methods.sift import SiftOptions
+from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.pose import PoseOptions
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from engine.values import Reason
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 FENCE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INCLUDE = re.compile(r'^--8<-- "(.+)"$', re.MULTILINE)

@@ -8,17 +8,17 @@ import sys
 import time
 import types
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from engine.formats.flight import open_flight
 from engine.formats.truth import read_truth
-from engine.runs.demo import write_flight
+from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
+from tests.support.paths import ROOT
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = ROOT / "examples"
 FRAMES = 8
 
 
@@ -48,8 +48,8 @@ def test_your_own_loop_fixes_every_frame(flight, monkeypatch, capsys):
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
-    from bench.bridge_counts import free_port
-    from bench.fly_standin import fly
+    from bench.live.bridge_counts import free_port
+    from bench.live.fly_standin import fly
 
     port, start = free_port(), read_truth(flight / "truth.csv")[0]
     link, place = f"udpin:127.0.0.1:{port}", [str(start.lat_deg), str(start.lon_deg)]

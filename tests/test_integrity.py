@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from engine import Camera, Frame, OptionError, OrthoMap, Reason
+from engine import Camera, OptionError, OrthoMap, Reason
+from engine.confidence import PeakFeatures, PriorAgreement
 from engine.integrity import (
     AssumedErrors,
     PeakRule,
@@ -24,11 +25,11 @@ from engine.integrity import (
     with_map_accuracy,
 )
 from engine.ncc_fft import find_peak, ncc
-from engine.values import Peak
+from engine.values import GridPose, Peak
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
-BLANK = np.zeros((300, 300), np.uint8)
 PIXELS = 2500  # 100 blocks of 5 x 5: one sigma of chance is 0.1
+AT_PRIOR = PeakFeatures(sigmas=10.0, ratio=0.6, agreement=PriorAgreement(0.0, 8.0))
 RULE = PeakRule(min_sigmas=2.0, min_margin_sigmas=0.5, min_margin_sigmas_whole_map=1.0)
 
 
@@ -53,22 +54,22 @@ def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
     ],
 )
 def test_a_peak_is_believed_when_it_is_high_and_alone(score, second, whole_map, reason):
-    verdict = judge_peak(peak(score, second), PIXELS, RULE, whole_map=whole_map)
+    verdict = judge_peak(peak(score, second), PIXELS, None if whole_map else AT_PRIOR, None, RULE)
     assert (verdict and verdict[0]) is reason
     if verdict:
         assert f"{score:.3f}" in verdict[1]  # the figures behind the reason
 
 
 def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
-    verdict = judge_peak(peak(0.9, -1.0, bend=np.zeros((2, 2))), PIXELS, RULE, whole_map=False)
+    verdict = judge_peak(peak(0.9, -1.0, bend=np.zeros((2, 2))), PIXELS, AT_PRIOR, None, RULE)
     assert verdict
     assert verdict[0] is Reason.AMBIGUOUS
 
 
 def test_the_same_score_is_worth_more_over_a_larger_patch():
     weak = peak(0.3, 0.1)
-    assert judge_peak(weak, 4 * PIXELS, PeakRule(), whole_map=False) is None
-    assert judge_peak(weak, PIXELS, PeakRule(), whole_map=False)[0] is Reason.LOW_SCORE
+    assert judge_peak(weak, 4 * PIXELS, AT_PRIOR, None, PeakRule()) is None
+    assert judge_peak(weak, PIXELS, AT_PRIOR, None, PeakRule())[0] is Reason.LOW_SCORE
 
 
 def test_a_score_of_chance_scatters_by_its_sigma():
@@ -94,11 +95,11 @@ def test_options_are_positive_keyword_only_and_refused_by_name(options):
         setattr(options(), name, 0.5)
 
 
-@pytest.mark.parametrize("name", ["min_confidence", "sure"])
+@pytest.mark.parametrize("name", ["min_confidence", "null_test_below"])
 def test_a_probability_of_98_is_refused(name):
     with pytest.raises(OptionError, match=rf"^{name}: expected a probability .* 1, got 98"):
         PeakRule(**{name: 98.0})
-    PeakRule(sure=1.0)  # always holds the peak against the patch upside down
+    PeakRule(null_test_below=1.0)  # every peak must beat its own template upside down
 
 
 def test_what_is_assumed_of_telemetry_is_said_in_one_place():
@@ -106,7 +107,7 @@ def test_what_is_assumed_of_telemetry_is_said_in_one_place():
     assert errors.height_sigma_m(100.0) == pytest.approx(5.0)
     told = {(None, None): (4.0, 4.0), (1.0, None): (0.5, 4.0), (None, 1.0): (4.0, 0.5), (0.0, 0.0): (0.5, 0.5)}
     for (roll, pitch), sigmas in told.items():
-        assert errors.tilts_deg(Frame(BLANK, 0, 100.0, 0.0, roll, pitch)) == sigmas
+        assert errors.tilts_deg(GridPose(100.0, 0.0, roll, pitch)) == sigmas
 
 
 @given(
@@ -163,7 +164,7 @@ def errors_for(frame, **assumed):
 
 
 def test_half_a_degree_of_tilt_is_1_3_metres_at_150():
-    covariance = errors_for(Frame(BLANK, 0, 150.0, 0.0, 0.0, 0.0), tilt_deg=0.5, map_m=0.3)
+    covariance = errors_for(GridPose(150.0, 0.0, 0.0, 0.0), tilt_deg=0.5, map_m=0.3)
     assert 150.0 * math.tan(math.radians(0.5)) == pytest.approx(1.309, abs=1e-3)
     # A level camera: the axis meets the ground below, whatever the height and the heading.
     np.testing.assert_allclose(np.diag(covariance)[:2], 1.309**2 + 0.3**2, rtol=1e-3)
@@ -172,8 +173,8 @@ def test_half_a_degree_of_tilt_is_1_3_metres_at_150():
 
 
 def test_a_tilt_that_nobody_measured_is_less_sure():
-    level = Frame(BLANK, 0, 150.0, 0.0, 0.0, 0.0)
-    unknown_roll = Frame(BLANK, 0, 150.0, 0.0, None, 0.0)
+    level = GridPose(150.0, 0.0, 0.0, 0.0)
+    unknown_roll = GridPose(150.0, 0.0, None, 0.0)
     gain = errors_for(unknown_roll) - errors_for(level)
     # Heading north, roll moves the axis east and west.
     assert gain[0, 0] == pytest.approx((150.0 * math.tan(math.radians(4.0))) ** 2 - 1.309**2, rel=1e-2)
@@ -182,7 +183,7 @@ def test_a_tilt_that_nobody_measured_is_less_sure():
 
 def test_the_height_of_a_tilted_camera_moves_the_fix_along_the_tilt():
     """Nose up 20 degrees on a heading of 90: the axis meets the ground 54.6 m to the east."""
-    frame = Frame(BLANK, 0, 150.0, 90.0, 0.0, 20.0)
+    frame = GridPose(150.0, 90.0, 0.0, 20.0)
     small = {"heading_deg": 1e-6, "tilt_deg": 1e-6, "map_m": 1e-6}
     covariance = errors_for(frame, height_m=3.0, height_share=1e-9, **small)
     assert math.sqrt(covariance[0, 0]) == pytest.approx(3.0 * math.tan(math.radians(20.0)), rel=1e-6)
@@ -199,7 +200,7 @@ def test_the_height_of_a_tilted_camera_moves_the_fix_along_the_tilt():
     height=st.floats(5.0, 3000.0),
 )
 def test_the_covariance_of_a_fix_is_symmetric_and_positive_definite(heading, roll, pitch, height):
-    frame = Frame(BLANK, 0, height, heading, roll, pitch)
+    frame = GridPose(height, heading, roll, pitch)
     jacobian = np.array([[0.5, 0.01], [0.01, -0.5]])
     covariance = ncc_covariance_m2(
         np.array([[0.04, 0.01], [0.01, 0.02]]), frame, CAMERA, jacobian, AssumedErrors()
@@ -209,8 +210,8 @@ def test_the_covariance_of_a_fix_is_symmetric_and_positive_definite(heading, rol
 
 
 def test_a_fix_by_correlation_needs_height_and_heading():
-    for frame in (Frame(BLANK, 0, None, 0.0), Frame(BLANK, 0, 150.0, None)):
-        with pytest.raises(OptionError, match=r"^frame: expected a height and a heading"):
+    for frame in (GridPose(None, 0.0, None, None), GridPose(150.0, None, None, None)):
+        with pytest.raises(OptionError, match=r"^pose: expected a height and a heading"):
             errors_for(frame)
 
 

@@ -317,7 +317,7 @@ def test_nothing_is_waited_for_longer_than_a_minute(name):
 
 
 def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
-    monkeypatch.setattr("engine.live._LEAVE_S", 0.05)
+    monkeypatch.setattr("engine.live._JOIN_S", 0.05)
     gate, sink, starts = threading.Event(), Sink(), []
 
     def make(start):

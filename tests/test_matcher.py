@@ -32,9 +32,10 @@ from engine import (
     Window,
 )
 from engine.integrity import AssumedErrors, PeakRule
-from engine.methods import sift
-from engine.methods.ncc import NccOptions
-from engine.methods.sift import SiftOptions
+from engine.methods.feature_pose import FeatureMatcher, attitude_prior
+from engine.methods.options import NccOptions, SiftOptions
+from engine.values import GridPose
+from tests.support.ground import Ground
 
 METHODS = ("ncc", "sift")
 NADIR = np.array([315.0, 296.0])
@@ -150,8 +151,8 @@ def test_without_a_prior_the_whole_map_is_searched_and_the_same_place_found(
     assert np.hypot(lost.east_m - known.east_m, lost.north_m - known.north_m) < 0.1
 
 
-def test_without_a_prior_a_place_on_a_large_map_is_found_by_way_of_a_coarse_one(make_ground, camera):
-    ground = make_ground(size=(1200, 1100), seed=9)  # more than the million pixels that are searched at once
+def test_without_a_prior_a_place_on_a_large_map_is_found_by_way_of_a_coarse_one(camera):
+    ground = Ground(size=(1200, 1100), seed=9)  # more than the million pixels that are searched at once
     matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
     for nadir in ((320.4, 850.6), (780.5, 402.5)):
         shown = ground.frame(camera, np.array(nadir), heading_deg=80.0)
@@ -232,8 +233,8 @@ def test_auto_is_ncc_where_it_can_be_and_sift_where_it_must(matchers, ground, ca
     assert fix.method == "sift"
 
 
-def test_nodata_about_the_flight_is_neither_matched_nor_in_the_way(make_ground, camera):
-    ground = make_ground()
+def test_nodata_about_the_flight_is_neither_matched_nor_in_the_way(camera):
+    ground = Ground()
     valid = np.zeros(ground.gray.shape, bool)
     valid[60:560, 60:600] = True
     gray = np.where(valid, ground.gray, 255).astype(np.uint8)
@@ -245,9 +246,9 @@ def test_nodata_about_the_flight_is_neither_matched_nor_in_the_way(make_ground, 
         assert distance_px(matcher.locate(shown)) < 0.3
 
 
-def test_a_place_counts_only_where_enough_of_the_frame_lies_on_the_map(make_ground, camera):
+def test_a_place_counts_only_where_enough_of_the_frame_lies_on_the_map(camera):
     """The patch is 242 px wide; the map ends 60 px right of the nadir, so that three quarters of it count."""
-    ground = make_ground()
+    ground = Ground()
     valid = np.ones(ground.gray.shape, bool)
     valid[:, int(NADIR[0]) + 60 :] = False
     site = OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", valid=valid)
@@ -303,18 +304,18 @@ def test_without_a_second_look_a_height_off_by_two_is_refused(ground, camera, fr
 def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
     ground, camera, frame, prior, monkeypatch, budget_ms, looks
 ):
-    beliefs = []
+    hypotheses = []
 
-    def look(query, _, belief, __):
+    def look(matcher, hypothesis):
         time.sleep(0.03)
-        beliefs.append(belief)
-        return query.refuse(Reason.TOO_FEW_MATCHES, "none", "sift")
+        hypotheses.append(hypothesis)
+        return matcher.query.refuse(Reason.TOO_FEW_MATCHES, "none", "sift")
 
-    monkeypatch.setattr(sift, "_look", look)
+    monkeypatch.setattr(FeatureMatcher, "_find_with", look)
     result = with_sift(ground, camera).locate(frame, prior, Budget(total_ms=budget_ms))
     assert result.reason is Reason.TOO_FEW_MATCHES
-    assert [belief.turn_deg is None for belief in beliefs] == [False, True][:looks]
-    assert [belief.heights_m for belief in beliefs] == [(150.0, 150.0), (75.0, 300.0)][:looks]
+    assert [hypothesis.x_axis_deg is None for hypothesis in hypotheses] == [False, True][:looks]
+    assert [hypothesis.heights_m for hypothesis in hypotheses] == [(150.0, 150.0), (75.0, 300.0)][:looks]
 
 
 # Where SIFT's features come from
@@ -331,8 +332,8 @@ def test_features_of_the_map_prepared_or_found_per_frame_give_the_same_place(gro
         assert fixes[0].score > 0.8
 
 
-def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(make_ground, camera):
-    ground = make_ground(lat_deg=60.0, lon_deg=17.9)  # 2.5 degrees of convergence
+def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(camera):
+    ground = Ground(lat_deg=60.0, lon_deg=17.9)  # 2.5 degrees of convergence
     matcher = with_sift(ground, camera, second_look=False, max_turn_deg=8.0)
     oriented = with_sift(ground, camera, second_look=False, upright=False, max_turn_deg=8.0)
     for mount in (camera.mount, np.array([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]) @ camera.mount):
@@ -349,9 +350,10 @@ def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, 
     """Of roll, pitch and heading by turns; of the two tilts each by whether it was told."""
     lifted = cv2.Rodrigues(np.radians([0.0, mounted_deg, 0.0]))[0] @ camera.mount  # about the body's right
     frame = Frame(np.zeros((8, 8), np.uint8), 0, 100.0, 40.0, None, 3.0)
-    query = SimpleNamespace(frame=frame, camera=replace(camera, mount=lifted))
+    known = GridPose(frame.height_agl_m, frame.heading_deg, frame.roll_deg, frame.pitch_deg)
+    query = SimpleNamespace(telemetry=known, camera=replace(camera, mount=lifted))
     errors = AssumedErrors(tilt_deg=0.4, unknown_tilt_deg=5.0)
-    prior = sift._attitude_prior(query, 40.0, 1.5, errors)
+    prior = attitude_prior(query, 40.0, 1.5, errors)
     for about_body_deg in np.diag([5.0, 0.4, 1.5]):
         about_camera = lifted.T @ np.radians(about_body_deg)
         assert about_camera @ prior.precision @ about_camera == pytest.approx(1.0)
@@ -599,9 +601,9 @@ def test_the_papers_profile_finds_the_place_of_a_level_frame(ground, camera, pri
             assert fix.method == method
 
 
-def test_the_papers_profile_turns_by_the_heading_less_the_maps(make_ground, camera):
+def test_the_papers_profile_turns_by_the_heading_less_the_maps(camera):
     """Equation 3, alpha = psi - psi_m: on a map whose up is 2.5 degrees off north the true heading fits best."""
-    ground = make_ground(lat_deg=60.0, lon_deg=17.9)
+    ground = Ground(lat_deg=60.0, lon_deg=17.9)
     matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(profile="paper"))
     image = ground.picture(camera, NADIR, 150.0, heading_deg=40.0)
     scores = {
@@ -688,8 +690,8 @@ def test_a_town_gives_the_same_fixes_in_any_projection(town_projections, sim_fli
         assert np.hypot(*difference.T).max() < most_m, name
 
 
-def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, make_ground, camera):
-    ground = make_ground(lon_deg=16.45)  # 1.1 degrees of convergence
+def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, camera):
+    ground = Ground(lon_deg=16.45)  # 1.1 degrees of convergence
     rng = np.random.default_rng(0)
     nadirs = rng.uniform((260.0, 250.0), (380.0, 350.0), (8, 2))
     frames = [

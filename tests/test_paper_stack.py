@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import math
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from engine.camera import Camera
 from engine.formats.geotiff import write_geotiff
 from engine.orthomap import OrthoMap
+from tests.support.paths import ROOT
 
-STACK = Path(__file__).parents[1] / "examples" / "paper-stack"
+STACK = ROOT / "examples" / "paper-stack"
 FILES = sorted(f for f in STACK.rglob("*") if f.suffix in (".launch", ".world", ".sdf", ".xml", ".config"))
 
 

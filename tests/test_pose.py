@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2, norm
 
-from bench.pose_scenes import GROUNDS, WRONG
-from bench.poses import CHI2_3_SIGMA, accepted, coverage
+from bench.accuracy.pose_scenes import GROUNDS, WRONG
+from bench.accuracy.poses import CHI2_3_SIGMA, accepted, coverage
 from engine import pnp
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
@@ -309,7 +309,7 @@ def test_the_precision_of_a_prior_is_its_covariance_inverted():
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_wrong_matches_never_give_a_pose(kind):
-    """A slice of the 100,000 sets that ``python -m bench.poses`` draws."""
+    """A slice of the 100,000 sets that ``python -m bench.accuracy.poses`` draws."""
     assert accepted(kind, 170, seed=13) == 0
 
 

@@ -9,11 +9,11 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import engine
+from tests.support.paths import ROOT
 
 PUBLIC = [
     "Answer",
@@ -32,6 +32,7 @@ PUBLIC = [
     "LiveOptions",
     "MapError",
     "MatcherOptions",
+    "MissingExtraError",
     "Navigator",
     "NavigatorOptions",
     "NavigatorState",
@@ -72,7 +73,6 @@ MODULES = {
     "sim.quadrotor": None,
 }
 """The named public modules, whose ``__all__`` counts, and the optional package that importing one needs."""
-ROOT = Path(__file__).parents[1]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
 UNUSED = (
     "matplotlib",
@@ -99,9 +99,7 @@ def fresh():
         "print('REPORT', json.dumps([loaded, reach, torch.cuda.is_initialized(), "
         "sorted(n for n in sys.modules if n.startswith('engine.'))]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", report], capture_output=True, text=True, cwd=Path(__file__).parents[1], check=True
-    )
+    done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)
     before, _, rest = done.stdout.partition("REPORT ")
     loaded, reach, cuda, modules = json.loads(rest)
     return {"printed": before + done.stderr, "loaded": loaded, "reach": reach, "cuda": cuda, "modules": modules}

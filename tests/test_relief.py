@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import body_axes
 
 from engine import Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
 from engine.align import view_of
-from engine.methods.hypothesis import NccOptions
+from engine.methods.options import NccOptions
 from engine.values import Attitude
+from tests.support.ground import body_axes
 
 NADIR = np.array([315.0, 296.0])
 HEIGHT_M = 150.0
@@ -90,7 +90,7 @@ def test_the_frame_is_laid_on_the_slope_below_it(scene, ground, camera, monkeypa
     site, frame, _ = scene
     matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
     fix = matcher.locate(frame, ground.prior(NADIR))
-    monkeypatch.setattr("engine.methods.hypothesis._slope", lambda *_: np.zeros(2))
+    monkeypatch.setattr("engine.methods.correlation.Correlator._slope", lambda *_: np.zeros(2))
     level = matcher.locate(frame, ground.prior(NADIR))
     assert isinstance(fix, Fix)
     assert fix.score > level.score + 0.1

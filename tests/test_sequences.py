@@ -9,7 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.sequences import IMAGES, METHODS, PRIORS, STAMPS, TELEMETRY, Ground, Step, fly, is_sound, random_steps
+from bench.live.sequences import (
+    IMAGES,
+    METHODS,
+    PRIORS,
+    STAMPS,
+    TELEMETRY,
+    Ground,
+    Step,
+    fly,
+    is_sound,
+    random_steps,
+)
 from engine import Fix, Navigator, NavigatorState
 
 RIGHT = Step("right", "next", "none", "right")
@@ -29,7 +40,7 @@ def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_random_sequences_end_in_documented_ways_and_some_in_fixes(tiny, method):
-    """A slice of ``python -m bench.sequences``."""
+    """A slice of ``python -m bench.live.sequences``."""
     endings = sum((sequence(tiny, seed, method) for seed in range(12)), start=sequence(tiny, 99, method))
     assert endings["fix"] > 0
     assert endings["TelemetryError"] > 0

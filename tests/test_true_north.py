@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, SceneMatcher, Window
-from engine.methods.ncc import NccOptions
+from engine.methods.options import NccOptions
+from tests.support.ground import Ground
 
 HEIGHT_M = 80.0
 PLANE_DEG = 25.0  # the heading in the plane's axes, by which the pictures are drawn
@@ -17,9 +18,9 @@ NADIR = np.array([500.0, 300.0])
 
 
 @pytest.fixture(scope="module")
-def polar(make_ground):
+def polar():
     """3.3 km from the pole: 90 m east of the map's middle north has turned by a degree and a half."""
-    return make_ground(epsg=32661, lat_deg=89.97, lon_deg=15.0)
+    return Ground(epsg=32661, lat_deg=89.97, lon_deg=15.0)
 
 
 @pytest.fixture(scope="module")

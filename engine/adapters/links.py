@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from engine.errors import BackendError, OptionError
+from engine.errors import OptionError, require
 
 PeerAddress = tuple[str, int] | None
 """Host and port that sent a datagram; None on a point-to-point link."""
@@ -58,7 +58,7 @@ class Connection:
 
         Raises:
             OSError: the link cannot be opened now.
-            BackendError: a serial port is requested and pyserial is not installed.
+            MissingExtraError: a serial port is requested and pyserial is not installed.
         """
         factories: dict[str, Callable[[str, int], Link]] = {
             "udpin": lambda host, port: _Udp(host, port, listens=True),
@@ -88,11 +88,11 @@ def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
     number = int(number_text) if number_text.isascii() and number_text.isdecimal() else 0
     max_number = 10_000_000 if kind == "serial" else 65535
     if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not 0 < number <= max_number:
-        raise OptionError(f"--connect: expected {_SYNTAX}, got {text!r}")
+        raise OptionError(f"connect: expected {_SYNTAX}, got {text!r}")
     if kind == "udpin" and not listen_anywhere and not _is_loopback(host):
         raise OptionError(
-            f"--connect: expected a loopback address to listen on, got {host!r}; "
-            "add --listen-anywhere to be reached from other machines"
+            f"connect: expected a loopback address to listen on, got {host!r}; "
+            "add `listen_anywhere` to be reached from other machines"
         )
     return Connection(kind, host, number)
 
@@ -173,12 +173,7 @@ class _Serial:
     is_stream = True
 
     def __init__(self, device: str, baud: int) -> None:
-        try:
-            import serial
-        except ImportError:
-            raise BackendError(
-                "serial: expected pyserial to be installed, the extra [mavlink]: pip install pyserial"
-            ) from None
+        serial = require("serial", "mavlink", "pyserial")
         self._port: Any = serial.Serial(device, baud, timeout=0, write_timeout=1.0)
 
     def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:

@@ -38,7 +38,7 @@ def read_key(path: str | Path) -> bytes:
     except ValueError:
         key = b""
     if len(key) != 32:
-        raise OptionError(f"--key: expected 32 bytes or 64 hexadecimal digits in {path}, got {len(content)} bytes")
+        raise OptionError(f"key: expected 32 bytes or 64 hexadecimal digits in {path}, got {len(content)} bytes")
     return key
 
 

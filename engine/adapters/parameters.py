@@ -25,7 +25,7 @@ def parameter_file(firmware: str, message: str, *, delay_ms: int, max_sigma_m: f
         OptionError: the delay is out of range.
     """
     if not 0 <= delay_ms <= MAX_DELAY_MS:
-        raise OptionError(f"--delay-ms: expected 0 to {MAX_DELAY_MS:g}, got {delay_ms}")
+        raise OptionError(f"delay_ms: expected 0 to {MAX_DELAY_MS:g}, got {delay_ms}")
     if firmware == "ardupilot":
         lines = _gps_input() if message == "gps_input" else _external_navigation(delay_ms)
         text = [f"# ArduPilot 4.5 and later, {message} by scenematch bridge mavlink. Reboot after loading."]

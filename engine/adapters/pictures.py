@@ -71,7 +71,7 @@ def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Iterator[Captur
     except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python accepts
         opened = False
     if not opened:
-        raise TelemetryError(f"--camera-source: expected a camera or stream that opens, got {quoted(source)}")
+        raise TelemetryError(f"camera_source: expected a camera or stream that opens, got {quoted(source)}")
     camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     try:
         while camera.grab():

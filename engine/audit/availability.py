@@ -58,7 +58,7 @@ def features(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Array:
 
 
 WEIGHTS = np.array([-16.41, 1.7, 1.89, 1.04])
-"""Of the logistic rule: constant, texture, score, lead; fitted by ``python -m bench.audit --fit``."""
+"""Of the logistic rule: constant, texture, score, lead; fitted by ``python -m bench.accuracy.audit --fit``."""
 
 
 # -------------------------------------------------------------------------------------------------- judging

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from engine.align import GroundView, rectify, view_of
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.methods.hypothesis import NccOptions
-from engine.methods.query import level_for
+from engine.methods.options import NccOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Window, check_positive
+from engine.window import level_for
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -19,13 +19,12 @@ from engine.align import enhance
 from engine.audit.plan import AuditPlan
 from engine.indexes.prepared import PreparedMap
 from engine.integrity import score_sigma
-from engine.methods.hypothesis import NccOptions
-from engine.methods.query import level_for
+from engine.methods.options import NccOptions
 from engine.ncc_fft import surface
 from engine.orthomap import OrthoMap
 from engine.peaks import fit_summit
 from engine.values import Window
-from engine.window import SPREAD_SIGMAS, place_window, window_size_px
+from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

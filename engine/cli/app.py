@@ -7,15 +7,24 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
-from engine.cli import (
-    bridge_commands,
-    campaign_commands,
-    console,
-    dataset_commands,
-    flight_commands,
-    map_commands,
+from engine.cli import console
+from engine.cli.argument_names import Command, error_as_typed
+from engine.cli.commands import (
+    bag,
+    bridge,
+    campaign,
+    compare,
+    dataset,
+    demo,
+    doctor,
+    evaluate,
+    export,
+    init,
+    locate,
+    simulate,
+    track,
 )
-from engine.cli.options import JsonOption
+from engine.cli.commands import map as map_commands
 from engine.errors import EngineError, OptionError
 
 app = typer.Typer(
@@ -24,28 +33,31 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command()(flight_commands.demo)
-app.command()(flight_commands.track)
-app.command()(flight_commands.compare)
-app.command()(campaign_commands.campaign)
-app.command()(flight_commands.init)
-app.command()(flight_commands.locate)
-app.command()(flight_commands.simulate)
-app.command()(flight_commands.evaluate)
-app.command()(flight_commands.export)
-app.command()(flight_commands.bag)
 map_app = typer.Typer(help="Facts about a map.")
-map_app.command("info")(map_commands.info)
-map_app.command("audit")(map_commands.audit)
-app.add_typer(map_app, name="map")
 dataset_app = typer.Typer(help="Published data sets.")
-dataset_app.command("import")(dataset_commands.import_dataset)
-dataset_app.command("check")(dataset_commands.check)
-app.add_typer(dataset_app, name="dataset")
 bridge_app = typer.Typer(help="Live, beside an autopilot.")
-bridge_app.command("mavlink")(bridge_commands.mavlink)
-bridge_app.command("mavlink-params")(bridge_commands.mavlink_params)
-bridge_app.command("ros")(bridge_commands.ros)
+
+# In the order of the help.
+app.command(cls=Command)(demo.demo)
+app.command(cls=Command)(track.track)
+app.command(cls=Command)(compare.compare)
+app.command(cls=Command)(campaign.campaign)
+app.command(cls=Command)(init.init)
+app.command(cls=Command)(locate.locate)
+app.command(cls=Command)(simulate.simulate)
+app.command(cls=Command)(evaluate.evaluate)
+app.command(cls=Command)(export.export)
+app.command(cls=Command)(bag.bag)
+app.command(cls=Command)(doctor.doctor)
+map_app.command("info", cls=Command)(map_commands.info)
+map_app.command("audit", cls=Command)(map_commands.audit)
+dataset_app.command("import", cls=Command)(dataset.import_dataset)
+dataset_app.command("check", cls=Command)(dataset.check)
+bridge_app.command("mavlink", cls=Command)(bridge.mavlink)
+bridge_app.command("mavlink-params", cls=Command)(bridge.mavlink_params)
+bridge_app.command("ros", cls=Command)(bridge.ros)
+app.add_typer(map_app, name="map")
+app.add_typer(dataset_app, name="dataset")
 app.add_typer(bridge_app, name="bridge")
 
 # typer brings its own copy of click, or depends on click: what it raises is found by descent, not by import.
@@ -59,10 +71,8 @@ def run(arguments: list[str]) -> int:
         result = get_command(app).main(args=arguments or ["--help"], prog_name="scenematch", standalone_mode=False)
     except _UsageError as error:
         return _fail(_usage(error), 2)
-    except OptionError as error:
-        return _fail(str(error), 2)
     except EngineError as error:
-        return _fail(str(error), 1)
+        return _fail(error_as_typed(error), 2 if isinstance(error, OptionError) else 1)
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 1)
     except (KeyboardInterrupt, typer.Abort):
@@ -83,16 +93,6 @@ def _usage(error: Any) -> str:
 def _fail(text: str, code: int) -> int:
     console.say(f"scenematch: {text}")
     return code
-
-
-@app.command()
-def doctor(as_json: JsonOption = False) -> None:
-    """Versions, devices, what is missing."""
-    from engine.cli.doctor import examine
-
-    facts, healthy = examine()
-    console.facts(facts, as_json, title="scenematch doctor")
-    raise typer.Exit(0 if healthy else 1)
 
 
 def _version(wanted: bool) -> None:

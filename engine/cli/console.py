@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import Progress
-from rich.progress import track as rich_track
+from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
-T = TypeVar("T")
+from engine.cli.argument_names import as_typed
+from engine.runs.progress import Progress
 
 _errors = Console(stderr=True, highlight=False)
 _PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
@@ -27,29 +25,33 @@ def say(text: str) -> None:
     print(" ".join(text.split()), file=sys.stderr, flush=True)
 
 
-def progress(items: Iterable[T], total: int, description: str) -> Iterator[T]:
-    """The same items, with a bar on a terminal and nothing in a pipe."""
-    shown = _errors.is_terminal
-    yield from rich_track(items, description, total, console=_errors, disable=not shown, transient=True)
+class _ConsoleProgress(Progress):
+    """Messages on standard error, and on a terminal a bar for each task."""
+
+    def __init__(self) -> None:
+        self._bars: dict[str, Bars] = {}
+
+    def message(self, text: str) -> None:
+        say(as_typed(text))
+
+    def update(self, description: str, done: int, total: int) -> None:
+        if not _errors.is_terminal:
+            return
+        bars = self._bars.get(description)
+        if bars is None:
+            bars = self._bars[description] = Bars(console=_errors, transient=True)
+            bars.add_task(description)
+            bars.start()
+        bars.update(bars.task_ids[0], completed=done, total=total)
+
+    def finish(self, description: str) -> None:
+        bars = self._bars.pop(description, None)
+        if bars is not None:
+            bars.stop()
 
 
-@contextmanager
-def progress_callback(description: str) -> Iterator[Callable[[int, int], None]]:
-    """A function to be told how much is done and how much there is: a bar on a terminal from then on.
-
-    So what turns out to take no time shows nothing, as everything does in a pipe.
-    """
-    shown = Progress(console=_errors, disable=not _errors.is_terminal, transient=True)
-    task = shown.add_task(description)
-
-    def tell(done: int, total: int) -> None:
-        shown.start()  # once is as good as often
-        shown.update(task, completed=done, total=total)
-
-    try:
-        yield tell
-    finally:
-        shown.stop()
+PROGRESS = _ConsoleProgress()
+"""What runs report to. A task that is never updated shows nothing, as all of them do in a pipe."""
 
 
 def print_json(value: Any) -> None:
@@ -107,36 +109,3 @@ def _text(value: Any, name: str) -> str:
     if isinstance(value, (list, tuple)):
         return ", ".join(_text(item, name) for item in value)
     return "-" if value is None else str(value)
-
-
-_SUMMARY = (
-    ("frames", "frames", "{}"),
-    ("fixes", "fixes", "{}"),
-    ("availability", "availability", "{:.1%}"),
-    ("RMS error", "rms_m", "{:.2f} m"),
-    ("median error", "median_m", "{:.2f} m"),
-    ("95 % within", "r95_m", "{:.2f} m"),
-    ("largest error", "max_m", "{:.2f} m"),
-    ("false fixes", "false_fixes", "{}"),
-    ("mean NEES (2 is honest)", "nees_mean", "{:.2f}"),
-    ("height RMS error", "height_rms_m", "{:.2f} m"),
-)
-
-
-def report(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> None:
-    """The figures of a track, and where its files are."""
-    if as_json:
-        print_json(summary)
-        return
-    known = [(name, form, summary[key]) for name, key, form in _SUMMARY if summary.get(key) is not None]
-    # A wild value keeps to its column.
-    pairs = [(name, form.replace(".2f", ".1e" if abs(v) >= 1e5 else ".2f").format(v)) for name, form, v in known]
-    latency = summary["latency_ms"]
-    if latency["p50"] is not None:
-        shown = ", ".join(f"{name} {latency[name]:.1f}" for name in ("p50", "p95", "p99", "max"))
-        pairs.append(("latency", f"{shown} ms"))
-    if summary["deadlines_missed"]:
-        pairs.append(("deadlines missed", str(summary["deadlines_missed"])))
-    pairs += [(f"refused: {reason}", str(count)) for reason, count in summary["reasons"].items()]
-    print_pairs(title, pairs)
-    say(f"written to {out}")

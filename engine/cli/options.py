@@ -13,7 +13,7 @@ SurfaceOption = Annotated[
 ]
 MapSigmaOption = Annotated[
     float | None,
-    typer.Option("--map-sigma-m", metavar="M", help="How well the map lies, per axis; else as the map says."),
+    typer.Option("--map-sigma-m", metavar="M", help="Georeferencing accuracy, per axis; else as the map says."),
 ]
 CameraOption = Annotated[
     Path, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
@@ -61,8 +61,8 @@ DeadlineOption = Annotated[
 SecondsOption = Annotated[
     float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
 ]
-OtherDeviceOption = Annotated[
-    str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless told.")
+OptionalDeviceOption = Annotated[
+    str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless given.")
 ]
 ImageTopicOption = Annotated[
     str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")

@@ -200,7 +200,7 @@ def telemetry_at(
     if not ((times_ns >= start_ns - END_HOLD_NS) & (times_ns <= end_ns + END_HOLD_NS)).any():
         raise TelemetryError(
             f"{log.path}: expected frames taken from {start_ns / 1e9:.3f} to {end_ns / 1e9:.3f} s of the log, got "
-            f"frames from {times_ns[0] / 1e9:.3f} to {times_ns[-1] / 1e9:.3f} s; --log-offset-s moves them"
+            f"frames from {times_ns[0] / 1e9:.3f} to {times_ns[-1] / 1e9:.3f} s; `log_offset_s` moves them"
         )
     columns = {name: _column(log, name, times_ns) for name in (*_COLUMNS, *_POSITION)}
     columns["height_agl_m"], sources = _height(log, times_ns, columns["roll_deg"], columns["pitch_deg"])

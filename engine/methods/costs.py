@@ -1,4 +1,4 @@
-"""What each step costs on this machine, learned from every time that it ran."""
+"""What each step costs on this machine, learned every time that it runs."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass
 
 _MEMORY = 0.93  # weight of a run after the next one: some fourteen runs count
-_SURPRISE = 2.0  # a run counts for at most this factor of what was expected: one interruption is no new price
+_MAX_SURPRISE = 2.0  # a run counts for at most this factor of the expected cost: one interruption changes little
 _SIGMAS = 3.0
 _MIN_MS = 0.05
-_DOUBT = 0.9  # what is left of the deviation each time that a step is refused for its price
-_FORGET = 0.99  # and of the price itself
+_DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for its cost
+_COST_DECAY = 0.99  # of the cost itself
 
 
 @dataclass(slots=True)
-class _Price:
+class _CostModel:
     """Running sums of a line, ms = fixed + rate * work, and of the deviations from it."""
 
     weight: float = 0.0
@@ -31,7 +31,7 @@ class _Price:
         rate = 0.0
         if spread > 1e-3 * mean_work**2:
             rate = (self.work_ms / self.weight - mean_work * mean_ms) / spread
-        elif work > mean_work > 0.0:  # all alike so far: larger work is taken to cost in proportion
+        elif work > mean_work > 0.0:  # only one amount of work was seen: more of it costs in proportion
             rate = mean_ms / mean_work
         rate = min(max(rate, 0.0), mean_ms / mean_work if mean_work > 0.0 else math.inf)
         return mean_ms + rate * (work - mean_work)
@@ -39,7 +39,7 @@ class _Price:
     def learn(self, work: float, ms: float) -> None:
         if self.weight > 0.0:
             expected = self.expected_ms(work)
-            ms = min(ms, _SURPRISE * expected + _MIN_MS)
+            ms = min(ms, _MAX_SURPRISE * expected + _MIN_MS)
             self.square = _MEMORY * self.square + (1.0 - _MEMORY) * (ms - expected) ** 2
         self.weight = _MEMORY * self.weight + 1.0
         self.work = _MEMORY * self.work + work
@@ -49,32 +49,32 @@ class _Price:
 
 
 class Costs:
-    """Prices of steps by name. A step's work is in units of its own, such as pixels."""
+    """Costs of steps by name. A step's work is in units of its own, such as pixels."""
 
     def __init__(self) -> None:
-        self._prices: dict[str, _Price] = {}
+        self._models: dict[str, _CostModel] = {}
 
     def learn(self, step: str, work: float, ms: float) -> None:
         """Note that a step with this much work took so many milliseconds."""
-        self._prices.setdefault(step, _Price()).learn(work, ms)
+        self._models.setdefault(step, _CostModel()).learn(work, ms)
 
-    def doubt(self, step: str, *, price: bool) -> None:
-        """Note that a step was refused for its price: one that never runs is never seen to have become cheap.
+    def note_refusal(self, step: str, *, decay_cost: bool) -> None:
+        """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
 
         Args:
             step: its name.
-            price: whether the price itself fades, so that the step is tried again; else the spread about it alone.
+            decay_cost: whether the cost itself decays, so that the step is tried again; else only its deviation.
         """
-        known = self._prices.get(step)
+        known = self._models.get(step)
         if known is not None:
-            known.square *= _DOUBT**2
-            if price:
-                known.ms *= _FORGET
-                known.work_ms *= _FORGET
+            known.square *= _DEVIATION_DECAY**2
+            if decay_cost:
+                known.ms *= _COST_DECAY
+                known.work_ms *= _COST_DECAY
 
-    def expected_ms(self, step: str, work: float) -> float:
-        """What the step will hardly exceed: its expected time and three deviations; 0 where it never ran."""
-        price = self._prices.get(step)
-        if price is None:
+    def upper_bound_ms(self, step: str, work: float) -> float:
+        """The step's expected time and three deviations; 0 where it never ran."""
+        model = self._models.get(step)
+        if model is None:
             return 0.0
-        return price.expected_ms(work) + _SIGMAS * math.sqrt(price.square)
+        return model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)

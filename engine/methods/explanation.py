@@ -1,4 +1,4 @@
-"""What one frame's match looked like: its surface or its matches, worked out again for reports, not in flight."""
+"""What one frame's match looks like: its correlation surface or its matches, recomputed for reports."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ import torch
 from numpy.typing import NDArray
 
 from engine.align import Patch, rectify, view_of
-from engine.indexes.landmarks import LandmarkMap
-from engine.indexes.prepared import PreparedMap
-from engine.methods import hypothesis, paper, sift
-from engine.methods.hypothesis import Aligned, NccOptions
+from engine.methods.correlation import Aligned, Correlator
+from engine.methods.feature_pose import FeatureMatcher
 from engine.methods.query import Query
-from engine.methods.sift import SiftOptions
 from engine.pose import PoseStats
 from engine.values import Window
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-_MAX_PX = 1 << 21  # of a window that is correlated as a whole; a larger one on a coarser level
+_MAX_WINDOW_PX = 1 << 21  # correlated as a whole; a larger window on a coarser level
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,84 +78,66 @@ class Explanation:
     matches: PointMatches | None = None
 
 
-def by_ncc(query: Query, prepared: PreparedMap, window: Window, options: NccOptions) -> Explanation:
-    """The surface of a window at the frame's own height and heading, see :func:`engine.methods.ncc.find`."""
-    frame, site = query.frame, query.site
-    if frame.height_agl_m is None or frame.heading_deg is None:
+def explain_correlation(correlator: Correlator, window: Window) -> Explanation:
+    """The surface of a window at the frame's own height and heading, see :meth:`engine.methods.ncc.Ncc.find`."""
+    query, site, pose = correlator.query, correlator.query.site, correlator.query.telemetry
+    if pose.height_agl_m is None or pose.grid_heading_deg is None:
         return Explanation(query.gray)
-    level = query.level_of(frame.height_agl_m)
-    while window.area_px >> 2 * level > _MAX_PX and level < site.levels - 1:
+    level = query.level_of(pose.height_agl_m)
+    while window.area_px >> 2 * level > _MAX_WINDOW_PX and level < site.levels - 1:
         level += 1
-    aligned = hypothesis.align(query, frame, level, options)
+    aligned = correlator.align(pose, level)
     if not isinstance(aligned, Aligned):
         return Explanation(query.gray)
-    found = hypothesis.surface(query, prepared, aligned, window, options)
+    found = correlator.surface(aligned, window)
     if found is None:
         return Explanation(query.gray, aligned.patch.gray)
     scores, corner = found[0].cpu().numpy(), found[1]
-    middle = site.full_from_level(_rectangle(corner, aligned.patch.gray).mean(axis=0), level)
-    surface = _surface(scores, middle, 2.0**level)
-    outline = site.full_from_level(_rectangle(corner + surface.peak_px, aligned.patch.gray), level)
+    middle = site.full_from_level(outline_of(corner, aligned.patch.gray).mean(axis=0), level)
+    surface = score_surface(scores, middle, 2.0**level)
+    outline = site.full_from_level(outline_of(corner + surface.peak_px, aligned.patch.gray), level)
     return Explanation(query.gray, aligned.patch.gray, outline, surface)
 
 
-def by_sift(query: Query, landmarks: LandmarkMap, window: Window, options: SiftOptions) -> Explanation:
+def explain_features(matcher: FeatureMatcher, window: Window) -> Explanation:
     """The matches in a window at the frame's own height and heading."""
-    patch = _patch(query)
+    query = matcher.query
+    patch = rectified_frame(query)
     explanation = Explanation(query.gray, None if patch is None else patch.gray)
-    if query.frame.height_agl_m is None:
+    if query.telemetry.height_agl_m is None:
         return explanation
     with torch.inference_mode():
-        frame_px, ground_m, stats = sift.matches_in(query, landmarks, window, options)
+        frame_px, ground_m, stats = matcher.matches_in(window)
     agree = np.zeros(len(frame_px), bool) if stats is None else stats.inliers
     matches = PointMatches(frame_px, query.site.pixel_from_enu(ground_m[:, :2]), agree)
-    outline = None if stats is None else _seen(query, stats, float(np.median(ground_m[agree, 2])))
+    outline = None if stats is None else _footprint(query, stats, float(np.median(ground_m[agree, 2])))
     return replace(explanation, outline_px=outline, matches=matches)
 
 
-def by_paper(query: Query, method: str, window: Window) -> Explanation:
-    """The same of the paper's recipe."""
-    frame, search = query.frame, query.site.gray(window)
-    corner = np.array([window.x0, window.y0], np.float64)
-    if method == "ncc":
-        known = frame.height_agl_m is not None and frame.heading_deg is not None
-        template = paper.template_of(query, window) if known else None
-        if template is None:
-            return Explanation(query.gray)
-        middle = _rectangle(corner, template).mean(axis=0)
-        surface = _surface(paper.surface(template, search), middle, 1.0)
-        return Explanation(query.gray, template, _rectangle(corner + surface.peak_px, template), surface)
-    patch, matched = _patch(query), paper.matches(query.gray, search)
-    explanation = Explanation(query.gray, None if patch is None else patch.gray)
-    if matched is None:
-        return explanation
-    agree = np.zeros(len(matched[0]), bool)  # the recipe tells the pose alone
-    return replace(explanation, matches=PointMatches(matched[0], matched[1] + corner, agree))
-
-
-def _surface(scores: NDArray[np.float32], corner_px: Array, step_px: float) -> ScoreSurface:
+def score_surface(scores: NDArray[np.float32], corner_px: Array, step_px: float) -> ScoreSurface:
+    """The surface of scores (H, W) with its highest place."""
     y, x = np.unravel_index(int(scores.argmax()), scores.shape)
     return ScoreSurface(scores, (int(x), int(y)), corner_px, step_px)
 
 
-def _rectangle(corner_px: Array, patch: Gray) -> Array:
-    """(4, 2) corners of a patch whose top-left pixel lies on ``corner_px``, along its pixels' edges."""
+def outline_of(corner_px: Array, patch: Gray) -> Array:
+    """(4, 2) corners of a patch (h, w) whose top-left pixel is on ``corner_px`` (2,), along its pixels' edges."""
     height, width = patch.shape
     return corner_px - 0.5 + np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
 
 
-def _patch(query: Query) -> Patch | None:
+def rectified_frame(query: Query) -> Patch | None:
     """The frame in the map's pixels by its telemetry, on the level that suits it."""
-    frame = query.frame
-    if frame.attitude is None or frame.height_agl_m is None:
+    pose = query.telemetry
+    if pose.grid_attitude is None or pose.height_agl_m is None:
         return None
-    jacobian = query.jacobian * 2.0 ** query.level_of(frame.height_agl_m)
-    view = view_of(query.camera, frame.attitude, frame.height_agl_m, jacobian)
+    jacobian = query.jacobian * 2.0 ** query.level_of(pose.height_agl_m)
+    view = view_of(query.camera, pose.grid_attitude, pose.height_agl_m, jacobian)
     return None if view is None else rectify(query.gray, query.camera, view)
 
 
-def _seen(query: Query, stats: PoseStats, ground_m: float) -> Array | None:
-    """(4, 2) where the frame's corners look at a level ground, in map pixels; None where one sees the horizon."""
+def _footprint(query: Query, stats: PoseStats, ground_m: float) -> Array | None:
+    """(4, 2) where the frame's corners see a level ground, in map pixels; None where one sees the horizon."""
     rays = query.camera.frame_rays[:4] @ stats.rotation
     if (rays[:, 2] >= 0.0).any():
         return None

@@ -1,16 +1,17 @@
-"""The NCC method (Fig. 5): grey, rectify by height and heading, enhance, correlate in the window, peak."""
+"""The NCC method (Fig. 5): grey, rectify by height and heading, enhance, correlate in the window, peak, refine."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Never
 
 import torch
 
-from engine.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
+from engine.confidence import PeakFeatures, peak_features, prior_agreement, probability
 from engine.indexes.prepared import PreparedMap
+from engine.indexes.samples import SampleMap
 from engine.integrity import (
-    PeakRule,
-    judge_confidence,
     judge_peak,
     misalignment_covariance_px2,
     ncc_covariance_m2,
@@ -18,149 +19,245 @@ from engine.integrity import (
     score_sigma,
 )
 from engine.methods import hypothesis_search
-from engine.methods.hypothesis import METHOD, Aligned, NccOptions, align, nadir_px, search, window_about
+from engine.methods.correlation import METHOD, Aligned, Correlator
+from engine.methods.explanation import Explanation, explain_correlation
+from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
-from engine.values import Attitude, Fix, NoFix, Peak, Reason, Window
+from engine.methods.refinement import Refinement
+from engine.orthomap import OrthoMap
+from engine.values import Attitude, Fix, NoFix, Peak, Reason, Result, Window
+from engine.window import SPREAD_SIGMAS
 
-WIDE_PX = 8 << 20
+MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
+_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
+_MIN_SIDE_PX = 24  # of what is correlated there
 
 
 @dataclass(frozen=True, slots=True)
 class PeakCandidate:
-    """A peak that is not judged yet.
+    """A peak that is not accepted yet.
 
     Attributes:
         peak: in pixels of the aligned level.
         aligned: the hypothesis that it belongs to.
-        fix: what the peak means, if it is believed.
-        trusted: neither heading nor height was searched for.
-        expected: how its place lies to the prior; None where there is none, or one that says next to nothing.
-        evidence: what speaks for it; None where more was searched than a window at one heading and height.
+        fix: what the peak means, if it is accepted; with its confidence where there are features.
+        features: of the confidence model; None where more was searched than a window at one heading and height.
+        searched: heading or height were searched for.
     """
 
     peak: Peak
     aligned: Aligned
     fix: Fix
-    trusted: bool
-    expected: PriorAgreement | None
-    evidence: PeakFeatures | None
+    features: PeakFeatures | None
+    searched: bool
 
 
-def find(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> PeakCandidate | NoFix:
-    """The highest peak of one frame with its evidence, or a refusal where there is none. As :func:`locate`."""
-    frame = query.frame
-    if frame.height_agl_m is None:
-        return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
-    if frame.heading_deg is None and options.heading_search_deg < 180.0:
-        return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
-    flat = query.refuse_flat(METHOD, options.rule.min_deviation)
-    if flat is not None:
-        return flat
-    level = min(query.level_of(frame.height_agl_m) + coarser, query.site.levels - 1)
-    with query.watch.stage("align"):
-        first = frame if frame.heading_deg is not None else replace(frame, heading_deg=0.0)
-        aligned = align(query, first, level, options)
-    if isinstance(aligned, NoFix):
-        return aligned
-    window = window_about(query, aligned, options)
-    if window is None:
-        return query.refuse_outside(METHOD)
-    trusted = hypothesis_search.is_trusted(frame, options)
-    wide = query.site.is_large and window.area_px >> 2 * aligned.level > WIDE_PX
-    if wide and hypothesis_search.coarse_px(query, aligned, window, options) > WIDE_PX:
-        detail = f"a window of {window.width_px} x {window.height_px} px is not searched; a better prior is needed"
-        return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
-    if trusted and query.prior is not None and not wide:
-        peak = search(query, prepared, aligned, window, options)
-    else:
-        peak, aligned = hypothesis_search.search(query, prepared, aligned, window, options)
-    if peak is None:
-        detail = "the map does not cover the frame anywhere in the window"
-        return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
-    if query.watch.deadline.remaining_ms < 0:
-        return query.refuse(Reason.LATE, "the budget was spent before the peak was known", METHOD, window=window)
-    fix = _fix(query, aligned, peak, window, options, trusted=trusted)
-    expected = None if wide else _expected(query, fix)
-    evidence = None
-    if trusted and expected is not None:
-        sigma = score_sigma(aligned.template.numel())
-        evidence = peak_features(peak, sigma, expected)
-        if probability(evidence) < options.rule.sure:
-            peak = _against_turned(query, prepared, aligned, window, peak, options)
-            evidence = peak_features(peak, sigma, expected)
-    return PeakCandidate(peak, aligned, fix, trusted, expected, evidence)
-
-
-def _against_turned(
-    query: Query, prepared: PreparedMap, aligned: Aligned, window: Window, peak: Peak, options: NccOptions
-) -> Peak:
-    """The peak with the best of the same patch upside down among its rivals.
-
-    Upside down the patch is of no place at all, so its best score is what this window gives to chance. Where the
-    compass is wrong by half a turn, it is the true place.
-    """
-    upside_down = replace(aligned, template=torch.flip(aligned.template, (0, 1)))
-    rival = search(query, prepared, upside_down, window, options)
-    return peak if rival is None else replace(peak, second_score=max(peak.second_score, rival.score))
-
-
-def locate(query: Query, prepared: PreparedMap, options: NccOptions, *, coarser: int = 0) -> Fix | NoFix:
-    """One frame to a fix by correlation; needs its height, and its heading or the time to search for it.
+class Ncc:
+    """Normalised cross-correlation; needs height and heading, or the time to search for the heading.
 
     Args:
-        query: the frame.
-        prepared: the map.
-        options: settings.
-        coarser: levels above the one whose pixels are like the frame's, for an answer that is quicker and cruder.
+        site: the map.
+        device: where tensors live.
+        options: settings; ``options.ncc`` counts.
     """
-    found = find(query, prepared, options, coarser=coarser)
-    return found if isinstance(found, NoFix) else judge(query, found, options.rule)
 
+    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
+        self.options = options.ncc
+        self.prepared = PreparedMap(site, device, self.options.enhance_radius_px, self.options.score)
+        self.samples = SampleMap(site, self.prepared)
 
-def judge(query: Query, found: PeakCandidate, rule: PeakRule) -> Fix | NoFix:
-    """The fix with its probability of being right where its peak is believed, else a refusal."""
-    evidence, pixels = found.evidence, found.aligned.template.numel()
-    # A place that contradicts the prior is vouched for by the match alone, as on a search of the whole map.
-    unexpected = found.expected is None or found.expected.prior_chi_square > rule.max_prior_chi_square
-    refusal = judge_peak(found.peak, pixels, rule, whole_map=unexpected, searched=not found.trusted)
-    if refusal is None and evidence is not None:
-        refusal = judge_confidence(evidence, rule.min_confidence)
-    if refusal is not None:
-        return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
-    return found.fix if evidence is None else replace(found.fix, confidence=probability(evidence))
+    @property
+    def parts(self) -> Mapping[str, Never]:
+        """None: it is one method."""
+        return {}
 
+    @property
+    def cache_counters(self) -> dict[str, int]:
+        """How many entries of each cache were created so far."""
+        return {"map regions": self.prepared.created, "sampled cells": self.samples.created}
 
-def _expected(query: Query, fix: Fix) -> PriorAgreement | None:
-    if query.prior is None or query.prior_px is None:
-        return None
-    return prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+    def prepare(self) -> None:
+        """Nothing: regions of the map are prepared as they are first searched."""
 
+    def warmup(self, query: Query) -> None:
+        """Run every variant of every step, so that it is compiled and its cost known."""
+        if query.prior is None:
+            self.locate(query)
+            return
+        for coarser in self._expected_window_px(query):
+            self.refine(query, self.correlate(query, coarser))
 
-def _fix(query: Query, aligned: Aligned, peak: Peak, window: Window, options: NccOptions, *, trusted: bool) -> Fix:
-    """The camera's nadir and its covariance; the heading too where it was not ``trusted`` but searched for."""
-    site, frame = query.site, aligned.frame
-    nadir = nadir_px(query, peak, aligned)
-    east, north = site.enu_from_pixel(nadir)
-    lat, lon = site.geodetic_from_pixel(nadir)
-    assert frame.height_agl_m is not None  # asked for before
-    rows, columns = aligned.template.shape
-    peak_px2 = peak_covariance_px(peak, rows * columns)
-    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), frame.height_agl_m, options.errors)
-    covariance = ncc_covariance_m2(peak_px2, frame, query.camera, aligned.jacobian, options.errors)
-    attitude = Attitude(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)
-    return Fix(
-        timestamp_ns=frame.timestamp_ns,
-        lat_deg=float(lat),
-        lon_deg=float(lon),
-        east_m=float(east),
-        north_m=float(north),
-        up_m=None,
-        covariance_m2=covariance,
-        attitude=None if trusted else attitude,
-        score=peak.score,
-        method=METHOD,
-        window=window,
-        timings=query.watch.timings,
-        map_xy_px=(float(nadir[0]), float(nadir[1])),
-    )
+    def locate(self, query: Query) -> Result:
+        """A fix on the finest level of the map that there is time for, refined where there is time for that."""
+        return self.refine(query, self.correlate(query))
+
+    def correlate(self, query: Query, coarser: int | None = None) -> Result:
+        """A fix by correlation alone.
+
+        Args:
+            query: the frame.
+            coarser: levels above the one whose pixels are like the frame's; None takes the finest that there is
+                time for.
+        """
+        if query.telemetry.height_agl_m is None:
+            return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
+        if query.prior is None or not self._trusts(query):
+            step = "ncc search" if query.prior is None else "ncc hypotheses"
+            works = {0: float(query.site.width_px * query.site.height_px)}
+        else:
+            step, works = "ncc", self._expected_window_px(query)
+        if coarser is None:
+            coarser = query.scheduler.first_affordable(step, works)
+        if coarser is None:
+            return query.refuse_late(METHOD, step)
+        with query.scheduler.costed(step, works[coarser]):
+            found = self.find(query, coarser=coarser)
+            result = found if isinstance(found, NoFix) else self.judge(query, found)
+        return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
+
+    def refine(self, query: Query, result: Result) -> Result:
+        """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
+        if not isinstance(result, Fix) or result.stage != "fine" or not self.options.refine:
+            return result
+        # A height that was searched for is not the frame's, and an unknown slope would be taken for a tilt.
+        if not self._trusts(query) or not query.site.has_surface:
+            return result
+        work_px = float(query.gray.size)
+        if not query.scheduler.can_afford("refinement", work_px):
+            query.scheduler.note_refusal("refinement", decay_cost=False)
+            return result
+        with query.scheduler.costed("refinement", work_px):
+            return Refinement(query, self.samples, self.options).refine(result)
+
+    def explain(self, query: Query, window: Window) -> Explanation:
+        """The correlation surface of a window at the frame's own height and heading."""
+        return explain_correlation(Correlator(query, self.prepared, self.options), window)
+
+    def find(self, query: Query, *, coarser: int = 0) -> PeakCandidate | NoFix:
+        """The highest peak of one frame, or a refusal where there is none; see :meth:`correlate`."""
+        refusal = self._refuse_unusable(query)
+        if refusal is not None:
+            return refusal
+        correlator = Correlator(query, self.prepared, self.options)
+        aligned = self._align(correlator, coarser)
+        if isinstance(aligned, NoFix):
+            return aligned
+        window = correlator.window(aligned)
+        if window is None:
+            return query.refuse_outside(METHOD)
+        wide = query.site.is_large and window.area_px >> 2 * aligned.level > MAX_WINDOW_PX
+        if wide and hypothesis_search.coarse_px(correlator, aligned, window) > MAX_WINDOW_PX:
+            size = f"{window.width_px} x {window.height_px} px"
+            detail = f"a window of {size} is not searched; a better prior is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
+        searched = not self._trusts(query)
+        if searched or wide or query.prior is None:
+            peak, aligned = hypothesis_search.search(correlator, aligned, window)
+        else:
+            peak = correlator.search(aligned, window)
+        if peak is None:
+            detail = "the map does not cover the frame anywhere in the window"
+            return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
+        if query.scheduler.deadline.remaining_ms < 0:
+            detail = "the budget was spent before the peak was known"
+            return query.refuse(Reason.LATE, detail, METHOD, window=window)
+        fix = self._fix(correlator, aligned, peak, window, searched=searched)
+        found = PeakCandidate(peak, aligned, fix, None, searched)
+        no_features = searched or wide or query.prior is None
+        return found if no_features else self._with_confidence(correlator, found)
+
+    def judge(self, query: Query, found: PeakCandidate) -> Result:
+        """The fix where its peak is accepted, else a refusal."""
+        pixels, fix = found.aligned.template.numel(), found.fix
+        rule, confidence = self.options.rule, fix.confidence
+        refusal = judge_peak(found.peak, pixels, found.features, confidence, rule, searched=found.searched)
+        if refusal is not None:
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
+        return fix
+
+    def _trusts(self, query: Query) -> bool:
+        return self.options.trusts(query.telemetry.grid_heading_deg)
+
+    def _refuse_unusable(self, query: Query) -> NoFix | None:
+        """A refusal of a frame that lacks what the method needs."""
+        pose = query.telemetry
+        if pose.height_agl_m is None:
+            return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
+        if pose.grid_heading_deg is None and self.options.heading_search_deg < 180.0:
+            return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
+        return query.refuse_flat(METHOD, self.options.rule.min_deviation)
+
+    def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
+        """The frame by its own height and heading, or by any heading where it came without one."""
+        query, pose = correlator.query, correlator.query.telemetry
+        assert pose.height_agl_m is not None  # or it was refused
+        level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
+        known = pose if pose.grid_heading_deg is not None else replace(pose, grid_heading_deg=0.0)
+        with query.scheduler.stage("align"):
+            return correlator.align(known, level)
+
+    def _with_confidence(self, correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
+        """The candidate with its probability; one that is not high must also beat the null hypothesis."""
+        query, peak = correlator.query, found.peak
+        assert query.prior is not None
+        assert query.prior_px is not None
+        sigma = score_sigma(found.aligned.template.numel())
+        agreement = prior_agreement(found.fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+        features = peak_features(peak, sigma, agreement)
+        confidence = probability(features)
+        if confidence < self.options.rule.null_test_below:
+            null_score = self._null_score(correlator, found.aligned, found.fix.window)
+            peak = replace(peak, second_score=max(peak.second_score, null_score))
+            features = peak_features(peak, sigma, agreement)
+            confidence = probability(features)
+        return replace(found, peak=peak, features=features, fix=replace(found.fix, confidence=confidence))
+
+    def _null_score(self, correlator: Correlator, aligned: Aligned, window: Window) -> float:
+        """The best score of the null-hypothesis template: the frame's own, upside down.
+
+        It shows no place on Earth, so its best score is what this window gives to chance. Where the compass is
+        wrong by half a turn, it is the true place.
+        """
+        upside_down = replace(aligned, template=torch.flip(aligned.template, (0, 1)))
+        rival = correlator.search(upside_down, window)
+        return -1.0 if rival is None else rival.score
+
+    def _fix(self, correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
+        """The camera's nadir and its covariance; the heading too where it was searched for."""
+        query, pose, errors = correlator.query, aligned.pose, self.options.errors
+        height_m = pose.height_agl_m
+        assert height_m is not None  # asked for before
+        rows, columns = aligned.template.shape
+        peak_px2 = peak_covariance_px(peak, rows * columns)
+        peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)
+        covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
+        attitude = Attitude(pose.roll_deg or 0.0, pose.pitch_deg or 0.0, pose.grid_heading_deg or 0.0)
+        return query.fix(
+            METHOD,
+            correlator.nadir_px(peak, aligned),
+            covariance,
+            score=peak.score,
+            window=window,
+            grid_attitude=attitude if searched else None,
+        )
+
+    def _expected_window_px(self, query: Query) -> dict[int, float]:
+        """Pixels of the window, to which the cost is proportional, by how much coarser a level that serves is."""
+        site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
+        assert height_m is not None  # asked for before
+        assert query.prior is not None
+        own, options = query.level_of(height_m), self.options
+        out = {}
+        for coarser in _COARSER:
+            gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
+            per_px = height_m / (camera.focal_px * gsd_m)
+            side_px = options.fraction * min(camera.width_px, camera.height_px) * per_px
+            if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
+                slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
+                width, height = (
+                    options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px)
+                )
+                rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
+                out[coarser] = min(width, columns) * min(height, rows)
+        return out

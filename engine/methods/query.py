@@ -1,11 +1,7 @@
-"""What every method is given: one frame, what is known of its place, the map, and a running clock."""
+"""What every method is given: one frame, what is known of its position, the map, and the frame's clock."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -14,59 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.budget import Deadline
 from engine.camera import Camera
-from engine.device import synchronise
-from engine.methods.costs import Costs
+from engine.geo import wrap_heading_deg
+from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
-from engine.values import Attitude, Frame, NoFix, Prior, Reason, Timings, Window
-from engine.window import SPREAD_SIGMAS, place_window, window_size_px
+from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, Window
+from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
-
-
-class Stopwatch:
-    """Milliseconds by stage, against a deadline, and what is known of the price of a rung.
-
-    Args:
-        deadline: runs already.
-        device: work on it is waited for when a stage ends.
-        costs: prices of the rungs, refreshed by each.
-    """
-
-    def __init__(self, deadline: Deadline, device: torch.device, costs: Costs | None = None) -> None:
-        self.deadline = deadline
-        self._device = device
-        self._costs = costs or Costs()
-        self._stages_ms: dict[str, float] = {}
-
-    def affords(self, rung: str, work: float) -> bool:
-        """Whether the time that is left will do for a rung of this much work; True for one that never ran."""
-        return self._costs.expected_ms(rung, work) <= self.deadline.remaining_ms
-
-    def give_up(self, rung: str, *, price: bool) -> None:
-        """Note that not even the least of a rung was affordable, see :meth:`engine.methods.costs.Costs.doubt`."""
-        self._costs.doubt(rung, price=price)
-
-    @contextmanager
-    def rung(self, name: str, work: float) -> Iterator[None]:
-        """Note what a rung of this much work costs."""
-        start_ms = self.deadline.elapsed_ms
-        yield
-        self._costs.learn(name, work, self.deadline.elapsed_ms - start_ms)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time one stage; stages of one name add up."""
-        start_ms = self.deadline.elapsed_ms
-        yield
-        synchronise(self._device)
-        self._stages_ms[name] = self._stages_ms.get(name, 0.0) + self.deadline.elapsed_ms - start_ms
-
-    @property
-    def timings(self) -> Timings:
-        """What was measured so far."""
-        return Timings(dict(self._stages_ms))
 
 
 @dataclass(frozen=True)
@@ -74,13 +25,13 @@ class Query:
     """One frame on its way to a fix.
 
     Attributes:
-        frame: as it came, but for its heading, which counts from the north of the map's plane.
+        frame: as it came.
         gray: (H, W) its undistorted grey picture.
         camera: the pinhole that the undistorted picture obeys.
         site: the map.
         prior: where the vehicle should be, or None: anywhere on the map.
         device: where tensors live.
-        watch: the running clock.
+        scheduler: the frame's clock.
     """
 
     frame: Frame
@@ -89,7 +40,7 @@ class Query:
     site: OrthoMap
     prior: Prior | None
     device: torch.device
-    watch: Stopwatch = field(repr=False)
+    scheduler: Scheduler = field(repr=False)
 
     @cached_property
     def prior_px(self) -> Array | None:
@@ -104,15 +55,17 @@ class Query:
             assert prior.lon_deg is not None
             return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
 
-    def with_frame(self, frame: Frame) -> Query:
-        """The same asked of another frame; what is known of the prior by now stays."""
-        other = copy(self)
-        object.__setattr__(other, "frame", frame)
-        return other
+    @cached_property
+    def telemetry(self) -> GridPose:
+        """Height and attitude that the frame came with, the heading turned to grid north at the prior's position.
 
-    def level_of(self, height_m: float) -> int:
-        """The pyramid level whose pixels are like the frame's, taken from this high above the ground."""
-        return level_for(self.site.gsd_m_per_px, height_m / self.camera.focal_px, self.site.levels)
+        Without a position that is the middle of the map, where grid north is true north.
+        """
+        frame, heading_deg = self.frame, self.frame.heading_deg
+        if heading_deg is not None and self.prior_px is not None and np.isfinite(self.prior_px).all():
+            lat, lon = self.site.geodetic_from_pixel(self.prior_px)
+            heading_deg = wrap_heading_deg(heading_deg + self.site.frame.convergence_deg(float(lat), float(lon)))
+        return GridPose(frame.height_agl_m, heading_deg, frame.roll_deg, frame.pitch_deg)
 
     @cached_property
     def jacobian(self) -> Array:
@@ -122,20 +75,24 @@ class Query:
             place = np.array([self.site.width_px - 1, self.site.height_px - 1]) / 2.0
         return self.site.enu_jacobian(place)
 
+    def level_of(self, height_m: float) -> int:
+        """The pyramid level whose pixels are like the frame's, taken from this high above the ground."""
+        return level_for(self.site.gsd_m_per_px, height_m / self.camera.focal_px, self.site.levels)
+
     def window(
         self,
         center_px: Array,
         footprint_px: tuple[float, float],
-        least_px: tuple[float, float],
+        min_px: tuple[float, float],
         *,
         margin: float,
     ) -> Window | None:
         """The adaptive window in map pixels (eq. 4, 5), or None where it lies outside the map.
 
         Args:
-            center_px: where the middle of the footprint should lie.
+            center_px: (2,) where the middle of the footprint should lie.
             footprint_px: extent of the whole frame on the map.
-            least_px: extent of what will be matched. The window holds it at every place within
+            min_px: extent of what will be matched. The window holds it at every position within
                 :data:`engine.window.SPREAD_SIGMAS` of the prior, also where equations 4 and 5 would be smaller.
             margin: the paper's 1.3.
         """
@@ -146,9 +103,60 @@ class Query:
         moved_px = np.abs(np.linalg.solve(self.jacobian, moved_m))
         size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
         slack = 2.0 * SPREAD_SIGMAS * prior.sigma_m / self.site.gsd_m_per_px
-        width, height = (max(a, b + slack) for a, b in zip(size, least_px, strict=True))
+        width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
         shape = (self.site.width_px, self.site.height_px)
         return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
+
+    # --------------------------------------------------------------------------------------------- answers
+
+    def fix(
+        self,
+        method: str,
+        nadir_px: Array,
+        covariance_m2: Array,
+        *,
+        score: float,
+        window: Window,
+        east_north_m: Array | None = None,
+        up_m: float | None = None,
+        grid_attitude: Attitude | None = None,
+    ) -> Fix:
+        """A fix of this frame; its heading counts from true north there.
+
+        Args:
+            method: "ncc" or "sift".
+            nadir_px: (2,) the camera's nadir in map pixels.
+            covariance_m2: (3, 3) east, north, up.
+            score: of the match.
+            window: that was searched.
+            east_north_m: (2,) the same place as ``nadir_px`` where it is known in metres; None computes it.
+            up_m: height of the camera, or None where it is not measured.
+            grid_attitude: as measured, the heading from grid north; None where it is not measured.
+        """
+        east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
+        lat, lon = (float(v) for v in self.site.geodetic_from_pixel(nadir_px))
+        return Fix(
+            timestamp_ns=self.frame.timestamp_ns,
+            lat_deg=lat,
+            lon_deg=lon,
+            east_m=float(east),
+            north_m=float(north),
+            up_m=up_m,
+            covariance_m2=covariance_m2,
+            attitude=self._true_attitude(grid_attitude, lat, lon),
+            score=score,
+            method=method,
+            window=window,
+            timings=self.scheduler.timings,
+            map_xy_px=(float(nadir_px[0]), float(nadir_px[1])),
+        )
+
+    def _true_attitude(self, grid_attitude: Attitude | None, lat_deg: float, lon_deg: float) -> Attitude | None:
+        if grid_attitude is None:
+            return None
+        turn_deg = self.site.frame.convergence_deg(lat_deg, lon_deg)
+        heading_deg = wrap_heading_deg(grid_attitude.heading_deg - turn_deg)
+        return Attitude(grid_attitude.roll_deg, grid_attitude.pitch_deg, heading_deg)
 
     def refuse(
         self,
@@ -167,7 +175,7 @@ class Query:
             method=method,
             score=score,
             window=window,
-            timings=self.watch.timings,
+            timings=self.scheduler.timings,
         )
 
     def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
@@ -187,26 +195,9 @@ class Query:
         """The refusal of a frame whose window has nothing in common with the map."""
         return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
 
-
-def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) -> Window:
-    """The part of one pyramid level that a window in map pixels covers.
-
-    Args:
-        site: the map.
-        window: in full-resolution pixels, inside the map.
-        level: of the pyramid.
-        step_px: width and height are rounded up to a multiple of this where the level is large enough, so that
-            a flight meets few different sizes and nothing is planned anew in flight.
-    """
-    rows, columns = site.level_shape(level)
-    spans = []
-    for start, size, limit in ((window.x0, window.width_px, columns), (window.y0, window.height_px, rows)):
-        low, high = start >> level, min(limit, max((start + size) >> level, (start >> level) + 1))
-        length = min(limit, -(-(high - low) // step_px) * step_px)
-        spans.append((min(low, limit - length), length))
-    return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
-
-
-def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int) -> int:
-    """The pyramid level whose pixels are nearest to the wanted size without being much coarser."""
-    return int(np.clip(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + 0.25), 0, levels - 1))
+    def refuse_late(self, method: str, step: str, *, decay_cost: bool = True) -> NoFix:
+        """The refusal of a frame for whose quickest variant of a step there is no time, see :class:`Scheduler`."""
+        self.scheduler.note_refusal(step, decay_cost=decay_cost)
+        left_ms = self.scheduler.deadline.remaining_ms
+        detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
+        return self.refuse(Reason.LATE, detail, method)

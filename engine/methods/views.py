@@ -1,4 +1,4 @@
-"""Where on the map features are looked for: the adaptive window, on each pyramid level that the height allows."""
+"""Where on the map features are searched: the adaptive window, on each pyramid level that the height allows."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ from numpy.typing import NDArray
 from engine.align import view_of
 from engine.geo import enu_from_body
 from engine.indexes.landmarks import PREPARED_PX
-from engine.methods.query import Query, level_crop, level_for
+from engine.methods.query import Query
 from engine.values import Attitude, NoFix, Window
+from engine.window import level_crop, level_for
 
-MIN_HEIGHT_M = 1.0
-"""The lowest height that is looked for where the height is unknown."""
 _CROP_STEP_PX = 32
 _LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryHypothesis:
-    """What of the telemetry is believed in one look at a frame.
+    """What is assumed of the telemetry in one attempt at a frame.
 
     Attributes:
-        heights_m: the lowest and the highest that is looked for; equal where the height is known.
-        turn_deg: direction of the map's x axis in the frame, from +x towards +y; None where unknown.
+        heights_m: the lowest and the highest that is searched; equal where the height is known.
+        x_axis_deg: direction of the map's x axis in the frame, from +x towards +y; None where unknown.
     """
 
     heights_m: tuple[float, float]
-    turn_deg: float | None
+    x_axis_deg: float | None
 
     @property
     def height_m(self) -> float | None:
@@ -60,9 +59,9 @@ class MapView:
         return np.array([self.crop.x0, self.crop.y0], np.float64)
 
 
-def turn_deg(query: Query) -> float | None:
+def x_axis_deg(query: Query) -> float | None:
     """Direction of the map's x axis in the middle of the frame, by the telemetry; None without a heading."""
-    attitude = query.frame.attitude
+    attitude = query.telemetry.grid_attitude
     if attitude is None:
         return None
     enu_from_camera = (
@@ -73,24 +72,24 @@ def turn_deg(query: Query) -> float | None:
 
 
 def views_of(
-    query: Query, belief: TelemetryHypothesis, method: str, *, margin: float, scale: float
+    query: Query, hypothesis: TelemetryHypothesis, method: str, *, margin: float, scale: float
 ) -> list[MapView] | NoFix:
-    """The windows to look at, one a level; a level that is too large to be searched gives way to a coarser one.
+    """The windows to search, one a level; a level that is too large to be searched gives way to a coarser one.
 
     Args:
         query: the frame and its prior; without a prior every window is the whole map.
-        belief: the heights decide on the levels, and on each the highest that it serves on the size of the window.
+        hypothesis: its heights determine the levels; the largest that a level serves, the window on it.
         method: what a refusal names.
         margin: the 1.3 of equations 4 and 5.
         scale: of the reduced frame.
     """
-    site, heights_m = query.site, belief.heights_m
+    site, heights_m = query.site, hypothesis.heights_m
     per_height = 1.0 / (query.camera.focal_px * scale * site.gsd_m_per_px)
     first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
     views: dict[int, MapView] = {}
     for level in range(first, last + 1):
         served_m = heights_m[1] if level == last else 2 ** (level + _LEVEL_ENDS) / per_height
-        window = _window(query, served_m, belief.turn_deg is not None, method, margin)
+        window = _window(query, served_m, hypothesis.x_axis_deg is not None, method, margin)
         if isinstance(window, NoFix):
             return window
         view = _view(query, window, level, heights_m[0] * per_height)
@@ -112,17 +111,17 @@ def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
     return MapView(window, level, level_crop(site, window, level, step_px=_CROP_STEP_PX), 2**level / per_px)
 
 
-def _window(query: Query, height_m: float, known_turn: bool, method: str, margin: float) -> Window | NoFix:
+def _window(query: Query, height_m: float, has_heading: bool, method: str, margin: float) -> Window | NoFix:
     """The adaptive window (eq. 4, 5) at a height; the whole map where the position is unknown."""
     nadir = query.prior_px
     if nadir is None:
         return Window(0, 0, query.site.width_px, query.site.height_px)
-    attitude = query.frame.attitude or Attitude(0.0, 0.0, 0.0)
+    attitude = query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0)
     view = view_of(query.camera, attitude, height_m, query.jacobian)
     if view is None:
         return query.refuse_tilted(attitude, method)
     width, height = view.footprint_px
-    if not known_turn:  # at any heading the footprint fits the square of its diagonal
+    if not has_heading:  # at any heading the footprint fits the square of its diagonal
         width = height = math.hypot(width, height)
     window = query.window(nadir + view.center_px, (width, height), (width, height), margin=margin)
     return window or query.refuse_outside(method)

@@ -17,10 +17,10 @@ from engine.formats.notes import FrameNote
 from engine.formats.track import TrackRow
 from engine.matcher import SceneMatcher
 from engine.methods.explanation import Explanation, PointMatches, ScoreSurface
-from engine.methods.query import level_crop
 from engine.orthomap import OrthoMap
 from engine.report.metrics import WRONG_M, TrackErrors
 from engine.values import Frame, Window
+from engine.window import level_crop
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

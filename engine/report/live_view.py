@@ -256,7 +256,7 @@ def open_live_view(matcher: SceneMatcher, recording: Path | None, address: str |
         files = [] if recording is None else [rr.FileSink(str(recording))]
         stream.set_sinks(*sinks, *files, default_blueprint=blueprint(matcher.site))
     except RuntimeError as error:
-        raise BackendError(f"--rerun: {recording} cannot be written: {error}") from None
+        raise BackendError(f"recording: {recording} cannot be written: {error}") from None
     return LiveView(stream, matcher)
 
 

@@ -8,13 +8,13 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.methods.query import level_crop
 from engine.orthomap import OrthoMap
 from engine.report.charts import crosses, dots, line, ticks
 from engine.report.explain import jpeg_data_uri
 from engine.report.metrics import WRONG_M
 from engine.report.plot_data import TrackPlotData
 from engine.values import Window
+from engine.window import level_crop
 
 Array = NDArray[np.float64]
 

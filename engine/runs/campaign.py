@@ -1,4 +1,4 @@
-"""`campaign`: many flights by several methods, a fresh process a run, resumable, told in one table."""
+"""Campaigns: many flights by several methods, a fresh process a run, resumable, summarised in one table."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from contextlib import AbstractContextManager
 from importlib.metadata import version
 from pathlib import Path
 
-from engine.cli import console
-from engine.cli.arguments import check_folder
 from engine.errors import OptionError
 from engine.report.campaign import TABLE, TABLE_HEAD, CampaignRow, write_tables
-from engine.runs.campaign_plan import RUNS, WORKSHOP, CampaignPlan, plan_campaign
+from engine.runs.campaign_plan import RUNS, UNFINISHED, CampaignPlan, plan_campaign
 from engine.runs.executors import Execute, in_processes, on_ray
-from engine.runs.jobs import Job, do, read_result
+from engine.runs.folders import StrPath, check_folder
+from engine.runs.jobs import Job, read_result, run_job
+from engine.runs.progress import SILENT, Progress
 
 MARKER = "scenematch-campaign.txt"
 """Says of a folder, from its begin on, that a campaign works in it: what is unfinished there may be removed."""
@@ -23,7 +23,13 @@ _SHOWN = 5  # names in a message
 
 
 def run_campaign(
-    path: Path, out: Path, *, workers: int | None = None, ray: str | None = None, force: bool = False
+    path: StrPath,
+    out: StrPath,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    force: bool = False,
+    progress: Progress = SILENT,
 ) -> list[CampaignRow]:
     """Do what is left of a campaign, and write its tables.
 
@@ -33,6 +39,7 @@ def run_campaign(
         workers: jobs at a time on this machine; None is one a core.
         ray: address of a Ray cluster to work on, "local" for one of this machine.
         force: whether runs whose inputs have changed are done again, in place of the old ones.
+        progress: is shown what the campaign does.
 
     Returns:
         The lines of the table: each run with its figures, or with why it failed.
@@ -40,34 +47,36 @@ def run_campaign(
     Raises:
         OptionError: the file or the folder is none for a campaign, or inputs have changed.
         TelemetryError: what a finished run left is damaged.
-        BackendError: there is no Ray, or no cluster.
+        MissingExtraError, BackendError: there is no Ray, or no cluster.
     """
-    plan = plan_campaign(path, out.resolve())
-    left = _left(plan, force)
+    out = Path(out)
+    plan = plan_campaign(Path(path), out.resolve())
+    left = _left(plan, force, progress)
     _prepare(out, list(left.values()), force)
     failures: dict[str, str] = {}
     done = sum(job.name not in left for job in plan.runs)
-    console.say(f"{len(plan.runs)} runs, {done} of them finished before")
+    progress.message(f"{len(plan.runs)} runs, {done} of them finished before")
     runs = [job for job in plan.runs if job.name in left]
     needed = {_flight_of(job) for job in runs}
     if runs:
         with _executor(workers, ray) as execute:
-            drawn = [job for job in plan.drawn if job.name in left and job.name in needed]
-            failures |= _work(execute, drawn, "flights")
-            failures |= _work(execute, [job for job in runs if _flight_of(job) not in failures], "runs")
+            simulated = [job for job in plan.simulated if job.name in left and job.name in needed]
+            failures |= _execute(execute, simulated, "flights", progress)
+            possible = [job for job in runs if _flight_of(job) not in failures]
+            failures |= _execute(execute, possible, "runs", progress)
     lines = [_line(job, plan.groups, failures) for job in plan.runs]
     write_tables(out, lines)
     return lines
 
 
-def _left(plan: CampaignPlan, force: bool) -> dict[str, Job]:
+def _left(plan: CampaignPlan, force: bool, progress: Progress) -> dict[str, Job]:
     """The jobs that are not finished, by name; those that others were finished in place of are named.
 
     Raises:
         OptionError: there are such, and ``force`` was not given.
     """
     left, changed = {}, []
-    for job in (*plan.drawn, *plan.runs):
+    for job in (*plan.simulated, *plan.runs):
         result = read_result(job)
         if result is not None and result.inputs == job.inputs:
             continue
@@ -79,29 +88,29 @@ def _left(plan: CampaignPlan, force: bool) -> dict[str, Job]:
         shown = ", ".join(changed[:_SHOWN]) + (f" and {len(changed) - _SHOWN} more" if changed[_SHOWN:] else "")
         if not force:
             raise OptionError(
-                f"--out: finished of other inputs: {shown}; choose another folder, or add --force to do them again"
+                f"out: finished of other inputs: {shown}; choose another folder, or add `force` to do them again"
             )
-        console.say(f"done again, as their inputs have changed: {shown}")
+        progress.message(f"done again, as their inputs have changed: {shown}")
     return left
 
 
 def _prepare(out: Path, left: Sequence[Job], force: bool) -> None:
-    """Make the campaign's folder; of an earlier start what is unfinished leaves it, and what is done again.
+    """Create the campaign's folder; of an earlier start what is unfinished leaves it, and what is done again.
 
     Raises:
         OptionError: the folder is there and is no campaign's, or has somebody's work where ours would be removed.
     """
     if not _is_campaign(out):
         check_folder(out, force)
-        if (out / WORKSHOP).exists():
+        if (out / UNFINISHED).exists():
             raise OptionError(
-                f"--out: expected a folder without {WORKSHOP}/, which is removed here, as {out} is no campaign's "
+                f"out: expected a folder without {UNFINISHED}/, which is removed here, as {out} is no campaign's "
                 "so far; move it away, or choose another folder"
             )
     (out / RUNS).mkdir(parents=True, exist_ok=True)
     (out / MARKER).write_text(f"A campaign of scenematch {version('scenematch')}.\n", encoding="utf-8")
-    shutil.rmtree(out / WORKSHOP, ignore_errors=True)
-    (out / WORKSHOP).mkdir()
+    shutil.rmtree(out / UNFINISHED, ignore_errors=True)
+    (out / UNFINISHED).mkdir()
     for job in left:
         if job.folder.exists():
             shutil.rmtree(job.folder)
@@ -128,12 +137,12 @@ def _flight_of(job: Job) -> str:
     return job.name.partition("/")[0]
 
 
-def _work(execute: Execute, jobs: Sequence[Job], what: str) -> dict[str, str]:
+def _execute(execute: Execute, jobs: Sequence[Job], description: str, progress: Progress) -> dict[str, str]:
     """Do the jobs; those that failed by name, with the reason."""
     failures = {}
-    for job, failure in console.progress(execute(do, jobs), len(jobs), what):
+    for job, failure in progress.track(execute(run_job, jobs), len(jobs), description):
         if failure is not None:
-            console.say(f"{job.name}: {failure}")
+            progress.message(f"{job.name}: {failure}")
             failures[job.name] = failure
     return failures
 

@@ -10,28 +10,30 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from engine.cli.arguments import check_choice
 from engine.errors import OptionError
 from engine.formats.datasets.sequence import MANIFEST
-from engine.formats.logs.readers import AS_LOGGED, LogClock
+from engine.formats.logs.readers import LogClock
 from engine.formats.settings import read_settings
 from engine.maps.rasters import GEOREFERENCE_TAG, stated_sigma
-from engine.runs.comparison import Run, parse_runs
-from engine.runs.jobs import Draw, Follow, Job
+from engine.runs.arguments import check_choice, renamed_in_errors
+from engine.runs.comparison import parse_runs
+from engine.runs.inputs import FOLDER_LAYOUT, FlightFiles
+from engine.runs.jobs import Job, SimulateTask, TrackTask
+from engine.runs.settings import TrackSettings
 from engine.runs.simulation import WorldSettings
-from engine.runs.tracking import FlightFiles, folder_inputs
 from engine.sim import CONDITIONS
 from engine.sim.town import RELIEF_MAX_M
 
-RUNS, FLIGHTS, WORKSHOP = "runs", "flights", "unfinished"
+RUNS, FLIGHTS, UNFINISHED = "runs", "flights", "unfinished"
 """Folders of a campaign's output folder."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedFlight:
-    """The files of a flight that was flown, in the layout of a flight folder unless told.
+    """The files of a recorded flight, in the layout of a flight folder unless named.
 
     Attributes:
         folder: that the others lie in, as seen from the campaign's file.
@@ -44,7 +46,7 @@ class RecordedFlight:
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
         truth: truth.csv or a log.
-        map_sigma_m: how well the map lies, where it does not say so itself.
+        map_sigma_m: georeferencing accuracy of the map per axis; none is what the map states.
         group: flights of one group are pooled in the table; without it those of a published data set are, and any
             other flight is a group of its own.
     """
@@ -63,19 +65,17 @@ class RecordedFlight:
     group: str | None = None
 
     def __post_init__(self) -> None:
-        try:
+        with renamed_in_errors(offset_s="log_offset_s"):
             LogClock(offset_s=self.log_offset_s)
-        except OptionError as error:
-            raise OptionError(f"log_{error}") from None
         stated_sigma(self.map_sigma_m, None, GEOREFERENCE_TAG, "map_sigma_m")
 
-    def inputs(self, name: str, base: Path) -> FlightFiles:
-        """The files as `track` takes them.
+    def files(self, name: str, base: Path) -> FlightFiles:
+        """The files as :func:`engine.runs.tracking.track` takes them.
 
         Raises:
             OptionError: one that is needed or was named is not there.
         """
-        usual, folder = RecordedFlight(), base / self.folder
+        defaults, folder = RecordedFlight(), base / self.folder
 
         def needed(what: str) -> Path:
             path: Path = folder / getattr(self, what)
@@ -85,11 +85,10 @@ class RecordedFlight:
 
         def optional(what: str) -> Path | None:
             file = getattr(self, what)
-            if file is None or (file == getattr(usual, what) and not (folder / file).exists()):
+            if file is None or (file == getattr(defaults, what) and not (folder / file).exists()):
                 return None
             return needed(what)
 
-        stamps = optional("frame_stamps")
         try:
             return FlightFiles(
                 map=needed("map"),
@@ -98,17 +97,13 @@ class RecordedFlight:
                 frames=needed("frames"),
                 telemetry=optional("telemetry"),
                 truth=optional("truth"),
-                clock=LogClock(stamps, self.log_offset_s) if stamps is not None or self.log_offset_s else None,
+                frame_stamps=optional("frame_stamps"),
+                log_offset_s=self.log_offset_s,
                 image_topic=self.image_topic,
                 map_sigma_m=self.map_sigma_m,
             )
         except OptionError as error:
-            raise OptionError(f"flights.{name}: {_as_keys(error)}") from None
-
-
-def _as_keys(error: OptionError) -> str:
-    """A message of the command line's, with its options as the keys of the file."""
-    return re.sub(r"--([a-z-]+)", lambda found: found[1].replace("-", "_"), str(error))
+            raise OptionError(f"flights.{name}: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,9 +142,9 @@ class Campaign:
     """What a campaign's file holds.
 
     Attributes:
-        runs: how each flight is followed, as `compare --run` takes it: METHOD, METHOD/PROFILE or a settings file.
-        flights: those that were flown, by name.
-        simulated: those that were not.
+        runs: how each flight is tracked: METHOD, METHOD/PROFILE or a settings file each.
+        flights: the recorded ones, by name.
+        simulated: the simulated ones.
     """
 
     runs: tuple[str, ...] = ()
@@ -167,12 +162,12 @@ class CampaignPlan:
     """All the jobs of a campaign.
 
     Attributes:
-        drawn: flights to be simulated, before the runs over them.
+        simulated: flights to be simulated, before the runs over them.
         runs: a flight by a method each.
         groups: of each run's flight, what it is pooled with.
     """
 
-    drawn: list[Job]
+    simulated: list[Job]
     runs: list[Job]
     groups: dict[str, str]
 
@@ -185,38 +180,40 @@ def plan_campaign(path: Path, out: Path) -> CampaignPlan:
     """
     campaign = read_settings(path, Campaign)
     try:
-        return _planned(campaign, path.parent, out)
+        return _plan(campaign, path.parent, out)
     except OptionError as error:
         raise OptionError(f"{path}: {error}") from None
 
 
-def _planned(campaign: Campaign, base: Path, out: Path) -> CampaignPlan:
+def _plan(campaign: Campaign, base: Path, out: Path) -> CampaignPlan:
     runs = _runs(campaign, base)
-    drawn, inputs, groups, prints = [], dict[str, FlightFiles](), dict[str, str](), dict[str, dict[str, str]]()
-    for name, scene in _scenes(campaign.simulated):
+    simulated: list[Job] = []
+    files, groups, hashes = dict[str, FlightFiles](), dict[str, str](), dict[str, dict[str, str]]()
+    for name, world in _worlds(campaign.simulated):
         if name in campaign.flights:
             raise OptionError(f"flights.{name}: expected another name, this is a simulated flight's")
-        job = _drawing(name, scene, campaign.simulated.frames, out)
-        drawn.append(job)
-        inputs[name], groups[name], prints[name] = (
-            folder_inputs(job.folder),
-            f"simulated {scene.condition}",
-            job.inputs,
-        )
+        job = _simulate_job(name, world, campaign.simulated.frames, out)
+        simulated.append(job)
+        files[name], groups[name], hashes[name] = _files_to_come(job), f"simulated {world.condition}", job.inputs
     for name, flight in campaign.flights.items():
-        inputs[name], groups[name] = (
-            flight.inputs(name, base),
-            flight.group or _dataset(base / flight.folder) or name,
-        )
-        prints[name] = _fingerprints(inputs[name])
-    if not inputs:
+        files[name] = flight.files(name, base)
+        groups[name] = flight.group or _dataset(base / flight.folder) or name
+        hashes[name] = _input_hashes(files[name])
+    if not files:
         raise OptionError("expected flights, as [flights.NAME] or as seeds in [simulated], got none")
     jobs = []
-    for flight_name, files in inputs.items():
-        for run in runs:
-            name, made_of = f"{flight_name}/{run.name}", prints[flight_name] | _settings_print(run)
-            jobs.append(Job(name, out / RUNS / name, out / WORKSHOP, made_of, Follow(files, run.settings)))
-    return CampaignPlan(drawn, jobs, groups)
+    for flight_name in files:
+        for run_name, settings in runs.items():
+            name, inputs = f"{flight_name}/{run_name}", hashes[flight_name] | _settings_hash(settings)
+            task = TrackTask(files[flight_name], settings)
+            jobs.append(Job(name, out / RUNS / name, out / UNFINISHED, inputs, task))
+    return CampaignPlan(simulated, jobs, groups)
+
+
+def _files_to_come(job: Job) -> FlightFiles:
+    """All the files of a flight folder, which the job is going to write."""
+    paths: dict[str, Any] = {name: job.folder / file for name, file in FOLDER_LAYOUT.items()}
+    return FlightFiles(**paths)
 
 
 def _dataset(folder: Path) -> str | None:
@@ -228,7 +225,7 @@ def _dataset(folder: Path) -> str | None:
     return name if isinstance(name, str) else None
 
 
-def _runs(campaign: Campaign, base: Path) -> list[Run]:
+def _runs(campaign: Campaign, base: Path) -> dict[str, TrackSettings]:
     """The methods; a settings file is looked for beside the campaign's."""
     texts = [str(base / text) if (base / text).is_file() else text for text in campaign.runs]
     if not texts:
@@ -236,52 +233,48 @@ def _runs(campaign: Campaign, base: Path) -> list[Run]:
     try:
         runs = parse_runs(texts)
     except OptionError as error:
-        raise OptionError(f"runs: {str(error).removeprefix('--run: ')}") from None
+        raise OptionError(f"runs: {str(error).removeprefix('runs: ')}") from None
     # Whether there is a GPU differs from machine to machine of a cluster; results must not.
-    return [
-        replace(run, settings=replace(run.settings, device="cpu")) if run.settings.device == "auto" else run
-        for run in runs
-    ]
+    return {
+        name: replace(settings, device="cpu") if settings.device == "auto" else settings
+        for name, settings in runs.items()
+    }
 
 
-def _scenes(simulated: SimulatedFlights) -> Iterator[tuple[str, WorldSettings]]:
+def _worlds(simulated: SimulatedFlights) -> Iterator[tuple[str, WorldSettings]]:
     for condition in simulated.conditions:
         for seed in simulated.seeds:
-            yield (
-                f"town-{seed}-{condition}",
-                WorldSettings(seed=seed, condition=condition, relief_m=simulated.relief_m),
-            )
+            world = WorldSettings(seed=seed, condition=condition, relief_m=simulated.relief_m)
+            yield f"town-{seed}-{condition}", world
 
 
-def _drawing(name: str, scene: WorldSettings, frames: int | None, out: Path) -> Job:
-    made_of = {"simulation": json.dumps(scene.facts() | {"frames": frames}), "engine": version("scenematch")}
-    return Job(name, out / FLIGHTS / name, out / WORKSHOP, made_of, Draw(scene, frames))
+def _simulate_job(name: str, world: WorldSettings, frames: int | None, out: Path) -> Job:
+    inputs = {"simulation": json.dumps(world.facts() | {"frames": frames}), "engine": version("scenematch")}
+    return Job(name, out / FLIGHTS / name, out / UNFINISHED, inputs, SimulateTask(world, frames))
 
 
-def _settings_print(run: Run) -> dict[str, str]:
-    text = json.dumps(asdict(run.settings), sort_keys=True, default=str)
+def _settings_hash(settings: TrackSettings) -> dict[str, str]:
+    text = json.dumps(asdict(settings), sort_keys=True, default=str)
     return {
         "settings": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
         "engine": version("scenematch"),
     }
 
 
-def _fingerprints(inputs: FlightFiles) -> dict[str, str]:
+def _input_hashes(files: FlightFiles) -> dict[str, str]:
     """A hash of the content of each input; no stamp of a file has to be trusted."""
-    files = {name: getattr(inputs, name) for name in ("map", "surface", "camera", "frames", "telemetry", "truth")}
-    clock = inputs.clock or AS_LOGGED
-    files["frame_stamps"] = clock.stamps
-    prints = {name: _fingerprint(path) for name, path in files.items() if path is not None}
-    told = {
-        "log_offset_s": clock.offset_s or None,
-        "image_topic": inputs.image_topic,
-        "map_sigma_m": inputs.map_sigma_m,
+    paths = {name: getattr(files, name) for name in (*FOLDER_LAYOUT, "frame_stamps")}
+    hashes = {name: _content_hash(path) for name, path in paths.items() if path is not None}
+    values = {
+        "log_offset_s": files.log_offset_s or None,
+        "image_topic": files.image_topic,
+        "map_sigma_m": files.map_sigma_m,
     }
-    return prints | {name: repr(value) for name, value in told.items() if value is not None}
+    return hashes | {name: repr(value) for name, value in values.items() if value is not None}
 
 
 @cache
-def _fingerprint(path: Path) -> str:
+def _content_hash(path: Path) -> str:
     """Of a file's bytes, or of all the files in a folder with their names."""
     digest = hashlib.blake2b(digest_size=16)
     if path.is_file():
@@ -290,5 +283,5 @@ def _fingerprint(path: Path) -> str:
                 digest.update(block)
     else:
         for file in sorted(file for file in path.rglob("*") if file.is_file()):
-            digest.update(f"{file.relative_to(path).as_posix()} {_fingerprint(file)}\n".encode())
+            digest.update(f"{file.relative_to(path).as_posix()} {_content_hash(file)}\n".encode())
     return digest.hexdigest()

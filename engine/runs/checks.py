@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 from engine.camera import Camera
-from engine.cli import console
 from engine.errors import CalibrationError, OptionError, TelemetryError
 from engine.formats.flight import Flight
 from engine.formats.frames import PictureFolder
 from engine.orthomap import OrthoMap
+from engine.runs.progress import SILENT, Progress
 from engine.values import Prior
 
 
-def check_pictures(flight: Flight, camera: Camera) -> None:
+def check_pictures(flight: Flight, camera: Camera, progress: Progress = SILENT) -> None:
     """Every picture decodes and is of the camera's size; of a video only the first frame is looked at.
 
     Raises:
@@ -24,7 +24,7 @@ def check_pictures(flight: Flight, camera: Camera) -> None:
     if not isinstance(source, PictureFolder):
         camera.check_size(source.read(flight.names[0]).shape)
         return
-    for name in console.progress(flight.names, len(flight), "checking pictures"):
+    for name in progress.track(flight.names, len(flight), "checking pictures"):
         path = source.path / name
         size = _decoded_size(str(path))
         try:
@@ -65,20 +65,22 @@ def check_needs(flight: Flight, method: str, profile: str) -> None:
         raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}")
 
 
-def check_start(place: Prior | None, site: OrthoMap) -> None:
+def check_start(start: Prior | None, site: OrthoMap) -> None:
     """Refuse a flight without a beginning over a map that is too large to be searched for one.
 
     Raises:
-        OptionError: no place is known.
+        OptionError: no position is known.
     """
-    if place is None and not site.is_searchable:
+    if start is None and not site.is_searchable:
         raise OptionError(
-            f"--start: expected a place to begin at, as LAT,LON or LAT,LON,SIGMA_M: the map of {site.size_km} is "
+            f"start: expected a place to begin at, as LAT,LON or LAT,LON,SIGMA_M: the map of {site.size_km} is "
             "not searched as a whole, and the telemetry has no position"
         )
 
 
-def check_place(name: str, place: Prior | None, site: OrthoMap, error: type[OptionError | TelemetryError]) -> None:
+def check_position(
+    name: str, position: Prior | None, site: OrthoMap, error: type[OptionError | TelemetryError]
+) -> None:
     """Refuse a position in latitude and longitude that has nothing to do with the map.
 
     Raises:
@@ -86,13 +88,13 @@ def check_place(name: str, place: Prior | None, site: OrthoMap, error: type[Opti
     """
     from pyproj import Geod
 
-    if place is None or place.lat_deg is None or place.lon_deg is None:
+    if position is None or position.lat_deg is None or position.lon_deg is None:
         return
     middle = site.frame
-    distance_m = Geod(ellps="WGS84").inv(middle.lon_deg, middle.lat_deg, place.lon_deg, place.lat_deg)[2]
+    distance_m = Geod(ellps="WGS84").inv(middle.lon_deg, middle.lat_deg, position.lon_deg, position.lat_deg)[2]
     extent_m = math.hypot(site.width_px, site.height_px) * site.gsd_m_per_px
-    if distance_m > extent_m + 3.0 * place.sigma_m:
+    if distance_m > extent_m + 3.0 * position.sigma_m:
         raise error(
-            f"{name}: expected a place on the map {site.name}, got {place.lat_deg:g},{place.lon_deg:g}, "
+            f"{name}: expected a place on the map {site.name}, got {position.lat_deg:g},{position.lon_deg:g}, "
             f"{distance_m / 1000.0:,.1f} km from its middle ({middle.lat_deg:.5f},{middle.lon_deg:.5f})"
         )

@@ -1,112 +1,97 @@
-"""``compare``: several methods, profiles or settings over one flight, told apart in one table and one chart."""
+"""Comparing methods, profiles or settings over one flight: a folder a run, one table and one chart of all."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.cli import console
-from engine.cli.arguments import check_folder, prepare_folder
 from engine.errors import OptionError
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
-from engine.matcher import METHODS
+from engine.methods import METHODS
 from engine.report.comparison import draw_comparison
-from engine.runs.tracking import FlightFiles, Settings, open_inputs, run_track, settings_from
+from engine.runs.folders import StrPath, check_folder, prepare_folder
+from engine.runs.inputs import FlightFiles, open_inputs
+from engine.runs.progress import SILENT, Progress
+from engine.runs.results import TRACK
+from engine.runs.settings import TrackSettings, load_settings
+from engine.runs.tracking import track
 
 TABLE, CHART = "table.json", "comparison.png"
-USUAL = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
-"""What is compared unless told: the paper's Table I."""
-
-COLUMNS = ("RMS m", "p50 ms", "p95 ms", "fixed", "false", "NEES", "up m")
+DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
+"""What is compared unless named: the paper's Table I."""
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """One of the runs that are compared: the name of its folder, and how the flight is followed."""
-
-    name: str
-    settings: Settings
-
-
-def parse_runs(texts: Sequence[str], **given: Any) -> list[Run]:
-    """Runs from METHOD, METHOD/PROFILE or a settings file each.
+def parse_runs(texts: Sequence[str] = (), **overrides: Any) -> dict[str, TrackSettings]:
+    """Settings by the name of their run, from METHOD, METHOD/PROFILE or a settings file each.
 
     Args:
-        texts: one a run; none of them is :data:`USUAL`.
-        given: settings that hold for all of them, where not None.
+        texts: one a run; none of them is :data:`DEFAULT_RUNS`.
+        overrides: settings that hold for all of them, where not None.
 
     Raises:
         OptionError: a text is none of these, or two runs have one name.
     """
-    runs = [_run(text, given) for text in texts or USUAL]
-    names = [run.name for run in runs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise OptionError(f"--run: expected runs of different names, got {twice!r} twice")
+    runs: dict[str, TrackSettings] = {}
+    for text in texts or DEFAULT_RUNS:
+        name, settings = _parse_run(text, overrides)
+        if name in runs:
+            raise OptionError(f"runs: expected runs of different names, got {name!r} twice")
+        runs[name] = settings
     return runs
 
 
-def _run(text: str, given: Mapping[str, Any]) -> Run:
+def _parse_run(text: str, overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
     method, slash, profile = text.partition("/")
     if method in METHODS and not Path(text).is_file():
         chosen = {"method": method, "profile": profile} if slash else {"method": method}
-        return Run(text.replace("/", "-"), settings_from(None, **given, **chosen))
+        return text.replace("/", "-"), load_settings(None, **overrides, **chosen)
     if not Path(text).is_file():
         raise OptionError(
-            f"--run: expected {', '.join(METHODS)}, one of them with /paper, or a settings file, got {text!r}"
+            f"runs: expected {', '.join(METHODS)}, one of them with /paper, or a settings file, got {text!r}"
         )
-    return Run(Path(text).stem, settings_from(Path(text), **given))
+    return Path(text).stem, load_settings(text, **overrides)
 
 
-def run_compare(inputs: FlightFiles, out: Path, runs: Sequence[Run], *, force: bool) -> dict[str, dict[str, Any]]:
-    """Follow the flight once for each run; every run's folder is as ``track`` writes it.
+def compare(
+    files: FlightFiles,
+    out: StrPath,
+    runs: Mapping[str, TrackSettings] | None = None,
+    *,
+    force: bool = False,
+    progress: Progress = SILENT,
+) -> dict[str, dict[str, Any]]:
+    """Follow the flight once for each run; every run's folder is as :func:`engine.runs.tracking.track` writes it.
 
-    The inputs are read and held against every run's settings before the first run begins and before a folder is
-    made.
+    The inputs are read and checked against every run's settings before the first run begins and before a folder
+    is created.
+
+    Args:
+        files: of the flight.
+        out: the folder, with one folder a run in it.
+        runs: settings by the name of their run; None is :data:`DEFAULT_RUNS`.
+        force: whether the folders may be there already.
+        progress: is shown what the runs do.
 
     Returns:
         The summaries by name, which ``table.json`` holds too.
     """
+    out, runs = Path(out), parse_runs() if runs is None else runs
     check_folder(out, force)
-    for run in runs:
-        check_folder(out / run.name, force)
-    opened = open_inputs(inputs, [run.settings for run in runs])
+    for name in runs:
+        check_folder(out / name, force)
+    inputs = open_inputs(files, list(runs.values()), progress=progress)
     prepare_folder(out, force, (TABLE, CHART))
     results = {
-        run.name: run_track(inputs, out / run.name, run.settings, force=force, opened=opened) for run in runs
+        name: track(files, out / name, settings, force=force, inputs=inputs, progress=progress)
+        for name, settings in runs.items()
     }
     (out / TABLE).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-    tracks = {run.name: read_track(out / run.name / "track.csv") for run in runs}
-    path = inputs.find_truth()
+    tracks = {name: read_track(out / name / TRACK) for name in runs}
+    path = files.find_truth()
     first = next(iter(tracks.values()))
     truth = open_truth(path, first[0].timestamp_ns if first else None) if path is not None else None
     draw_comparison(out / CHART, tracks, truth)
     return results
-
-
-def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:
-    """The table, a run a row."""
-    rows = [(name, *cells(summary)) for name, summary in results.items()]
-    console.print_table(title, ("run", *COLUMNS), rows)
-
-
-def cells(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """The figures of :data:`COLUMNS`; what is unknown is a dash."""
-    latency = summary["latency_ms"]
-
-    def shown(value: float | None, form: str) -> str:
-        return "-" if value is None else form.format(value)
-
-    return (
-        shown(summary.get("rms_m"), "{:.2f}"),
-        shown(latency["p50"], "{:.1f}"),
-        shown(latency["p95"], "{:.1f}"),
-        shown(summary.get("availability"), "{:.1%}"),
-        shown(summary.get("false_fixes"), "{}"),
-        shown(summary.get("nees_mean"), "{:.2f}"),
-        shown(summary.get("height_rms_m"), "{:.2f}"),
-    )

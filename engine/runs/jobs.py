@@ -1,4 +1,4 @@
-"""Jobs of a campaign: a flight that is drawn or followed, in a process of its own, its folder made in one step."""
+"""Jobs of a campaign: a flight that is simulated or tracked, in a process of its own, its folder in one step."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
 from engine.report.campaign import are_valid_figures, are_valid_latencies
-from engine.runs.simulation import WorldSettings, run_simulate
-from engine.runs.tracking import FlightFiles, Settings, run_track
+from engine.runs.inputs import FlightFiles
+from engine.runs.progress import Progress
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import WorldSettings, simulate
+from engine.runs.tracking import track
 
 RESULT, LOG = "result.json", "log.txt"
 _TIMES = ("latency_ms", "deadlines_missed", "settings")
@@ -24,27 +27,28 @@ _TIMES = ("latency_ms", "deadlines_missed", "settings")
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
-    """A simulated flight, drawn into its folder."""
+class SimulateTask:
+    """A flight that is simulated into its folder."""
 
-    scene: WorldSettings
+    world: WorldSettings
     frames: int | None
 
-    def work(self, folder: Path) -> dict[str, Any]:
-        """Draw it; returns how many frames it has."""
-        return {"frames": run_simulate(folder, self.scene, frames=self.frames, force=True)["frames"]}
+    def run(self, folder: Path, progress: Progress) -> dict[str, Any]:
+        """Simulate it; returns how many frames it has."""
+        facts = simulate(folder, self.world, frames=self.frames, force=True, progress=progress)
+        return {"frames": facts["frames"]}
 
 
 @dataclass(frozen=True, slots=True)
-class Follow:
-    """A flight that is followed by one method with its settings."""
+class TrackTask:
+    """A flight that is tracked by one method with its settings."""
 
-    inputs: FlightFiles
-    settings: Settings
+    files: FlightFiles
+    settings: TrackSettings
 
-    def work(self, folder: Path) -> dict[str, Any]:
+    def run(self, folder: Path, progress: Progress) -> dict[str, Any]:
         """Write track.csv and summary.json; returns those figures of the summary that are no times."""
-        summary = run_track(self.inputs, folder, self.settings, force=True, report=False)
+        summary = track(self.files, folder, self.settings, force=True, report=False, progress=progress)
         return {name: value for name, value in summary.items() if name not in _TIMES}
 
 
@@ -55,29 +59,29 @@ class Job:
     Attributes:
         name: stable from one start of the campaign to the next.
         folder: where the result is; it is there as a whole or not at all.
-        workshop: a folder for what is not finished, on the same disk.
+        unfinished: a folder for what is not finished, on the same disk.
         inputs: what the work is made of, by name: hashes and values.
         task: the work.
     """
 
     name: str
     folder: Path
-    workshop: Path
+    unfinished: Path
     inputs: dict[str, str]
-    task: Draw | Follow
+    task: SimulateTask | TrackTask
 
 
-def do(job: Job) -> str | None:
+def run_job(job: Job) -> str | None:
     """Work with one thread, and put the folder in its place when all is in it.
 
     Returns:
-        None, or in one line why the work could not be done. What it had written then stays in the workshop.
+        None, or in one line why the work could not be done. What it had written then stays in ``unfinished``.
     """
     set_threads(1)
-    folder = Path(tempfile.mkdtemp(prefix=job.name.replace("/", ".") + ".", dir=job.workshop))
+    folder = Path(tempfile.mkdtemp(prefix=job.name.replace("/", ".") + ".", dir=job.unfinished))
     try:
-        with _quietly(folder / LOG):
-            figures = job.task.work(folder)
+        with _logged(folder / LOG) as progress:
+            figures = job.task.run(folder, progress)
     except (EngineError, OSError) as error:
         return " ".join(str(error).split())
     except Exception as error:  # a fault of ours in one run must not cost the others
@@ -89,15 +93,26 @@ def do(job: Job) -> str | None:
     return None
 
 
+class _Log(Progress):
+    """Writes messages to a file."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def message(self, text: str) -> None:
+        self._stream.write(f"{' '.join(text.split())}\n")
+        self._stream.flush()
+
+
 @contextlib.contextmanager
-def _quietly(log: Path) -> Iterator[None]:
-    """What would be printed goes to a file: many runs at a time would talk across each other."""
+def _logged(log: Path) -> Iterator[Progress]:
+    """A run's messages, and what libraries print, go to a file: those of many runs at a time would mix."""
     with (
         log.open("w", encoding="utf-8") as stream,
         contextlib.redirect_stderr(stream),
         contextlib.redirect_stdout(stream),
     ):
-        yield
+        yield _Log(stream)
 
 
 def _publish(folder: Path, target: Path) -> None:
@@ -118,8 +133,8 @@ class Result:
 
     Attributes:
         inputs: what it was made of, as :class:`Job` has them.
-        figures: of a flight that was followed those of its summary, without times.
-        latency_ms: p50, p95, p99 and max of its frames; None of a flight that was drawn.
+        figures: of a flight that was tracked those of its summary, without times.
+        latency_ms: p50, p95, p99 and max of its frames; None of a flight that was simulated.
     """
 
     inputs: dict[str, str]
@@ -135,13 +150,13 @@ def read_result(job: Job) -> Result | None:
     """
     if not job.folder.exists():
         return None
-    told = _read(job.folder / RESULT, "inputs", "figures")
-    inputs, figures, latency_ms = told["inputs"], told["figures"], None
+    values = _read(job.folder / RESULT, "inputs", "figures")
+    inputs, figures, latency_ms = values["inputs"], values["figures"], None
     whole = isinstance(inputs, dict) and all(isinstance(value, str) for value in inputs.values())
-    followed = isinstance(job.task, Follow)
-    if not (whole and isinstance(figures, dict) and (not followed or are_valid_figures(figures))):
+    tracked = isinstance(job.task, TrackTask)
+    if not (whole and isinstance(figures, dict) and (not tracked or are_valid_figures(figures))):
         raise _damaged(job.folder / RESULT)
-    if followed:
+    if tracked:
         latency_ms = _read(job.folder / "summary.json", "latency_ms")["latency_ms"]
         if not are_valid_latencies(latency_ms):
             raise _damaged(job.folder / "summary.json")
@@ -151,8 +166,8 @@ def read_result(job: Job) -> Result | None:
 def _read(path: Path, *names: str) -> dict[str, Any]:
     """Values of a file by name."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        return {name: told[name] for name in names}
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return {name: values[name] for name in names}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise _damaged(path) from None
 

@@ -1,4 +1,4 @@
-"""``map audit``: where on a map frames from a given height can be matched, and what a route will meet."""
+"""Auditing a map: where on it frames from a given height can be matched, and what a route will meet."""
 
 from __future__ import annotations
 
@@ -14,68 +14,113 @@ from engine.audit.availability import Audit, RouteAvailability, gather, predict
 from engine.audit.plan import AuditOptions, AuditPlan, MapPart, plan_audit
 from engine.audit.self_match import SelfMatchStatistics, measure
 from engine.camera import Camera
-from engine.cli import console
-from engine.cli.arguments import check_folder, named_as_typed, open_map, parse_circle, prepare_folder
 from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
 from engine.orthomap import SEARCH_LIMIT_PX, OrthoMap
+from engine.runs.arguments import parse_circle, renamed_in_errors
+from engine.runs.folders import StrPath, check_folder, prepare_folder
+from engine.runs.inputs import open_map
+from engine.runs.progress import SILENT, Progress
 
 OWNED = ("matchability.tif", "audit.png", "summary.json")
 NODATA = -1.0
 PAPER_CAMERA, PAPER_HEIGHT_M = (300, 300, 60.0), 150.0
-"""Width, height and field of view of the paper's camera, and its height: what an audit assumes unless told."""
+"""Width, height and field of view of the paper's camera, and its height: what an audit assumes unless given."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AuditFiles:
     """The files of an audit, the height, and what part of the map it is of; None where not given.
 
     Attributes:
-        around: LAT,LON,RADIUS_M.
-        corridor_m: how far to each side of the route.
+        map: GeoTIFF, a picture with a world file, or a folder of tiles.
+        surface: surface model, a GeoTIFF of heights.
+        camera: calibration; None is the paper's camera.
+        route: GeoJSON LineString, or a QGroundControl .plan.
+        other: the same ground at another date.
+        height_agl_m: above the ground; None is the paper's height.
+        around: only what lies within "LAT,LON,RADIUS_M".
+        corridor_m: only what lies so near to the route.
     """
 
-    map: Path
-    surface: Path | None
-    camera: Path | None
-    route: Path | None
-    other: Path | None
-    height_agl_m: float | None
+    map: StrPath
+    surface: StrPath | None = None
+    camera: StrPath | None = None
+    route: StrPath | None = None
+    other: StrPath | None = None
+    height_agl_m: float | None = None
     around: str | None = None
     corridor_m: float | None = None
 
 
-def run_audit(inputs: AuditFiles, out: Path, *, sigma_m: float, force: bool, as_json: bool) -> dict[str, Any]:
-    """Audit, write raster, picture and summary, and print the summary."""
+@dataclass(frozen=True, slots=True)
+class MapAudit:
+    """A finished audit.
+
+    Attributes:
+        audit: its grid.
+        route: availability along the route, where there is one.
+        summary: what summary.json holds.
+    """
+
+    audit: Audit
+    route: RouteAvailability | None
+    summary: dict[str, Any]
+
+
+def audit_map(
+    files: AuditFiles,
+    out: StrPath,
+    *,
+    prior_sigma_m: float = 10.0,
+    force: bool = False,
+    progress: Progress = SILENT,
+) -> MapAudit:
+    """Audit a map, and write raster, picture and summary.
+
+    Args:
+        files: the map, and what it is audited for.
+        out: the folder.
+        prior_sigma_m: of the position before a match.
+        force: whether the folder may be there already.
+        progress: is shown what the audit does.
+
+    Raises:
+        OptionError: an argument is out of its range, or beside the map.
+        MapError, CalibrationError, TelemetryError: a file cannot be read.
+    """
+    out = Path(out)
     check_folder(out, force)
-    around = parse_circle("--around", inputs.around)
-    if inputs.corridor_m is not None and inputs.route is None:
-        raise OptionError("--corridor-m: expected a --route with it, got none")
-    site = open_map(inputs.map, inputs.surface)
-    other = None if inputs.other is None else _same_place(open_map(inputs.other), site)
-    camera = Camera.from_fov(*PAPER_CAMERA) if inputs.camera is None else Camera.load(inputs.camera)
-    waypoints = None if inputs.route is None else read_route(inputs.route)
+    plan, waypoints = _plan(files, prior_sigma_m, progress)
+    prepare_folder(out, force, OWNED)
+    audit = gather(plan, progress.track(measure(plan), len(plan), "auditing"))
+    route = None if waypoints is None else predict(audit, *waypoints.T)
+    _write(out, audit, route, Path(files.map).name)
+    facts = _summary(audit, route, files)
+    (out / "summary.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return MapAudit(audit, route, facts)
+
+
+def _plan(
+    files: AuditFiles, prior_sigma_m: float, progress: Progress
+) -> tuple[AuditPlan, NDArray[np.float64] | None]:
+    """What is audited, and the (N, 2) waypoints of the route in degrees."""
+    around = parse_circle("around", files.around)
+    if files.corridor_m is not None and files.route is None:
+        raise OptionError("corridor_m: expected a `route` with it, got none")
+    site = open_map(files.map, files.surface, progress=progress)
+    other = None if files.other is None else _same_ground(open_map(files.other, progress=progress), site)
+    camera = Camera.from_fov(*PAPER_CAMERA) if files.camera is None else Camera.load(files.camera)
+    waypoints = None if files.route is None else read_route(files.route)
     if waypoints is not None:
         _check_route(waypoints, site)
-    height_m = PAPER_HEIGHT_M if inputs.height_agl_m is None else inputs.height_agl_m
-    typed = {"height_agl_m": "--height-agl", "prior_sigma_m": "--sigma-m", "camera": "--camera"}
-    with named_as_typed(**typed, corridor_m="--corridor-m", part="--route"):
-        part = _part(around, waypoints, inputs.corridor_m, site)
-        plan = plan_audit(site, camera, height_m, AuditOptions(prior_sigma_m=sigma_m), other, part)
+    height_m = PAPER_HEIGHT_M if files.height_agl_m is None else files.height_agl_m
+    with renamed_in_errors(part="route"):
+        part = _part(around, waypoints, files.corridor_m, site)
+        plan = plan_audit(site, camera, height_m, AuditOptions(prior_sigma_m=prior_sigma_m), other, part)
     _check_size(plan, part)
-    prepare_folder(out, force, OWNED)
-    audit = gather(plan, console.progress(measure(plan), len(plan), "auditing"))
-    route = None if waypoints is None else predict(audit, *waypoints.T)
-    _write(out, audit, route, inputs.map.name)
-    result = summary(audit, route, inputs)
-    (out / "summary.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    if as_json:
-        console.print_json(result)
-    else:
-        console.print_pairs(f"audit of {inputs.map}", _pairs(audit, route))
-        console.say(f"written to {out}")
-    return result
+    return plan, waypoints
 
 
 def _part(
@@ -84,23 +129,21 @@ def _part(
     corridor_m: float | None,
     site: OrthoMap,
 ) -> MapPart | None:
-    """The part of the map that was asked for; None is all of it, which a huge map is never audited as.
+    """The part of the map to audit; None is all of it, which a huge map is never audited as.
 
     Raises:
-        OptionError: the map is huge and nothing was asked for, or it was asked for a place beside it.
+        OptionError: the map is huge and no part is given, or the part lies beside it.
     """
     if around is not None:
         x, y = site.pixel_from_geodetic(*around[:2])
         if not (-0.5 <= x < site.width_px - 0.5 and -0.5 <= y < site.height_px - 0.5):
-            raise OptionError(
-                f"--around: expected a place on the map {site.name}, got {around[0]:g},{around[1]:g}"
-            )
+            raise OptionError(f"around: expected a place on the map {site.name}, got {around[0]:g},{around[1]:g}")
         return MapPart(around=around, route=waypoints, corridor_m=corridor_m)
     if waypoints is not None and (corridor_m is not None or not site.is_searchable):
         return MapPart(route=waypoints, corridor_m=corridor_m)
     if not site.is_searchable:
         raise OptionError(
-            f"--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of {site.size_km} is not "
+            f"around: expected LAT,LON,RADIUS_M, or a `route` to audit along: the map of {site.size_km} is not "
             "audited as a whole"
         )
     return None
@@ -113,18 +156,16 @@ def _check_size(plan: AuditPlan, part: MapPart | None) -> None:
         OptionError: it has more pixels than a map that is audited as a whole.
     """
     if part is not None and plan.area_px > SEARCH_LIMIT_PX:
-        name = "--around" if part.around is not None else "--corridor-m"
+        name = "around" if part.around is not None else "corridor_m"
         most, got = (n * plan.site.gsd_m_per_px**2 / 1e6 for n in (SEARCH_LIMIT_PX, plan.area_px))
         raise OptionError(f"{name}: expected at most {most:.0f} km2 of the map to audit, got {got:.0f} km2")
 
 
-def _same_place(other: OrthoMap, site: OrthoMap) -> OrthoMap:
+def _same_ground(other: OrthoMap, site: OrthoMap) -> OrthoMap:
     """The other map, if it has anything to do with the first."""
     (west, south, east, north), (left, low, right, high) = other.bounds_deg, site.bounds_deg
     if west > right or east < left or south > high or north < low:
-        raise OptionError(
-            f"--other: expected a map of the same ground as {site.name}, got {other.name}, elsewhere"
-        )
+        raise OptionError(f"other: expected a map of the same ground as {site.name}, got {other.name}, elsewhere")
     return other
 
 
@@ -134,7 +175,7 @@ def _check_route(waypoints: NDArray[np.float64], site: OrthoMap) -> None:
     if not (np.isfinite(xy).all() and (high >= 0).all() and (low <= [site.width_px, site.height_px]).all()):
         lat, lon = waypoints[0]
         raise OptionError(
-            f"--route: expected a route over the map {site.name}, got one that begins at {lat:g},{lon:g}"
+            f"route: expected a route over the map {site.name}, got one that begins at {lat:g},{lon:g}"
         )
 
 
@@ -161,21 +202,21 @@ def _cells_to_crs(audit: Audit) -> tuple[NDArray[np.float64], int]:
     return np.column_stack([right - origin, below - origin, origin]), epsg
 
 
-def summary(audit: Audit, route: RouteAvailability | None, inputs: AuditFiles) -> dict[str, Any]:
+def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -> dict[str, Any]:
     """What summary.json holds."""
     plan = audit.plan
     known = np.isfinite(audit.availability)
     scale = 2.0**plan.level * plan.site.gsd_m_per_px
     return {
-        "map": str(inputs.map),
-        "surface": None if inputs.surface is None else str(inputs.surface),
-        "camera": None if inputs.camera is None else str(inputs.camera),
-        "other": None if inputs.other is None else str(inputs.other),
+        "map": str(files.map),
+        "surface": None if files.surface is None else str(files.surface),
+        "camera": None if files.camera is None else str(files.camera),
+        "other": None if files.other is None else str(files.other),
         "height_agl_m": plan.height_agl_m,
         "prior_sigma_m": plan.options.prior_sigma_m,
         "footprint_m": [n * scale for n in plan.view.footprint_px],
         "level": plan.level,
-        "part": _part_facts(plan, inputs),
+        "part": _part_facts(plan, files),
         "places": list(plan.cells),
         "spacing_m": (plan.spacing_px * plan.site.gsd_m_per_px).tolist(),
         "availability": float(audit.availability[known].mean()) if known.any() else None,
@@ -183,17 +224,17 @@ def summary(audit: Audit, route: RouteAvailability | None, inputs: AuditFiles) -
         "evidence_median": {
             one.name: _median(getattr(audit.evidence, one.name)) for one in fields(SelfMatchStatistics)
         },
-        "route": None if route is None else _route_facts(route, str(inputs.route)),
+        "route": None if route is None else _route_facts(route, str(files.route)),
     }
 
 
-def _part_facts(plan: AuditPlan, inputs: AuditFiles) -> dict[str, Any] | None:
+def _part_facts(plan: AuditPlan, files: AuditFiles) -> dict[str, Any] | None:
     """What part of the map was audited; None for all of it."""
     if plan.looked.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
         return None
     return {
-        "around": inputs.around,
-        "corridor_m": inputs.corridor_m,
+        "around": files.around,
+        "corridor_m": files.corridor_m,
         "places": len(plan),
         "area_km2": plan.area_px * plan.site.gsd_m_per_px**2 / 1e6,
     }
@@ -211,22 +252,3 @@ def _route_facts(route: RouteAvailability, path: str) -> dict[str, Any]:
         "availability": route.availability,
         "stretches": [asdict(stretch) for stretch in route.stretches],
     }
-
-
-def _pairs(audit: Audit, route: RouteAvailability | None) -> list[tuple[str, str]]:
-    plan = audit.plan
-    footprint = " x ".join(f"{n * 2.0**plan.level * plan.site.gsd_m_per_px:.0f}" for n in plan.view.footprint_px)
-    pairs = [
-        ("frame on the ground", f"{footprint} m from {plan.height_agl_m:g} m"),
-        ("places", f"{len(plan)}, every {plan.spacing_px.mean() * plan.site.gsd_m_per_px:.0f} m"),
-        ("of the map", f"{plan.area_px * plan.site.gsd_m_per_px**2 / 1e6:.3g} km2"),
-    ]
-    pairs += [(name, f"{share:.1%}") for name, share in audit.shares.items() if share > 0.0 or name == "good"]
-    if route is not None:
-        pairs.append(("route", f"{route.length_m:,.0f} m, predicted availability {route.availability:.1%}"))
-        for one in route.stretches:
-            ends = (
-                f"{one.start_lat_deg:.6f},{one.start_lon_deg:.6f} to {one.end_lat_deg:.6f},{one.end_lon_deg:.6f}"
-            )
-            pairs.append((f"poor: {one.flag}", f"{ends}, {one.length_m:,.0f} m, {one.availability:.0%}"))
-    return pairs

@@ -1,11 +1,11 @@
-"""``bridge mavlink`` and its parameter files: a camera and an autopilot in, fixes to the autopilot out."""
+"""The loop of the MAVLink bridge, and its parameter files: pictures in, fixes to the autopilot out."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,200 +14,265 @@ from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import CapturedImage, capture, replay
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
-from engine.cli import console
-from engine.cli.arguments import (
-    check_choice,
-    check_device,
-    named_as_typed,
-    open_map,
-    parse_position,
-    refuse_given,
-)
-from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
+from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
 from engine.live import LiveOptions
-from engine.matcher import METHODS, SceneMatcher
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
 from engine.orthomap import OrthoMap
-from engine.runs.checks import check_place
-from engine.runs.watching import Watching, watched_beside
+from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
+from engine.runs.checks import check_position
+from engine.runs.folders import StrPath, check_file
+from engine.runs.inputs import open_map
+from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
+from engine.runs.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
     from engine.adapters.mavlink_out import MavlinkOptions
 
-_SAY_EVERY_S = 5.0
-_HEAR_S = 10.0
+_MESSAGE_PERIOD_S = 5.0
+_AUTOPILOT_TIMEOUT_S = 10.0
 _MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
 _MAX_GRAB_MS = 10_000.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BridgeFiles:
-    """The map, the camera, and where pictures come from: files or a camera, one of the two."""
+    """The map, the camera, and where pictures come from: files or a camera, one of the two.
 
-    map: Path
-    surface: Path | None
-    camera: Path
-    frames: Path | None
-    telemetry: Path | None
-    source: str | None
-    rate_hz: float | None = None  # of pictures without stamps; None for 10
-    exposure_to_grab_ms: float | None = None  # of a camera; None for none
-    map_sigma_m: float | None = None  # how well the map lies, where it does not say
+    Attributes:
+        map: GeoTIFF, a picture with a world file, or a folder of tiles.
+        camera: calibration.
+        surface: surface model, a GeoTIFF of heights.
+        frames: pictures that are played at their own pace, a folder or a video.
+        telemetry: telemetry.csv, whose stamps set that pace.
+        camera_source: number of a camera or URL of a stream, by OpenCV.
+        rate_hz: pace of pictures without stamps; None is 10.
+        exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
+        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+
+    Raises:
+        OptionError: a number is out of its range, or an argument does not go with another.
+    """
+
+    map: StrPath
+    camera: StrPath
+    surface: StrPath | None = None
+    frames: StrPath | None = None
+    telemetry: StrPath | None = None
+    camera_source: str | None = None
+    rate_hz: float | None = None
+    exposure_to_grab_ms: float | None = None
+    map_sigma_m: float | None = None
 
     def __post_init__(self) -> None:
-        if (self.frames is None) == (self.source is None):
-            raise OptionError("--frames: expected either --frames or --camera-source")
+        if (self.frames is None) == (self.camera_source is None):
+            raise OptionError("frames: expected either `frames` or `camera_source`")
         if self.frames is None:
-            refuse_given({"--telemetry": self.telemetry, "--rate-hz": self.rate_hz}, "--frames")
+            check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz}, "frames")
         else:
-            refuse_given({"--exposure-to-grab-ms": self.exposure_to_grab_ms}, "--camera-source")
+            check_unused({"exposure_to_grab_ms": self.exposure_to_grab_ms}, "camera_source")
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
-            raise OptionError(f"--rate-hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
+            raise OptionError(f"rate_hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
         if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MAX_GRAB_MS:
             raise OptionError(
-                f"--exposure-to-grab-ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
+                f"exposure_to_grab_ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
             )
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage]:
         """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
         if self.frames is not None:
-            return replay(self.frames, self.telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
-        assert self.source is not None  # one of the two is given
-        return capture(self.source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)
+            telemetry = None if self.telemetry is None else Path(self.telemetry)
+            return replay(Path(self.frames), telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
+        assert self.camera_source is not None  # one of the two is given
+        return capture(self.camera_source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkSettings:
-    """How the autopilot is reached and what it is told, as the command line has it.
+class MavlinkSettings:
+    """How the autopilot is reached and what it is sent.
+
+    Attributes:
+        connect: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
+        listen_anywhere: allow udpin on addresses that other machines reach.
+        system_id: of the vehicle; others are not heard.
+        key: secret of MAVLink's signing; with it unsigned packets are ignored.
+        firmware: of the autopilot, "ardupilot" or "px4".
+        message: what is sent; "" is the firmware's usual one.
+        max_sigma_m: a fix that is less certain is not sent.
+        set_origin: give an autopilot without an origin the map's.
+        origin_alt_m: height of that origin above sea level; None is the map's ground.
+        use_velocity: whether the autopilot's velocity is used between fixes.
 
     Raises:
         OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
     """
 
     connect: str
-    listen_anywhere: bool
-    system_id: int
-    key: Path | None
-    firmware: str
-    message: str
-    max_sigma_m: float
-    set_origin: bool
-    origin_alt_m: float | None
-    use_velocity: bool
+    listen_anywhere: bool = False
+    system_id: int = 1
+    key: StrPath | None = None
+    firmware: str = "ardupilot"
+    message: str = ""
+    max_sigma_m: float = 10.0
+    set_origin: bool = True
+    origin_alt_m: float | None = None
+    use_velocity: bool = True
 
     def __post_init__(self) -> None:
         if not self.set_origin:
-            refuse_given({"--origin-alt-m": self.origin_alt_m}, "--set-origin")
+            check_unused({"origin_alt_m": self.origin_alt_m}, "set_origin")
         if self.origin_alt_m is not None and not abs(self.origin_alt_m) <= _MAX_ALT_M:
             raise OptionError(
-                f"--origin-alt-m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
+                f"origin_alt_m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
             )
+
+    def outgoing(self) -> MavlinkOptions:
+        """What is sent.
+
+        Raises:
+            OptionError: the firmware, the message or the accuracy is none that can be.
+        """
+        return _outgoing(self.firmware, self.message, self.max_sigma_m)
+
+    def origin(self, site: OrthoMap) -> NedOrigin | None:
+        """The map's, at the height of its ground where none is given; None where none is to be set."""
+        if not self.set_origin:
+            return None
+        alt_m = site.ground_m if self.origin_alt_m is None else self.origin_alt_m
+        return NedOrigin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MatchSettings:
-    """How frames are matched, as the command line has it.
+class BridgeSettings:
+    """How a bridge matches frames.
+
+    Attributes:
+        method: "auto", "ncc" or "sift".
+        device: where tensors live.
+        start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
+        deadline_ms: age by which a frame is answered.
+        seconds: ends after this time; None ends with the pictures.
 
     Raises:
         OptionError: a word or a number is none of those that are expected.
         DeviceError: the device is missing.
     """
 
-    method: str
-    device: str
-    start: str | None
-    deadline_ms: float
-    seconds: float | None
+    method: str = "auto"
+    device: str = "auto"
+    start: str | None = None
+    deadline_ms: float = 121.0
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
-        check_choice("--method", self.method, METHODS)
-        check_device("--device", self.device)
-        parse_position("--start", self.start)
+        check_choice("method", self.method, METHODS)
+        check_device(self.device)
+        parse_position("start", self.start)
         self.live_options()
 
     def live_options(self) -> LiveOptions:
         """The deadlines of the frames."""
-        with named_as_typed(deadline_ms="--deadline-ms"):
-            return LiveOptions(deadline_ms=self.deadline_ms)
+        return LiveOptions(deadline_ms=self.deadline_ms)
 
 
-def run_bridge(
-    inputs: BridgeFiles, wire: LinkSettings, matching: MatchSettings, *, as_json: bool, watching: Watching
-) -> None:
-    """Bridge until the pictures end, the time is over or somebody interrupts, and print what was done."""
-    _need_pymavlink()
-    watching.check()
+def run_mavlink_bridge(
+    files: BridgeFiles,
+    link: MavlinkSettings,
+    settings: BridgeSettings | None = None,
+    *,
+    live_view: LiveViewTarget = NO_LIVE_VIEW,
+    progress: Progress = SILENT,
+) -> MavlinkStatus:
+    """Bridge until the pictures end or the time is over.
+
+    Args:
+        files: map, camera and pictures.
+        link: the autopilot.
+        settings: how frames are matched; None is the defaults.
+        live_view: where the live view goes.
+        progress: is shown what the bridge does.
+
+    Returns:
+        What was done.
+
+    Raises:
+        MissingExtraError: pymavlink, or for a serial line pyserial, is not installed.
+        BackendError: the link cannot be opened.
+        OptionError, MapError, CalibrationError, TelemetryError: an argument or a file is not as expected.
+    """
+    require("pymavlink", "mavlink")
+    live_view.check()
     from engine.adapters.mavlink import MavlinkBridge
     from engine.adapters.packets import read_key
 
-    connection = parse_connection(wire.connect, listen_anywhere=wire.listen_anywhere)
-    options = _outgoing(wire.firmware, wire.message, wire.max_sigma_m)
-    start = parse_position("--start", matching.start)
-    key = None if wire.key is None else read_key(wire.key)
-    site = open_map(inputs.map, inputs.surface, inputs.map_sigma_m)
-    camera = Camera.load(inputs.camera)
-    check_place("--start", start, site, OptionError)
-    matcher = SceneMatcher(site, camera, matching.method, matching.device)
+    settings = settings or BridgeSettings()
+    connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
+    outgoing = link.outgoing()
+    start = parse_position("start", settings.start)
+    key = None if link.key is None else read_key(Path(link.key))
+    site = open_map(files.map, files.surface, files.map_sigma_m, progress=progress)
+    camera = Camera.load(files.camera)
+    check_position("start", start, site, OptionError)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device)
     matcher.warmup()
 
-    with watched_beside(matcher, watching) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
-                connection, make_navigator, options, start, matching.live_options(),
-                origin=_origin(site, wire), use_velocity=wire.use_velocity, system_id=wire.system_id, key=key,
+                connection, make_navigator, outgoing, start, settings.live_options(),
+                origin=link.origin(site), use_velocity=link.use_velocity, system_id=link.system_id, key=key,
                 watch=watcher,
             )  # fmt: skip
         except OSError as error:
-            raise BackendError(f"--connect: {wire.connect} cannot be opened: {error.strerror or error}") from None
+            raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
-            pictures = inputs.pictures(lambda: _wait_for_autopilot(bridge))
-            _follow(bridge, pictures, camera, matching.seconds)
-            status = bridge.status
-    console.facts(asdict(status), as_json, title=f"{options.kind} to {wire.connect}")
+            pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
+            _run(bridge, pictures, camera, settings.seconds, progress)
+            return bridge.status
 
 
-def write_parameters(
-    firmware: str, message: str, out: Path, *, delay_ms: int, max_sigma_m: float, force: bool
+def write_parameter_file(
+    firmware: str,
+    message: str,
+    out: StrPath,
+    *,
+    delay_ms: int = 100,
+    max_sigma_m: float = 10.0,
+    force: bool = False,
 ) -> None:
-    """Write the parameter file of a firmware."""
-    _need_pymavlink()
-    options = _outgoing(firmware, message, max_sigma_m)
-    text = parameter_file(firmware, options.kind, delay_ms=delay_ms, max_sigma_m=max_sigma_m)
-    if out.exists() and not force:
-        raise OptionError(f"--out: {out} exists; choose another file, or add --force to replace it")
+    """Write the parameters that let an autopilot fly by the bridge's fixes.
+
+    Args:
+        firmware: "ardupilot" or "px4".
+        message: that is sent; "" is the firmware's usual one.
+        out: the file.
+        delay_ms: from capture to arrival.
+        max_sigma_m: of the fixes that are sent.
+        force: whether the file may be there already.
+    """
+    require("pymavlink", "mavlink")
+    out, outgoing = Path(out), _outgoing(firmware, message, max_sigma_m)
+    text = parameter_file(firmware, outgoing.kind, delay_ms=delay_ms, max_sigma_m=max_sigma_m)
+    check_file(out, force)
     out.write_text(text, encoding="utf-8")
-    console.say(f"written to {out}")
-
-
-def _need_pymavlink() -> None:
-    try:
-        import pymavlink  # noqa: F401
-    except ImportError:
-        raise BackendError(
-            "bridge: expected pymavlink to be installed, the extra [mavlink]: pip install pymavlink"
-        ) from None
 
 
 def _outgoing(firmware: str, message: str, max_sigma_m: float) -> MavlinkOptions:
     from engine.adapters.mavlink_out import MavlinkOptions
 
-    with named_as_typed(firmware="--firmware", message="--message", max_sigma_m="--max-sigma-m"):
-        return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
+    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
 
 
-def _origin(site: OrthoMap, wire: LinkSettings) -> NedOrigin | None:
-    """The map's, at the height of its ground where none is told."""
-    if not wire.set_origin:
-        return None
-    alt_m = site.ground_m if wire.origin_alt_m is None else wire.origin_alt_m
-    return NedOrigin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
-
-
-def _follow(
-    bridge: MavlinkBridge, pictures: Iterator[CapturedImage], camera: Camera, seconds: float | None
+def _run(
+    bridge: MavlinkBridge,
+    pictures: Iterator[CapturedImage],
+    camera: Camera,
+    seconds: float | None,
+    progress: Progress,
 ) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
-    begin = said = time.monotonic()
+    begin = reported = time.monotonic()
     count = 0
     for image, captured_ns in pictures:
         count += 1
@@ -217,21 +282,21 @@ def _follow(
             raise CalibrationError(f"picture {count}: {error}") from None
         bridge.submit(image, captured_ns)
         now = time.monotonic()
-        if now - said >= _SAY_EVERY_S:
-            said = now
-            console.say(_line(bridge.status))
+        if now - reported >= _MESSAGE_PERIOD_S:
+            reported = now
+            progress.message(_status_line(bridge.status))
         if seconds is not None and now - begin >= seconds:
             return
     if count == 0:
-        raise TelemetryError("--frames: expected at least one picture, got none")
+        raise TelemetryError("frames: expected at least one picture, got none")
     _wait_for_answers(lambda: bridge.status.answered, count)
 
 
-def _wait_for_autopilot(bridge: MavlinkBridge) -> None:
-    """A flight that is played begins with the autopilot's: where it was earlier, nobody would have told."""
+def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress) -> None:
+    """A flight that is played begins with the autopilot's: where it was earlier is not known."""
     if not bridge.connected:
-        console.say(f"the pictures wait for the autopilot, {_HEAR_S:g} s at most")
-    until = time.monotonic() + _HEAR_S
+        progress.message(f"the pictures wait for the autopilot, {_AUTOPILOT_TIMEOUT_S:g} s at most")
+    until = time.monotonic() + _AUTOPILOT_TIMEOUT_S
     while not bridge.connected and time.monotonic() < until:
         time.sleep(0.002)
 
@@ -244,7 +309,7 @@ def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
         time.sleep(0.3)
 
 
-def _line(status: MavlinkStatus) -> str:
+def _status_line(status: MavlinkStatus) -> str:
     from engine.adapters.mavlink import MIN_RATE_HZ
 
     reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"

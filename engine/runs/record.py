@@ -1,4 +1,4 @@
-"""Records: what a finished track was made of, as its summary.json keeps it for ``evaluate`` and ``export``."""
+"""Records: inputs and settings of a finished run, as its summary.json keeps them for later runs over it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "budget_ms", "ground_amsl_m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Record:
+class RunRecord:
     """The inputs and settings of a run; paths are absolute, and None is what there was not.
 
     Attributes:
@@ -32,7 +32,7 @@ class Record:
         frame_stamps: when the frames were taken, where the telemetry is a log.
         log_offset_s: added to the frames' own stamps, in the same case.
         image_topic: of the pictures, where the frames are a bag.
-        map_sigma_m: how well the map lies, where that was told.
+        map_sigma_m: georeferencing accuracy of the map, where it was given.
         heights: frames by the source of their height, where the telemetry is a log.
         method: "ncc", "sift" or "auto".
         profile: "engine" or "paper".
@@ -91,12 +91,12 @@ class Record:
 
     def facts(self) -> dict[str, Any]:
         """The same as JSON holds it."""
-        told = asdict(self)
-        more: dict[str, Any] = told.pop("more")
-        return told | more
+        values = asdict(self)
+        more: dict[str, Any] = values.pop("more")
+        return values | more
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path) -> RunRecord:
     """The settings in a summary.json.
 
     Raises:
@@ -104,10 +104,10 @@ def read_record(path: Path) -> Record:
     """
     wrong = f"{path}: expected the summary that track writes"
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))["settings"]
-        known = {each.name for each in fields(Record)} - {"more"}
-        more = {name: value for name, value in told.items() if name not in known}
-        return Record(**{name: value for name, value in told.items() if name in known}, more=more)
+        values = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        known = {each.name for each in fields(RunRecord)} - {"more"}
+        more = {name: value for name, value in values.items() if name not in known}
+        return RunRecord(**{name: value for name, value in values.items() if name in known}, more=more)
     except FileNotFoundError:
         raise TelemetryError(f"{path}: expected the summary of a finished track, got no such file") from None
     except TelemetryError as error:

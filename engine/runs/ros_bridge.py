@@ -1,74 +1,110 @@
-"""``bridge ros``: a camera's topic and a vehicle's in, poses, fixes and diagnostics out."""
+"""The loop of the ROS bridge: a camera's topic and a vehicle's in, poses, fixes and diagnostics out."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 
-from engine.adapters.ros import RosBridge, RosNode, RosTopics
+from engine.adapters.ros import RosBridge, RosNode, RosStatus, RosTopics
 from engine.adapters.ros_out import RosOptions
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
-from engine.cli import console
-from engine.cli.arguments import named_as_typed, open_map, parse_position
-from engine.errors import BackendError, CalibrationError, OptionError
+from engine.errors import BackendError, OptionError
 from engine.formats.ros.messages import camera_from_message
 from engine.matcher import SceneMatcher
-from engine.runs.checks import check_place
-from engine.runs.mavlink_bridge import MatchSettings
-from engine.runs.watching import Watching, watched_beside
+from engine.runs.arguments import parse_position
+from engine.runs.checks import check_position
+from engine.runs.folders import StrPath
+from engine.runs.inputs import open_map
+from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
+from engine.runs.mavlink_bridge import BridgeSettings
+from engine.runs.progress import SILENT, Progress
 
-_PATIENCE_S = 30.0
+_CAMERA_INFO_TIMEOUT_S = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class RosFiles:
-    """The map, the calibration where a file has it, and the topics."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RosSettings:
+    """What a node of ROS hears and publishes.
 
-    map: Path
-    surface: Path | None
-    camera: Path | None
-    topics: RosTopics
-    map_sigma_m: float | None = None  # how well the map lies, where it does not say
+    Attributes:
+        version: 1 for rospy, 2 for rclpy.
+        map: GeoTIFF, a picture with a world file, or a folder of tiles.
+        surface: surface model, a GeoTIFF of heights.
+        camera: calibration; None takes the topic's, of a nadir camera.
+        topics: that are heard.
+        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        firmware: for whom the poses are, behind MAVROS: "none", "ardupilot" or "px4".
+        origin: of the poses, "LAT,LON"; None is the map's.
+
+    Raises:
+        OptionError: the topic of the images has no name.
+    """
+
+    map: StrPath
+    surface: StrPath | None = None
+    camera: StrPath | None = None
+    topics: RosTopics = field(default_factory=RosTopics)
+    map_sigma_m: float | None = None
+    version: int = 1
+    firmware: str = "none"
+    origin: str | None = None
 
     def __post_init__(self) -> None:
         if not self.topics.image:
-            raise OptionError("--image-topic: expected a name, got nothing")
+            raise OptionError("image_topic: expected a name, got nothing")
+
+    def options(self) -> RosOptions:
+        """What is published.
+
+        Raises:
+            OptionError: the firmware or the origin is none.
+        """
+        position = parse_position("origin", self.origin)
+        begin = None if position is None else NedOrigin(position.lat_deg or 0.0, position.lon_deg or 0.0, 0.0)
+        return RosOptions(firmware=self.firmware, origin=begin)
 
 
-def run_bridge_ros(
-    version: int,
-    inputs: RosFiles,
-    matching: MatchSettings,
-    firmware: str,
-    origin: str | None,
+def run_ros_bridge(
+    ros: RosSettings,
+    settings: BridgeSettings | None = None,
     *,
-    as_json: bool,
-    watching: Watching,
-) -> None:
-    """Run the node until ROS, the time or somebody ends it, and print what was done."""
-    watching.check()
-    start, place = parse_position("--start", matching.start), parse_position("--origin", origin)
-    begin = None if place is None else NedOrigin(place.lat_deg or 0.0, place.lon_deg or 0.0, 0.0)
-    with named_as_typed(firmware="--firmware"):
-        options = RosOptions(firmware=firmware, origin=begin)
-    site = open_map(inputs.map, inputs.surface, inputs.map_sigma_m)
-    check_place("--start", start, site, OptionError)
-    camera = None if inputs.camera is None else Camera.load(inputs.camera)
-    node = _node(version)
-    matcher = SceneMatcher(
-        site, camera or _told(node, inputs.topics.camera_info), matching.method, matching.device
-    )
+    live_view: LiveViewTarget = NO_LIVE_VIEW,
+    progress: Progress = SILENT,
+) -> RosStatus:
+    """Run the node until ROS or the time ends it.
+
+    Args:
+        ros: what is heard and published.
+        settings: how frames are matched; None is the defaults.
+        live_view: where the live view goes.
+        progress: is shown what the node does.
+
+    Returns:
+        What was done.
+
+    Raises:
+        BackendError: ROS is not installed, or nothing answers.
+        OptionError, MapError, CalibrationError: an argument or a file is not as expected.
+    """
+    live_view.check()
+    settings = settings or BridgeSettings()
+    start, options = parse_position("start", settings.start), ros.options()
+    site = open_map(ros.map, ros.surface, ros.map_sigma_m, progress=progress)
+    check_position("start", start, site, OptionError)
+    camera = None if ros.camera is None else Camera.load(ros.camera)
+    node = _node(ros.version)
+    camera = camera or _published_camera(node, ros.topics.camera_info, progress)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device)
     matcher.warmup()
 
-    with watched_beside(matcher, watching) as (make_navigator, watcher):
-        bridge = RosBridge(node, site, make_navigator, options, start, matching.live_options(), watch=watcher)
-        console.say(f"listening to {inputs.topics.image}")
+    with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
+        bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
+        progress.message(f"listening to {ros.topics.image}")
         try:
-            node.spin(bridge.handlers(inputs.topics), bridge.check_input, matching.seconds)
+            node.spin(bridge.handlers(ros.topics), bridge.check_input, settings.seconds)
         finally:
             bridge.close()
-    console.facts(asdict(bridge.status), as_json, title=f"ROS {version} on {inputs.topics.image}")
+    return bridge.status
 
 
 def _node(version: int) -> RosNode:
@@ -80,17 +116,17 @@ def _node(version: int) -> RosNode:
         from engine.adapters import ros2
 
         return ros2.Node("scenematch")
-    raise OptionError(f"--ros: expected 1 or 2, got {version}")
+    raise OptionError(f"version: expected 1 or 2, got {version}")
 
 
-def _told(node: RosNode, topic: str) -> Camera:
-    """The calibration that a topic tells."""
+def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:
+    """The calibration that is published on a topic."""
     if not topic:
-        raise CalibrationError("--camera: expected a calibration, or a topic that has it")
-    console.say(f"waiting for the calibration on {topic}")
-    message = node.wait_for(topic, "sensor_msgs/msg/CameraInfo", _PATIENCE_S)
+        raise OptionError("camera: expected a calibration, or a topic that has it")
+    progress.message(f"waiting for the calibration on {topic}")
+    message = node.wait_for(topic, "sensor_msgs/msg/CameraInfo", _CAMERA_INFO_TIMEOUT_S)
     if message is None:
         raise BackendError(
-            f"--camera-info-topic: expected a calibration on {topic} within {_PATIENCE_S:g} s, got none"
+            f"camera_info_topic: expected a calibration on {topic} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
         )
     return camera_from_message(message)

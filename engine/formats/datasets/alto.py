@@ -49,7 +49,7 @@ def read_alto(root: Path, part: str, gsd_m: float | None = None) -> DatasetSeque
         OptionError: the pixel size is out of range.
     """
     if gsd_m is not None and not 1e-3 <= gsd_m <= 100.0:
-        raise OptionError(f"--gsd-m: expected 0.001 to 100 metres, got {gsd_m:g}")
+        raise OptionError(f"gsd_m: expected 0.001 to 100 metres, got {gsd_m:g}")
     table = root / part / "query.csv"
     rows = list(read_table(table, ("name", "easting", "northing", "altitude", *_QUATERNION)))
     if not rows:

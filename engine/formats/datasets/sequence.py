@@ -106,12 +106,12 @@ class ImportOptions:
 
     def __post_init__(self) -> None:
         if self.datum is not None and self.datum not in DATUMS:
-            raise OptionError(f"--height-is: expected one of {', '.join(DATUMS)}, got {self.datum!r}")
+            raise OptionError(f"datum: expected one of {', '.join(DATUMS)}, got {self.datum!r}")
         hfov_deg = None if isinstance(self.camera, Path) else self.camera
         for name, unit, value, (low, high) in (
-            ("--hfov-deg", "degrees", hfov_deg, HFOV_DEG),
-            ("--interval-s", "seconds", self.interval_s, INTERVAL_S),
-            ("--ground-m", "metres", self.ground_m, GROUND_M),
+            ("hfov_deg", "degrees", hfov_deg, HFOV_DEG),
+            ("interval_s", "seconds", self.interval_s, INTERVAL_S),
+            ("ground_m", "metres", self.ground_m, GROUND_M),
         ):
             if value is not None and not low <= value <= high:
                 raise OptionError(f"{name}: expected {low:g} to {high:g} {unit}, got {value:g}")
@@ -125,8 +125,8 @@ def check_complete(sequence: DatasetSequence, options: ImportOptions) -> None:
         TelemetryError, CalibrationError: there are no images, or the calibration cannot be read.
     """
     if options.map is None and sequence.map is None:
-        raise OptionError("--map: expected a map, since the data set has none")
-    for name, path in (("--map", options.map), ("--surface", options.surface)):
+        raise OptionError("map: expected a map, since the data set has none")
+    for name, path in (("map", options.map), ("surface", options.surface)):
         if path is not None and not path.is_file():
             raise OptionError(f"{name}: expected an existing file, got {path}")
     if isinstance(options.camera, Path):
@@ -144,7 +144,7 @@ def clear_frames(out: Path) -> None:
     """
     frames = out / "frames"
     if frames.is_symlink():
-        raise OptionError(f"--out: expected {frames} to be a folder of its own, got a link to {frames.resolve()}")
+        raise OptionError(f"out: expected {frames} to be a folder of its own, got a link to {frames.resolve()}")
     imported = _imported(out)
     for file in frames.iterdir() if frames.is_dir() else ():
         if file.is_symlink() or (file.name in imported and file.is_file()):
@@ -184,12 +184,12 @@ def write_sequence(out: Path, sequence: DatasetSequence, options: ImportOptions)
         _telemetry_row(image, stamp_ns, datum, options, first=not k) for k, (image, stamp_ns) in enumerate(images)
     ]
     if datum is None and any(image.height_m is not None for image, _ in images):
-        notes += ("heights are left out: the authors do not say what they are counted from, --height-is does",)
+        notes += ("heights are left out: the authors do not say what they are counted from, `datum` does",)
     elif options.ground_m is not None and (count := _below_ground(images, datum, options.ground_m)):
-        notes += (f"heights of {count} of {len(images)} pictures are left out: they are not above --ground-m",)
+        notes += (f"heights of {count} of {len(images)} pictures are left out: they are not above `ground_m`",)
     elif datum not in (None, "agl") and options.ground_m is None:
         notes += (
-            f"heights above the ground are unknown: they are {datum}, and --ground-m gives the ground's level",
+            f"heights above the ground are unknown: they are {datum}, and `ground_m` gives the ground's level",
         )
     # Written first: it marks the images as imported.
     about: dict[str, Any] = {"dataset": sequence.dataset, "part": sequence.part, "notes": notes}
@@ -225,7 +225,7 @@ def _in_time(
     kept: list[tuple[SequenceImage, int]] = []
     for image in present:
         if image.timestamp_ns is None:
-            raise OptionError("--interval-s: expected seconds between pictures, since the data set has no times")
+            raise OptionError("interval_s: expected seconds between pictures, since the data set has no times")
         if not kept or image.timestamp_ns > kept[-1][1]:
             kept.append((image, image.timestamp_ns))
     if len(kept) < len(present):

@@ -103,14 +103,14 @@ def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> t
         if log.captures_ns.size != len(source.names):
             raise TelemetryError(
                 f"{log.path}: expected a camera message for each of {len(source.names)} pictures, got "
-                f"{log.captures_ns.size}; say when they were taken with --frame-stamps"
+                f"{log.captures_ns.size}; say when they were taken with `frame_stamps`"
             )
         return [int(stamp_ns) for stamp_ns in log.captures_ns], list(source.names)
     rows = exif_telemetry([source.path / name for name in source.names])
     if not rows:
         raise TelemetryError(
             f"{log.path}: expected to know when the pictures were taken: it has no camera messages, they have no "
-            "EXIF times, and no --frame-stamps was given"
+            "EXIF times, and no `frame_stamps` was given"
         )
     return [row.timestamp_ns for row in rows], [row.frame for row in rows]
 

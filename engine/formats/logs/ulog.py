@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import TelemetryError
+from engine.errors import TelemetryError, require
 from engine.formats.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
 
 HEAD = b"ULog\x01\x12\x35"
@@ -48,7 +48,8 @@ def read_ulog(path: Path) -> FlightLog:
     """Read a ULog.
 
     Raises:
-        TelemetryError: the extra ``logs`` is not installed, the file is no ULog, or has no usable series.
+        MissingExtraError: pyulog is not installed.
+        TelemetryError: the file is no ULog, or has no usable series.
     """
     with path.open("rb") as file:
         head = file.read(len(HEAD))
@@ -81,15 +82,12 @@ class _LoopGuard(io.BufferedReader):
 
 def _topics(path: Path) -> dict[str, Columns]:
     """(N,) values by topic and field."""
-    try:
-        from pyulog import ULog
-    except ImportError:
-        raise TelemetryError(f"{path}: a ULog needs pyulog, the extra [logs]: pip install pyulog") from None
+    pyulog = require("pyulog", "logs")
     # The parser prints what it skips, and raises various errors on corrupt files.
     quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
     with _LoopGuard(io.FileIO(path)) as file, quiet[0], quiet[1]:
         try:
-            log: Any = ULog(file, [*_TOPICS, *_FALLBACKS.values()])
+            log: Any = pyulog.ULog(file, [*_TOPICS, *_FALLBACKS.values()])
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise TelemetryError(f"{path}: expected a ULog that can be read: {reason}") from None

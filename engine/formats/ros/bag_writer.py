@@ -64,7 +64,8 @@ def write_bag(
 
     Raises:
         OptionError: the kind is unknown or does not match the suffix, or the existing path may not be replaced.
-        TelemetryError: rosbags is not installed, a frame has no stamp, or the bag cannot be written.
+        MissingExtraError: rosbags is not installed.
+        TelemetryError: a frame has no stamp, or the bag cannot be written.
     """
     path = Path(path)
     if kind not in BAG_KINDS:
@@ -93,13 +94,13 @@ def check_replaceable(path: Path, replace: bool) -> None:
     if not (path.exists() or path.is_symlink()):
         return
     if not replace:
-        raise OptionError(f"--out: {path} exists; choose another name, or add --force to replace it")
+        raise OptionError(f"path: {path} exists; choose another name, or add `replace` to replace it")
     if path.is_dir():
         parts = {file for pattern in _PARTS for file in path.glob(pattern)}
         others = sorted(set(path.iterdir()) - parts)
         if others or path.is_symlink():
             cause = f"it also contains {others[0].name}" if others else "it is a link"
-            raise OptionError(f"--out: expected a bag in {path} to replace, but {cause}")
+            raise OptionError(f"path: expected a bag in {path} to replace, but {cause}")
 
 
 @contextmanager
@@ -162,7 +163,7 @@ def _write_truth(write: Write, messages: MessageFactory, row: Truth) -> None:
 @contextmanager
 def _bag_writer(path: Path, unfinished: Path, kind: str) -> Iterator[tuple[Write, MessageFactory]]:
     """A function that writes messages to a new bag, and their factory; errors name ``path``."""
-    _, typesys = import_rosbags(path)
+    _, typesys = import_rosbags()
     from rosbags import rosbag1, rosbag2
 
     ros1 = kind == "ros1"

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import CalibrationError, EngineError, TelemetryError
+from engine.errors import CalibrationError, EngineError, TelemetryError, require
 from engine.formats.frames import FrameSource
 from engine.formats.resampling import (
     FlightLog,
@@ -151,7 +151,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
         found = _topic(reader, _CALIBRATION, (beside, ""))
         first = None if found is None else next(_messages(path, reader, {found}, {_CALIBRATION}), None)
     if first is None:
-        raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with --camera")
+        raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with `camera`")
     try:
         return camera_from_message(first[2])
     except CalibrationError as error:
@@ -283,7 +283,7 @@ def _messages(
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """An open reader of the bag."""
-    highlevel, typesys = import_rosbags(path)
+    highlevel, typesys = import_rosbags()
     if not path.exists():
         raise TelemetryError(f"{path}: no such bag")
     with _readable(path):
@@ -308,14 +308,10 @@ def _readable(path: Path) -> Iterator[None]:
         raise TelemetryError(f"{path}: expected a bag that can be read: {reason}") from None
 
 
-def import_rosbags(path: Path) -> tuple[Any, Any]:
+def import_rosbags() -> tuple[Any, Any]:
     """Import the modules of rosbags for reading and for types.
 
     Raises:
-        TelemetryError: rosbags is not installed.
+        MissingExtraError: rosbags is not installed.
     """
-    try:
-        from rosbags import highlevel, typesys
-    except ImportError:
-        raise TelemetryError(f"{path}: a bag needs rosbags, the extra [bags]: pip install rosbags") from None
-    return highlevel, typesys
+    return require("rosbags.highlevel", "bags"), require("rosbags.typesys", "bags")

@@ -1,0 +1,87 @@
+"""Fit the probability that a fix is right: prints the constants of ``engine.confidence``.
+
+    python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT]
+
+On towns that no other benchmark reports on. Half of the matches have an answer; what is left out of the telemetry
+and how coarsely SIFT looks changes from match to match.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.accuracy.judged import Bench, Row
+from bench.accuracy.trials import Trial, ground
+from engine.confidence import PeakModel, PoseModel
+from engine.device import set_threads
+from engine.methods.options import SiftOptions
+
+FIT_SEEDS = (21, 22, 23, 24, 25, 26)
+MODELS = {"NCC": PeakModel, "SIFT": PoseModel}
+UNTOLD = 0.25  # how often something is left out
+SCALES = (0.5, 0.35, 0.25)  # of the frame, as a budget asks for
+
+
+def fitted(x: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, ...]:
+    """Weights by maximum likelihood, by Newton's method with a whisper of ridge that keeps it finite.
+
+    Args:
+        x: (N, K) terms.
+        right: (N,) whether each place was right.
+    """
+    weights, y = np.zeros(x.shape[1]), right.astype(np.float64)
+    for _ in range(50):
+        p = 1.0 / (1.0 + np.exp(-np.clip(x @ weights, -30, 30)))
+        hessian = (x * (p * (1.0 - p))[:, None]).T @ x + 0.1 * np.eye(x.shape[1])
+        step = np.linalg.solve(hessian, x.T @ (y - p) - 0.1 * weights)
+        weights += step
+        if np.abs(step).max() < 1e-8:
+            break
+    return tuple(float(round(w, 3)) for w in weights)
+
+
+def matched(job: tuple[int, int, int, str]) -> list[Row]:
+    """Matches of one town by one method, another town being the wrong one."""
+    seed, other, count, method = job
+    set_threads(1)
+    bench, rng = Bench(ground(seed), ground(other, map_only=True)), np.random.default_rng(seed)
+    trials = bench.trials(range(count), rng)
+    if method == "NCC":
+        return [bench.judged(made, method) for made in trials]
+    return [_by_sift(bench, made, rng) for made in trials]
+
+
+def _by_sift(bench: Bench, made: Trial, rng: np.random.Generator) -> Row:
+    frame, prior = made.frame, made.prior if rng.random() > UNTOLD else None
+    for names in (("heading_deg",), ("roll_deg", "pitch_deg"), ("height_agl_m",)):
+        if rng.random() < UNTOLD:
+            frame = replace(frame, **dict.fromkeys(names))
+    return bench.posed(made, frame, prior, SiftOptions(scale=float(rng.choice(SCALES))))
+
+
+def main() -> None:
+    """Fit, and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--matches", type=int, default=12_000, help="by each method")
+    parser.add_argument("--method", choices=MODELS)
+    options = parser.parse_args()
+    each = options.matches // len(FIT_SEEDS)
+    for method, model in MODELS.items():
+        if options.method not in (None, method):
+            continue
+        jobs = [(a, b, each, method) for a, b in zip(FIT_SEEDS, FIT_SEEDS[1:] + FIT_SEEDS[:1], strict=True)]
+        with ProcessPoolExecutor(2) as pool:
+            found = [row for part in pool.map(matched, jobs) for row in part if row.terms]
+        right = np.array([row.right for row in found])
+        weights = model(*fitted(np.array([row.terms for row in found]), right))
+        wrong = int((~right).sum())
+        print(f"{weights}\n{each * len(jobs)} matches, {len(found)} found something, {wrong} wrong", flush=True)
+
+
+if __name__ == "__main__":
+    main()

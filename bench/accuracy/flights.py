@@ -1,0 +1,213 @@
+"""Whole flights by SIFT, through the Navigator, beside OpenCV's features and the paper's recipe.
+
+    python -m bench.accuracy.flights [--quick] [--docs DIR]
+
+Writes docs/flights.md. The recorded flights are left out where they are not there; the built-in one always flies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench import DOCS, SHARED
+from bench.inputs.views import FRAMES
+from bench.pages import flights
+from bench.pages.flights import Run
+from bench.speed.peers import OpenCvFeatures
+from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
+from engine.device import set_threads
+from engine.formats.flight import open_flight
+from engine.formats.telemetry import ground_amsl_m
+from engine.formats.track import TrackRow, track_row
+from engine.formats.truth import interpolate_truth, read_truth
+from engine.geo import enu_from_body
+from engine.methods.options import SiftOptions
+from engine.navigator import ACCEPT_ALL, Matcher
+from engine.report.metrics import Ground, errors_en_m, summarise
+from engine.sim import plan_flight
+from engine.values import Attitude, Truth
+
+STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "nust": 2, "caliterra": 1}
+MIDDLE = ("nust",)  # whose truth is the ground in the middle of each frame, not below the camera
+START_SIGMA_M = 15.0
+SIMULATED_SEED, SIMULATED_HZ = 1, 0.56
+OURS, NO_ATTITUDE = "scenematch SIFT", "scenematch SIFT, attitude not used"
+OPENCV, PAPER = "OpenCV features, scenematch pose", "paper's SIFT"
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A flight as the navigator meets it."""
+
+    name: str
+    step: int
+    site: OrthoMap
+    camera: Camera
+    frames: list[tuple[Frame, Prior | None]]
+    truth: list[Truth]
+    ground: Ground
+
+
+def recorded(name: str, step: int, **accuracy: float | None) -> Recorded:
+    """Every ``step``-th frame of a shared flight; the accuracy of its map as :meth:`OrthoMap.open` takes it."""
+    folder = SHARED / name
+    camera, surface = Camera.load(folder / "camera.yaml"), folder / "dsm.tif"
+    site = OrthoMap.open(folder / "map.tif", surface=surface if surface.exists() else None, **accuracy)
+    flown = open_flight(folder / FRAMES.get(name, "frames"), folder / "telemetry.csv", camera)
+    frames = [(item.frame, item.prior) for index, item in enumerate(flown) if index % step == 0]
+    ground = Ground(site.ground_m, ground_amsl_m(flown.rows))
+    return Recorded(name, step, site, camera, frames, read_truth(folder / "truth.csv"), ground)
+
+
+def simulated() -> Recorded:
+    """Every second frame of the built-in flight."""
+    plan = plan_flight(SIMULATED_SEED, rate_hz=SIMULATED_HZ)
+    site = plan.town.site()
+    frames: list[tuple[Frame, Prior | None]] = [(frame, None) for frame in plan.iter_frames()]
+    return Recorded("built-in", 2, site, plan.camera, frames, plan.truth_rows(), Ground(site.ground_m))
+
+
+def fly(flight: Recorded, who: str, matcher: Matcher) -> Run:
+    """Follow the flight from its true start."""
+    first = flight.truth[0]
+    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
+    navigator = Navigator(matcher, start, options=ACCEPT_ALL if who == PAPER else None)
+    results, rows = [], []
+    for index, (frame, prior) in enumerate(flight.frames):
+        begin = time.perf_counter()
+        result = navigator.update(frame, prior)
+        spent_ms = (time.perf_counter() - begin) * 1e3
+        results.append(result)
+        if flight.name in MIDDLE and isinstance(result, Fix):
+            result = moved_to_middle(result, flight.site, flight.camera)
+        rows.append(track_row(str(index), result, latency_ms=spent_ms, deadline_met=None))
+    return _judged(flight, who, results, rows)
+
+
+def _judged(flight: Recorded, who: str, results: list[Fix | NoFix], rows: list[TrackRow]) -> Run:
+    shares = [result.score for result in results if isinstance(result, Fix)]
+    return Run(
+        flight.name,
+        who,
+        flight.step,
+        summarise(rows, flight.truth, frame=flight.site.frame, ground=flight.ground),
+        errors_en_m(rows, flight.truth, flight.site.frame).distance_m,
+        float(np.mean(shares)) if shares else None,
+        attitude_rms_deg(results, flight.truth),
+    )
+
+
+def moved_to_middle(fix: Fix, site: OrthoMap, camera: Camera) -> Fix:
+    """The fix at the ground that the middle of its frame shows, where it has a pose."""
+    if fix.attitude is None or fix.up_m is None:
+        return fix
+    ray = _turn(fix.attitude) @ camera.mount @ camera.frame_rays[4]
+    east, north = np.array([fix.east_m, fix.north_m]) + ray[:2] * (fix.up_m - site.ground_m) / -ray[2]
+    lat, lon = site.frame.geodetic_from_enu(east, north)
+    return replace(fix, east_m=float(east), north_m=float(north), lat_deg=float(lat), lon_deg=float(lon))
+
+
+def attitude_rms_deg(results: list[Fix | NoFix], truth: list[Truth]) -> float | None:
+    """RMS of the angle of the whole rotation from true to measured attitude; None where none is known."""
+    angles = []
+    for result in results:
+        true = None if result.timestamp_ns is None else interpolate_truth(truth, result.timestamp_ns)
+        if isinstance(result, Fix) and result.attitude is not None and true is not None:
+            if true.heading_deg is None or true.roll_deg is None or true.pitch_deg is None:
+                continue
+            between = _turn(result.attitude) @ _turn(Attitude(true.roll_deg, true.pitch_deg, true.heading_deg)).T
+            angles.append(math.degrees(float(np.linalg.norm(cv2.Rodrigues(between)[0]))))
+    return float(np.sqrt(np.mean(np.square(angles)))) if angles else None
+
+
+def _turn(attitude: Attitude) -> NDArray[np.float64]:
+    return enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
+
+
+def methods(flight: Recorded) -> Iterator[tuple[str, Matcher]]:
+    """The four that every flight is flown by."""
+    yield OURS, _engine(flight, SiftOptions())
+    yield NO_ATTITUDE, _engine(flight, SiftOptions(use_attitude=False))
+    yield OPENCV, OpenCvFeatures(flight.site, flight.camera, prepared=True)
+    yield PAPER, SceneMatcher(flight.site, flight.camera, "sift", "cpu", MatcherOptions(profile="paper"))
+
+
+def _engine(flight: Recorded, options: SiftOptions) -> SceneMatcher:
+    matcher = SceneMatcher(flight.site, flight.camera, "sift", "cpu", MatcherOptions(sift=options))
+    matcher.warmup()
+    return matcher
+
+
+# ------------------------------------------------------------------------- what the telemetry does not tell
+
+
+def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
+    """Name, what becomes of each frame's telemetry (a number multiplies the height), and the options.
+
+    ``height_factor`` says how wrong the height may be; without such a setting the defaults fly.
+    """
+    factor = {"height_factor": 2.0} if "height_factor" in SiftOptions.__dataclass_fields__ else {}
+    wrong = SiftOptions(**factor)
+    told = f"`height_factor={factor['height_factor']:g}`" if factor else "default options"
+    unknown = {"heading_deg": None, "height_agl_m": None}
+    return [
+        ("as told", {}, SiftOptions()),
+        ("attitude told, not used", {}, SiftOptions(use_attitude=False)),
+        ("roll and pitch unknown", {"roll_deg": None, "pitch_deg": None}, SiftOptions()),
+        ("heading unknown", {"heading_deg": None}, SiftOptions()),
+        ("height unknown", {"height_agl_m": None}, SiftOptions()),
+        (f"height told as half, {told}", {"height_agl_m": 0.5}, wrong),
+        (f"height told as double, {told}", {"height_agl_m": 2.0}, wrong),
+        ("heading and height unknown", unknown, SiftOptions()),
+        ("nothing known but the start", {**unknown, "roll_deg": None, "pitch_deg": None}, SiftOptions()),
+    ]
+
+
+def retold(frame: Frame, changes: dict[str, Any]) -> Frame:
+    """The frame with other telemetry; a number given for the height is a factor on it."""
+    factor = changes.get("height_agl_m")
+    if factor is not None and frame.height_agl_m is not None:
+        changes = {**changes, "height_agl_m": factor * frame.height_agl_m}
+    return replace(frame, **changes)
+
+
+def fly_variants(flight: Recorded) -> Iterator[Run]:
+    """The built-in flight under every telemetry."""
+    for name, changes, options in variants():
+        frames = [(retold(frame, changes), prior) for frame, prior in flight.frames]
+        yield fly(replace(flight, frames=frames), name, _engine(flight, options))
+
+
+def main() -> None:
+    """Fly, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a few frames of each flight")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its picture")
+    options = parser.parse_args()
+    set_threads(1)
+    there = [(name, step) for name, step in STEPS.items() if (SHARED / name).is_dir()]
+    runs, built_in = [], simulated()
+    for name, step in [*there, (built_in.name, built_in.step)]:
+        flight = built_in if name == built_in.name else recorded(name, step)
+        if options.quick:
+            flight = replace(flight, frames=flight.frames[:8])
+        for who, matcher in methods(flight):
+            runs.append(fly(flight, who, matcher))
+            print(f"{name}, {who}: {runs[-1].summary['fixes']} of {len(flight.frames)} frames fixed", flush=True)
+    if options.quick:
+        built_in = replace(built_in, frames=built_in.frames[:8])
+    flights.write(options.docs, runs, list(fly_variants(built_in)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""One match by one method: its scores, and what became of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.accuracy.trials import Ground, Trial, prior_about, trial
+from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
+from engine.budget import Budget, Deadline
+from engine.confidence import regressors
+from engine.methods.feature_pose import PoseCandidate
+from engine.methods.ncc import Ncc, PeakCandidate
+from engine.methods.options import NccOptions, SiftOptions
+from engine.methods.query import Query
+from engine.methods.sift import Sift
+from engine.ncc_fft import surface
+from engine.pose import PoseOptions
+from engine.report.metrics import FALSE_SIGMAS, WRONG_M
+from engine.window import level_crop
+
+Array = NDArray[np.float64]
+M = TypeVar("M", Ncc, Sift)
+
+METHODS = {"NCC": 0.5, "NCC, refined": 0.2, "SIFT": 0.2, "auto": 0.1}
+"""Which share of the matches is by which."""
+SCORES = {
+    "NCC": ("probability", "NCC", "PSR", "second peak"),
+    "NCC, refined": ("probability",),
+    "SIFT": ("probability", "false alarms", "share of inliers"),
+    "auto": ("probability",),
+}
+LOOSE = PoseOptions(min_inliers=4, max_log10_nfa=2.0)  # poses that chance may make, so that there is what to judge
+_PSR_PX = 11.0
+
+
+class Row(NamedTuple):
+    """One match. Of what found nothing, ``scores`` is empty; ``squared`` is NaN where the truth is not on the map.
+
+    ``right`` is of what was found, believed or not: within 10 m of the truth, or within 3 of its own sigmas.
+    """
+
+    ground: str
+    kind: str
+    method: str
+    fixed: bool
+    right: bool
+    scores: list[float]  # as SCORES names them; higher speaks for it
+    regressors: list[float]
+    error_m: float
+    sigma_m: float
+    squared: float  # squared Mahalanobis distance from the truth
+
+
+class Bench:
+    """A ground with its maps and, made when they are needed, the matchers over them."""
+
+    def __init__(self, here: Ground, other: Ground) -> None:
+        self.here, self.other = here, other
+        self._made: dict[tuple[str, str], SceneMatcher] = {}
+
+    @cached_property
+    def maps(self) -> dict[str, OrthoMap]:
+        """By the names of :class:`bench.accuracy.trials.Trial`."""
+        here = self.here
+        return {"own": here.site, "old": here.old, "tiled": here.tiled, "other": self.other.site}
+
+    def matcher(self, on: str, method: str) -> SceneMatcher:
+        """A matcher over one of the maps."""
+        key = (on, method)
+        if key not in self._made:
+            options = MatcherOptions(ncc=NccOptions(refine=method != "NCC"))
+            engine = {"SIFT": "sift", "auto": "auto"}.get(method, "ncc")
+            self._made[key] = SceneMatcher(self.maps[on], self.here.camera, engine, "cpu", options)
+        return self._made[key]
+
+    def trials(self, numbers: range, rng: np.random.Generator) -> Iterator[Trial]:
+        """Matches by their numbers; on another map the prior is where frames of that map were taken."""
+        for number in numbers:
+            made = trial(self.here, number, rng)
+            if made.on == "other":
+                place = self.other.places_m[rng.integers(len(self.other.places_m))]
+                made = replace(made, prior=prior_about(place, rng))
+            yield made
+
+    def judged(self, made: Trial, method: str) -> Row:
+        """The match by a method as the engine is set up."""
+        matcher = self.matcher(made.on, method)
+        if method == "NCC":
+            query = _query(matcher, made.frame, made.prior)
+            ncc = _part(matcher, "ncc", Ncc)
+            found = ncc.find(query)
+            if isinstance(found, NoFix):
+                return self.row(made, method, None, False, [], [])
+            result = ncc.judge(query, found)
+            assert found.features is not None  # there is a prior, and a heading and height to trust
+            scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found)]
+            scores.append(-found.features.ratio)
+            values = regressors(found.features).tolist()
+            return self.row(made, method, found.fix, isinstance(result, Fix), scores, values)
+        if method == "SIFT":
+            return self.posed(made, made.frame, made.prior, matcher.options.sift)
+        fix = matcher.locate(made.frame, made.prior)
+        if isinstance(fix, NoFix):
+            return self.row(made, method, None, False, [], [])
+        return self.row(made, method, fix, True, [fix.confidence or 0.0], [])
+
+    def posed(self, made: Trial, frame: Frame, prior: Prior | None, options: SiftOptions) -> Row:
+        """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""
+        matcher = self.matcher(made.on, "SIFT")
+        query = _query(matcher, frame, prior)
+        sift = _part(matcher, "sift", Sift)
+        found = sift.find(query, options)
+        fixed = isinstance(found, PoseCandidate) and found.confidence >= options.min_confidence
+        if isinstance(found, NoFix):
+            found = sift.find(query, replace(options, pose=LOOSE, min_confidence=0.0))
+        if isinstance(found, NoFix):
+            return self.row(made, "SIFT", None, False, [], [])
+        scores = [found.confidence, -found.features.log10_nfa, found.fix.score]
+        return self.row(made, "SIFT", found.fix, fixed, scores, regressors(found.features).tolist())
+
+    def row(
+        self, made: Trial, method: str, fix: Fix | None, fixed: bool, scores: list[float], values: list[float]
+    ) -> Row:
+        """A match held against its truth."""
+        name, kind = self.here.name, made.kind
+        if fix is None:
+            return Row(name, kind, method, False, False, [], [], np.inf, np.nan, np.nan)
+        if made.truth_m is None:
+            return Row(name, kind, method, fixed, False, scores, values, np.inf, fix.sigma_m, np.nan)
+        error = self.here.seen_m(fix) - made.truth_m
+        error_m = float(np.hypot(*error))
+        squared = float(error @ np.linalg.solve(fix.covariance_m2[:2, :2], error))
+        right = error_m <= WRONG_M or error_m <= FALSE_SIGMAS * fix.sigma_m
+        return Row(name, kind, method, fixed, right, scores, values, error_m, fix.sigma_m, squared)
+
+
+def _query(matcher: SceneMatcher, frame: Frame, prior: Prior | None) -> Query:
+    return matcher._query(frame, prior, Deadline(Budget()))
+
+
+def _part(matcher: SceneMatcher, name: str, kind: type[M]) -> M:
+    """The method of a matcher that is only made of that one."""
+    method = matcher._method.parts.get(name, matcher._method)
+    assert isinstance(method, kind)
+    return method
+
+
+def _psr(query: Query, ncc: Ncc, found: PeakCandidate) -> float:
+    """Peak-to-sidelobe ratio: the peak above the mean of the rest, in standard deviations of the rest."""
+    crop = level_crop(query.site, found.fix.window, found.aligned.level)
+    region, template = ncc.prepared.cut(crop, found.aligned.level), found.aligned.template
+    scores = surface(region.search, template[None])[0].numpy()
+    y, x = np.unravel_index(int(scores.argmax()), scores.shape)
+    rows, columns = np.ogrid[: scores.shape[0], : scores.shape[1]]
+    rest = scores[np.hypot(rows - y, columns - x) > _PSR_PX]
+    return float((scores[y, x] - rest.mean()) / max(float(rest.std()), 1e-6)) if rest.size else 0.0

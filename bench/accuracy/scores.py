@@ -1,0 +1,286 @@
+"""Scores of NCC on simulated and recorded flights and over the seasons: ``python -m bench.accuracy.scores``.
+
+Writes docs/scores.md. Every figure comes from the engine's own steps; without the recorded data there is no page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import permutations
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+import torch
+from numpy.typing import NDArray
+
+from bench import DOCS, SHARED
+from engine import Camera, Frame, OrthoMap, Prior
+from engine.align import SCORES, enhance, to_gray
+from engine.budget import Budget, Deadline
+from engine.confidence import PriorAgreement, peak_features
+from engine.device import set_threads
+from engine.formats.flight import open_flight
+from engine.formats.truth import interpolate_truth, read_truth
+from engine.indexes.prepared import PreparedMap
+from engine.integrity import judge_peak, score_sigma
+from engine.methods.correlation import Aligned, Correlator
+from engine.methods.options import NccOptions
+from engine.methods.query import Query
+from engine.methods.scheduler import Scheduler
+from engine.ncc_fft import match_template, prepare
+from engine.sim import plan_flight
+from engine.window import level_for
+
+Gray = NDArray[np.uint8]
+
+CPU = torch.device("cpu")
+SEEDS = (7, 8, 9)
+WRONG_M = 10.0
+PRIOR_OFF_M = 20.0  # at most, per axis
+PRIOR_SIGMA_M = 12.0
+RECORDED = {
+    "gazebo-a1": ("town A1, drawn by Gazebo", "frames", 8),
+    "gazebo-a1-evening": ("town A1 in low evening light, map of noon", "frames", 8),
+    "gazebo-a2": ("town A1, flight A2 with hard turns", "frames", 8),
+    "nust": ("campus, video on a satellite map of another date", "flight.mp4", 4),
+    "caliterra": ("bare ground from 30 to 50 m, map of the same day", "frames", 1),
+}
+SEASON_PX, SEASON_REACH_PX, SEASON_WITHIN_PX, SEASON_PATCHES = 200, 100, 4.0, 12
+TIMED_PX, TIMED_RUNS = 228, 300
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A map, and frames with the truth (latitude, longitude)."""
+
+    name: str
+    site: OrthoMap
+    camera: Camera
+    frames: list[tuple[Frame, tuple[float, float]]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One search: how far off the peak is, by how many sigmas it leads its rival, and whether it is believed."""
+
+    error_m: float
+    lead: float
+    believed: bool
+
+
+# --------------------------------------------------------------------------------------------------- inputs
+
+
+def simulated(light: str) -> Iterator[Flight]:
+    for seed in SEEDS:
+        plan = plan_flight(seed, rate_hz=0.28, light=light)
+        site = plan.town.site()
+        places = [(row.lat_deg, row.lon_deg) for row in plan.truth_rows()]
+        yield Flight(f"{seed}", site, plan.camera, list(zip(plan.iter_frames(), places, strict=True)))
+
+
+def recorded(folder: Path, source: str, step: int) -> Flight:
+    surface = folder / "dsm.tif"
+    camera = Camera.load(folder / "camera.yaml")
+    site = OrthoMap.open(folder / "map.tif", surface=surface if surface.exists() else None)
+    flight, rows = open_flight(folder / source, folder / "telemetry.csv", camera), read_truth(folder / "truth.csv")
+    frames = []
+    for index, item in enumerate(flight):
+        truth = None if index % step else interpolate_truth(rows, item.frame.timestamp_ns)
+        if truth is not None:
+            frames.append((item.frame, (truth.lat_deg, truth.lon_deg)))
+    return Flight(folder.name, site, camera, frames)
+
+
+def vintages(folder: Path) -> dict[int, Gray]:
+    """The same ground by year, grey."""
+    found = {}
+    for path in sorted(folder.glob("*.tif")):
+        match = re.search(r"_(\d{4})\d{4}\.tif$", path.name)
+        assert match is not None
+        with rasterio.open(path) as data:
+            colour = np.ascontiguousarray(data.read([1, 2, 3]).transpose(1, 2, 0))
+        found[int(match[1])] = np.asarray(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), np.uint8)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------- measuring
+
+
+def fly(flight: Flight, score: str, site: OrthoMap | None = None) -> list[Trial]:
+    """Every frame searched about a place off the truth, on its own map or on one that it does not show."""
+    options = NccOptions(score=score, exhaustive=True)
+    ground = site or flight.site
+    prepared = PreparedMap(ground, CPU, options.enhance_radius_px, score)
+    pinhole = replace(flight.camera, distortion_model="plumb_bob", distortion=np.zeros(5))
+    rng = np.random.default_rng(0)
+    trials = []
+    for frame, place in flight.frames:
+        truth = flight.site.frame.enu_from_geodetic(*place)
+        east, north = truth + rng.uniform(-PRIOR_OFF_M, PRIOR_OFF_M, 2)
+        prior = Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
+        gray = flight.camera.undistort(to_gray(frame))
+        query = Query(frame, gray, pinhole, ground, prior, CPU, Scheduler(Deadline(Budget()), CPU))
+        trials.append(search(query, prepared, options, truth))
+    return trials
+
+
+def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDArray[np.float64]) -> Trial:
+    """The steps of engine/methods/ncc.py, keeping the rival of the peak also where it is refused."""
+    refused = Trial(np.inf, 0.0, False)
+    site, height_m = query.site, query.frame.height_agl_m
+    assert height_m is not None
+    level = level_for(site.gsd_m_per_px, height_m / query.camera.focal_px, site.levels)
+    correlator = Correlator(query, prepared, options)
+    aligned = correlator.align(query.telemetry, level)
+    if not isinstance(aligned, Aligned):
+        return refused
+    window = correlator.window(aligned)
+    peak = None if window is None else correlator.search(aligned, window)
+    if peak is None:
+        return refused
+    pixels = aligned.template.numel()
+    nadir = site.full_from_level(np.array([peak.x, peak.y]) - aligned.patch.offset_px, level)
+    error_m = float(np.hypot(*(site.enu_from_pixel(nadir) - truth)))
+    lead = (peak.score - peak.second_score) / score_sigma(pixels)
+    at_prior = peak_features(peak, score_sigma(pixels), PriorAgreement(0.0, 1.0))
+    believed = judge_peak(peak, pixels, at_prior, None, options.rule) is None
+    return Trial(error_m, lead if error_m <= WRONG_M else -lead, believed)
+
+
+def seasons(years: dict[int, Gray], pairs: list[tuple[int, int]], score: str) -> tuple[list[float], list[float]]:
+    """Per pair of years the share of patches that are found, and of all patches the lead."""
+    maps = {year: prepare(torch.from_numpy(enhance(gray, score=score))) for year, gray in years.items()}
+    rng = np.random.default_rng(0)
+    shares, leads = [], []
+    for old, new in pairs:
+        rows, columns = years[old].shape
+        found = 0
+        for _ in range(SEASON_PATCHES):
+            x, y = (int(rng.integers(SEASON_REACH_PX, n - SEASON_PX - SEASON_REACH_PX)) for n in (columns, rows))
+            patch = np.ascontiguousarray(years[old][y : y + SEASON_PX, x : x + SEASON_PX])
+            side = SEASON_PX + 2 * SEASON_REACH_PX
+            window = maps[new].crop(x - SEASON_REACH_PX, y - SEASON_REACH_PX, side, side)
+            template = torch.from_numpy(enhance(patch, score=score))
+            peak = match_template(window, template, exclusion_px=6.0, exhaustive=True)
+            right = np.hypot(peak.x - SEASON_REACH_PX, peak.y - SEASON_REACH_PX) <= SEASON_WITHIN_PX
+            lead = (peak.score - peak.second_score) / score_sigma(template.numel())
+            leads.append(lead if right else -lead)
+            found += bool(right)
+        shares.append(found / SEASON_PATCHES)
+    return shares, leads
+
+
+def median_ms(score: str) -> float:
+    gray = np.random.default_rng(0).integers(0, 256, (TIMED_PX, TIMED_PX)).astype(np.uint8)
+    spent = []
+    for _ in range(TIMED_RUNS):
+        start = time.perf_counter()
+        enhance(gray, score=score)
+        spent.append(time.perf_counter() - start)
+    return float(np.median(spent) * 1e3)
+
+
+# ---------------------------------------------------------------------------------------------------- writing
+
+
+def flown(trials: list[Trial]) -> str:
+    fixes = np.array([trial.error_m for trial in trials if trial.believed])
+    right = fixes[fixes <= WRONG_M]
+    rms = f"{np.sqrt(np.mean(right**2)):.2f} m" if len(right) else "-"
+    wrong, lead = len(fixes) - len(right), float(np.median([trial.lead for trial in trials]))
+    return f"{len(fixes)}, {wrong}, {rms}, {lead:.1f}"
+
+
+def chance(trials: list[Trial]) -> str:
+    """The lead of places that are not there; it is negative by the sign of wrong ones."""
+    highest = float(np.quantile([-trial.lead for trial in trials], 0.95))
+    return f"{sum(trial.believed for trial in trials)}, {highest:.2f}"
+
+
+def found(shares: list[float], leads: list[float]) -> str:
+    return f"{100 * np.mean(shares):.1f} %, {100 * min(shares):.0f} %, {np.median(leads):.1f}"
+
+
+def per_score(cell: Callable[[str], str]) -> list[str]:
+    return [cell(score) for score in SCORES]
+
+
+def measure(data: Path) -> list[list[str]]:
+    """Rows of the table of figures, the first cell of each saying what was measured."""
+    rows = []
+    for light in ("noon", "evening"):
+        flights = list(simulated(light))
+        count = sum(len(flight.frames) for flight in flights)
+        cells = per_score(lambda score, f=flights: flown([t for one in f for t in fly(one, score)]))
+        rows.append([f"simulated towns, {light} ({count}); fitted on", *cells])
+        others = list(zip(flights, flights[1:] + flights[:1], strict=True))
+        cells = per_score(lambda s, o=others: chance([t for one, other in o for t in fly(one, s, other.site)]))
+        rows.append([f"the same on the map of another town ({count}); fitted on", *cells])
+    for name, (title, source, step) in RECORDED.items():
+        flight = recorded(data / name, source, step)
+        rows.append([f"{title} ({len(flight.frames)})", *per_score(lambda score, f=flight: flown(fly(f, score)))])
+    years = vintages(data / "naip")
+    pairs = list(permutations(years, 2))
+    fitted = [pair for pair in pairs if not (pair[0] % 2 or pair[1] % 2)]
+    for title, part in (("fitted on", fitted), ("the other pairs", [p for p in pairs if p not in fitted])):
+        cells = per_score(lambda score, p=part: found(*seasons(years, p, score)))
+        rows.append([f"years of farmland, {len(part)} pairs ({len(part) * SEASON_PATCHES}); {title}", *cells])
+    rows.append([f"time for {TIMED_PX} x {TIMED_PX} px", *per_score(lambda score: f"{median_ms(score):.2f} ms")])
+    return rows
+
+
+PAGE = f"""# Scores: what is correlated
+
+`NccOptions.score` says what goes into the zero-mean NCC. `engine.align.enhance` computes it from the grey levels,
+once for the map and once for each frame, alike; matching itself does not change, and nodata takes no part.
+
+| score | what it is | when |
+|---|---|---|
+| `"grey"` | the grey levels, smoothed by 1-2-1 | map and frames of the same day and light |
+| `"local"` | less their neighbourhood's mean, over its deviation | the default: light, haze, sensors differ |
+| `"gradient"` | the same of the gradient's magnitude | another season turns tones round; wants sharp pictures |
+| `"mixed"` | the sum of local and gradient | fields and crops of another season or year; takes the time of both |
+
+`NccOptions.enhance_radius_px` is the neighbourhood of the last three. Plain NCC, without means taken off, is
+equation 1 of the paper: `ncc(search, templates, zero_mean=False)` and `profile="paper"`.
+
+## Measured
+
+One thread, every place of the window scored; height, heading and tilt from the telemetry, the prior up to
+{PRIOR_OFF_M:.0f} m off per axis. Lead is the median distance of the peak from its rival in sigmas of the score
+([integrity](integrity.md)), negative where the peak is at a wrong place.
+
+- Flights (frames): **fixes, wrong ones** by more than {WRONG_M:.0f} m, **RMS of the others, lead**.
+- Map of another town (frames): **places believed**, all wrong; the **lead that 95 % of the peaks stay below**.
+- Years of farmland (patches), one year on the map of another, {SEASON_PX} x {SEASON_PX} px of 5 m, searched
+  {SEASON_REACH_PX} px to each side: **found within {SEASON_WITHIN_PX:.0f} px, the same of the worst pair, lead**.
+- Rows that say "fitted on" chose the scores and their settings; the others only judge them.
+
+"""
+
+
+def table(rows: list[list[str]]) -> str:
+    head = ["measured on", *(f'`"{score}"`' for score in SCORES)]
+    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, default=SHARED, help="recorded flights")
+    parser.add_argument("--page", type=Path, default=DOCS / "scores.md", help="what to write")
+    options = parser.parse_args()
+    set_threads(1)
+    cv2.setNumThreads(1)
+    options.page.write_text(PAGE + table(measure(options.data)) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

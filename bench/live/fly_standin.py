@@ -1,0 +1,119 @@
+"""A stand-in autopilot that flies a flight folder in real time, for a bridge beside it on the bench.
+
+``python -m bench.live.fly_standin FLIGHT [--port N] [--firmware ardupilot|px4] [--seconds S]``, before or after
+the bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT holds a ``telemetry.csv``
+and a ``truth.csv`` with heights and attitude, as ``scenematch simulate`` writes them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
+from engine.formats.telemetry import read_telemetry
+from engine.formats.truth import read_truth
+from engine.geo import LocalFrame
+
+FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
+_REPORT_S = 5.0
+
+
+def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]:
+    """The truth of a flight folder: where it was so long after its first picture, about where, how long."""
+    rows = read_truth(flight / "truth.csv")
+    first_ns = read_telemetry(flight / "telemetry.csv")[0].timestamp_ns
+    place = LocalFrame(rows[0].lat_deg, rows[0].lon_deg)
+    enu = np.array([place.enu_from_geodetic(row.lat_deg, row.lon_deg) for row in rows])
+    time_s = np.array([(row.timestamp_ns - first_ns) * 1e-9 for row in rows])
+    velocity = np.gradient(enu, time_s, axis=0)
+    headings = np.rad2deg(np.unwrap(np.deg2rad([row.heading_deg for row in rows])))
+    attitude = [[row.height_agl_m, row.roll_deg, row.pitch_deg] for row in rows]
+    columns = np.column_stack([enu[:, :2], attitude, headings, velocity[:, :2]]).astype(float)
+
+    def motion(seconds: float) -> State:
+        return State(*(float(np.interp(seconds, time_s, column)) for column in columns.T))
+
+    return motion, place, float(time_s[-1])
+
+
+def wait_for_bridge(port: int) -> None:
+    """Until somebody listens on a UDP port of loopback: what is sent to one that nobody has comes back refused."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("127.0.0.1", port))
+        while True:
+            try:
+                probe.send(b"")
+                time.sleep(0.01)
+                probe.send(b"")
+                return
+            except ConnectionRefusedError:
+                time.sleep(0.02)
+
+
+def fly(flight: Path, port: int, firmware: str, seconds: float | None = None) -> dict[str, Any]:
+    """Fly until the flight or the time is over; returns how many fixes came, and how far off half of them were."""
+    motion, place, duration_s = recorded(flight)
+    wait_for_bridge(port)
+    clock = RealClock()
+    begin_ns, errors = clock(), []
+
+    def now(time_s: float) -> State:
+        return motion(time_s - begin_ns * 1e-9)
+
+    def on_fix(message: Any, arrived_ns: int) -> None:
+        errors.append(off_m(message, now, pilot))
+
+    agenda = Agenda(clock)
+    pilot = Standin(agenda, port, now, place, on_fix, firmware=FIRMWARES[firmware])
+    agenda.every(2 * MS, pilot.poll, clock())
+    agenda.every(round(_REPORT_S * S), lambda: print(summary(errors), flush=True), clock() + round(_REPORT_S * S))
+    try:
+        agenda.run(begin_ns + round(min(duration_s, math.inf if seconds is None else seconds) * S))
+    finally:
+        pilot.close()
+    return {"fixes": len(errors), "median_m": float(np.median(errors)) if errors else None}
+
+
+def off_m(message: Any, motion: Callable[[float], State], pilot: Standin) -> float:
+    """How far a fix is from where the vehicle was when its picture was taken."""
+    kind = message.get_type()
+    captured_us = message.usec if kind == "VISION_POSITION_ESTIMATE" else message.time_usec
+    if kind == "GLOBAL_POSITION_SENSOR":
+        captured_us -= message.processing_time
+    if kind in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
+        east, north = pilot.place.enu_from_geodetic(message.lat * 1e-7, message.lon * 1e-7)[:2]
+    else:
+        east, north = message.y, message.x
+    was = motion(captured_us * 1e-6)
+    return math.hypot(east - was.east_m, north - was.north_m)
+
+
+def summary(errors: list[float]) -> str:
+    """One line."""
+    return f"{len(errors)} fixes" + (f", half within {np.median(errors):.2f} m" if errors else "")
+
+
+def main() -> None:
+    """Fly, and print what came."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("flight", type=Path)
+    parser.add_argument("--port", type=int, default=14550)
+    parser.add_argument("--firmware", choices=FIRMWARES, default="ardupilot")
+    parser.add_argument("--seconds", type=float)
+    arguments = parser.parse_args()
+    print(f"waits for a bridge on UDP port {arguments.port} of this machine", flush=True)
+    came = fly(arguments.flight, arguments.port, arguments.firmware, arguments.seconds)
+    print(f"landed; {came['fixes']} fixes" + (f", half within {came['median_m']:.2f} m" if came["fixes"] else ""))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""Sequences of frames as nobody should send them: does each end in a fix, a refusal or a documented error?
+
+    python -m bench.live.sequences [COUNT [FIRST]]
+
+Gaps, duplicates, reordered and backward stamps, NaN priors, flat, black and saturated frames, wrong shapes and
+types, impossible telemetry; a real matcher on a tiny map. Prints what became of the frames, one JSON object.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from engine import (
+    Camera,
+    EngineError,
+    Fix,
+    Frame,
+    MatcherOptions,
+    Navigator,
+    NoFix,
+    OrthoMap,
+    Prior,
+    SceneMatcher,
+    device,
+)
+from engine.methods.options import SiftOptions
+from engine.pose import PoseOptions
+
+SIDE_PX, MAP_PX, GSD_M = 64, 192, 0.5
+HEIGHT_M = GSD_M * SIDE_PX / (2.0 * math.tan(math.radians(30.0)))  # a pixel of the frame is one of the map
+SECOND = 1_000_000_000
+SPEED_PX_S = 10
+METHODS = ("ncc", "sift", "auto")
+
+IMAGES = ("right", "noise", "flat", "black", "saturated", "small", "float", "rgba", "empty")
+STAMPS = ("next", "gap", "same", "before", "long before", "none", "far future")
+PRIORS = ("none", "right", "wide", "wrong", "off the map", "far away", "NaN", "both", "negative")
+TELEMETRY = (
+    "right", "no heading", "no height", "nothing", "wrong heading", "tilted", "upside down", "tiny", "huge", "NaN",
+    "below ground", "fast", "faster than light",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is wrong with one frame: one word of each of the lists above."""
+
+    image: str
+    stamp: str
+    prior: str
+    telemetry: str
+
+
+def random_steps(rng: np.random.Generator, count: int) -> list[Step]:
+    """Steps of which so many, drawn once for all, are as they should be in each respect."""
+    right = rng.choice([0.3, 0.8, 0.95])
+
+    def word(words: Sequence[str]) -> str:
+        return words[0] if rng.random() < right else str(rng.choice(words))
+
+    return [Step(*map(word, (IMAGES, STAMPS, PRIORS, TELEMETRY))) for _ in range(count)]
+
+
+class Ground:
+    """A tiny map with its matchers, and the frames that are taken over it."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(3)
+        fine, broad = (cv2.GaussianBlur(rng.normal(size=(MAP_PX, MAP_PX)), (0, 0), s) for s in (1.0, 4.0))
+        mixed = fine / fine.std() + broad / broad.std()
+        self.gray = np.clip(128.0 + 35.0 * mixed, 0, 255).astype(np.uint8)
+        to_crs = np.array([[GSD_M, 0.0, 5e5], [0.0, -GSD_M, 5.3e6]])
+        self.site = OrthoMap.from_arrays(self.gray, to_crs, "EPSG:32633")
+        self.camera = Camera.from_fov(SIDE_PX, SIDE_PX, 60.0)
+        # The frame is too small to be halved, and for matches 16 px apart to be many.
+        options = MatcherOptions(sift=SiftOptions(scale=1.0, pose=PoseOptions(distinct_px=4.0)))
+        self.matchers = {m: SceneMatcher(self.site, self.camera, m, "cpu", options) for m in METHODS}
+
+    def frame(self, step: Step, stamp_ns: int | None, time_ns: int) -> Frame:
+        """The frame of a step; the vehicle flies along the map's diagonal and back."""
+        x = y = self.corner_px(time_ns)
+        image: Any = self.gray[y : y + SIDE_PX, x : x + SIDE_PX]
+        if step.image == "noise":
+            image = np.random.default_rng(abs(time_ns)).integers(0, 256, image.shape, dtype=np.uint8)
+        elif step.image in ("flat", "black", "saturated"):
+            image = np.full_like(image, {"flat": 90, "black": 0, "saturated": 255}[step.image])
+        elif step.image == "small":
+            image = image[: SIDE_PX // 2]
+        elif step.image == "float":
+            image = image.astype(np.float32)
+        elif step.image == "rgba":
+            image = np.repeat(image[..., None], 4, axis=2)
+        elif step.image == "empty":
+            image = image[:0]
+        return Frame(image, stamp_ns, **self.telemetry(step))
+
+    def telemetry(self, step: Step) -> dict[str, float | None]:
+        """Of a step, by the names of :class:`engine.Frame`."""
+        right = {"height_agl_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
+        wrong: dict[str, dict[str, float | None]] = {
+            "no heading": {"heading_deg": None},
+            "no height": {"height_agl_m": None},
+            "nothing": dict.fromkeys(right),
+            "wrong heading": {"heading_deg": -1e9},
+            "tilted": {"roll_deg": 85.0, "pitch_deg": -70.0},
+            "upside down": {"roll_deg": 180.0},
+            "tiny": {"height_agl_m": 1e-9},
+            "huge": {"height_agl_m": 1e12},
+            "NaN": {"pitch_deg": math.nan},
+            "below ground": {"height_agl_m": -3.0},
+            "fast": {"east_velocity_mps": 3.5, "north_velocity_mps": -3.5},
+            "faster than light": {"east_velocity_mps": 1e12, "north_velocity_mps": -1e12},
+        }
+        return {**right, **wrong.get(step.telemetry, {})}
+
+    def prior(self, step: Step, time_ns: int) -> Prior | None:
+        """The prior of a step."""
+        middle = self.corner_px(time_ns) + (SIDE_PX - 1) / 2.0
+        east, north = (float(v) for v in self.site.enu_from_pixel(np.array([middle, middle])))
+        sigma_m = {"wide": 500.0, "far away": 1e12, "negative": -1.0}.get(step.prior, 3.0)
+        if step.prior == "none":
+            return None
+        if step.prior == "NaN":
+            return Prior(east_m=math.nan, north_m=north, sigma_m=math.nan)
+        if step.prior == "both":
+            return Prior(east_m=east, north_m=north, lat_deg=48.0, lon_deg=15.0, sigma_m=1.0)
+        off_m = {"wrong": 20.0, "off the map": 1e4, "far away": 1e12}.get(step.prior, 0.0)
+        return Prior(east_m=east + off_m, north_m=north, sigma_m=sigma_m)
+
+    def corner_px(self, time_ns: int) -> int:
+        """Column and row where the frame of a moment begins."""
+        last = MAP_PX - SIDE_PX
+        return last - abs(time_ns * SPEED_PX_S // SECOND % (2 * last) - last)
+
+
+def stamp_after(kind: str, newest_ns: int, number: int) -> int | None:
+    """The stamp of a step after the newest that came."""
+    steps_s = {"next": 0.2, "gap": 60.0, "same": 0.0, "before": -0.3, "long before": -500.0, "far future": 1e8}
+    return (
+        None if kind == "none" else newest_ns + round(steps_s[kind] * SECOND) + (number if kind == "before" else 0)
+    )
+
+
+def fly(ground: Ground, steps: Sequence[Step], method: str, *, start: bool) -> Counter[str]:
+    """Fly a sequence; returns how often each ending came.
+
+    Raises:
+        AssertionError: a frame ended in something else, or a fix without a sound covariance or with another
+            frame's stamp.
+    """
+    newest_ns = SECOND
+    begin = ground.prior(Step("right", "next", "right", "right"), newest_ns) if start else None
+    navigator, endings, resets = Navigator(ground.matchers[method], begin), Counter[str](), 0
+    for number, step in enumerate(steps):
+        stamp = stamp_after(step.stamp, newest_ns, number)
+        time_ns = newest_ns if stamp is None else stamp
+        try:
+            result = navigator.update(ground.frame(step, stamp, time_ns), ground.prior(step, time_ns))
+        except EngineError as error:
+            endings[type(error).__name__] += 1
+            continue
+        finally:
+            check(navigator, resets)
+            resets = navigator.reset_count
+        newest_ns = max(newest_ns, time_ns)
+        assert result.timestamp_ns == stamp
+        endings["fix" if isinstance(result, Fix) else result.reason.value] += 1
+        assert isinstance(result, NoFix) or is_sound(result.covariance_m2), result
+    return endings
+
+
+def check(navigator: Navigator, resets: int) -> None:
+    """What holds between any two frames."""
+    prediction, age_s = navigator.prediction, navigator.anchor_age_s
+    assert prediction is None or math.isfinite(prediction.sigma_m)
+    assert age_s is None or age_s >= 0.0
+    assert navigator.reset_count >= resets
+    assert navigator.tracking or not navigator.healthy
+
+
+def is_sound(covariance_m2: Any) -> bool:
+    """Whether a covariance is (3, 3), finite, symmetric and positive definite."""
+    finite = covariance_m2.shape == (3, 3) and np.isfinite(covariance_m2).all()
+    return bool(
+        finite and np.allclose(covariance_m2, covariance_m2.T) and np.linalg.eigvalsh(covariance_m2)[0] > 0.0
+    )
+
+
+def main() -> None:
+    """Fly 10,000 sequences, or as many as are asked for, from seed ``FIRST`` on."""
+    device.set_threads(1)
+    warnings.simplefilter("error")
+    count = int(sys.argv[1]) if sys.argv[1:] else 10_000
+    first = int(sys.argv[2]) if sys.argv[2:] else 0
+    ground, endings = Ground(), Counter[str]()
+    for seed in range(first, first + count):
+        rng = np.random.default_rng(seed)
+        steps = random_steps(rng, int(rng.integers(1, 24)))
+        try:
+            endings += fly(ground, steps, METHODS[seed % 3], start=bool(rng.integers(2)))
+        except Exception as error:
+            raise AssertionError(f"sequence {seed}: {steps}") from error
+    print(json.dumps({"sequences": count, "frames": endings.total(), "endings": dict(endings.most_common())}))
+
+
+if __name__ == "__main__":
+    main()

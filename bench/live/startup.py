@@ -1,0 +1,89 @@
+"""From the start of the process to the first fix: each part, with kept caches and without.
+
+``python -m bench.live.startup FOLDER METHOD STARTED_S`` is the measured process; it prints one JSON object.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+PARTS = ("Python", "import torch", "import engine", "open map and flight", "warm-up", "first frame")
+
+
+def startup(methods: tuple[str, ...] = ("ncc", "sift", "auto"), rounds: int = 1) -> list[Row]:
+    """Every method with everything kept from an earlier start, and the last one with less."""
+    from engine.runs.simulation import write_flight
+    from engine.sim import plan_flight
+
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        write_flight(root / "flight", plan_flight(1, frames=2))
+        # The order matters: a start keeps what it made for the next.
+        caches, uncompiled = root / "caches", root / "uncompiled"
+        last = methods[-1]
+        rows = [
+            _row(root, last, "nothing kept", caches, caches, 1),
+            _row(root, last, "map kept, nothing compiled", caches, uncompiled, 1),
+        ]
+        rows += [_row(root, method, "all kept", caches, caches, rounds) for method in methods]
+    return rows
+
+
+def _row(root: Path, method: str, kept: str, maps: Path, compiled: Path, rounds: int) -> Row:
+    """Medians of some starts, in seconds."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(maps / "maps"), "NUMBA_CACHE_DIR": str(compiled / "numba")}
+    starts = []
+    for _ in range(rounds + (kept == "all kept")):
+        command = [sys.executable, "-m", "bench.live.startup", str(root / "flight"), method, repr(time.time())]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
+        starts.append(json.loads(done.stdout))
+    starts = starts[-rounds:]  # the first of those with everything kept may still have had something to keep
+    medians = {part: statistics.median(start[part] for start in starts) for part in PARTS}
+    return {
+        "method": method,
+        "kept": kept,
+        "parts_s": medians,
+        "total_s": sum(medians.values()),
+        "fixed": all(start["fixed"] for start in starts),
+    }
+
+
+def measured() -> Row:
+    """This process, part by part."""
+    marks = [float(sys.argv[3]), time.time()]
+    import torch
+
+    torch.set_num_threads(1)
+    marks.append(time.time())
+    from engine import Camera, Fix, OrthoMap, SceneMatcher
+    from engine.device import set_threads
+    from engine.formats.flight import open_flight
+
+    set_threads(1)
+    marks.append(time.time())
+    folder = Path(sys.argv[1])
+    camera = Camera.load(folder / "camera.yaml")
+    site = OrthoMap.open(folder / "map.tif", surface=folder / "dsm.tif")
+    first = next(iter(open_flight(folder / "frames", folder / "telemetry.csv", camera)))
+    marks.append(time.time())
+    matcher = SceneMatcher(site, camera, sys.argv[2], "cpu")
+    matcher.warmup()
+    marks.append(time.time())
+    result = matcher.locate(first.frame, first.prior)
+    marks.append(time.time())
+    spent = [end - begin for begin, end in itertools.pairwise(marks)]
+    return {**dict(zip(PARTS, spent, strict=True)), "fixed": isinstance(result, Fix)}
+
+
+if __name__ == "__main__":
+    print(json.dumps(measured()))

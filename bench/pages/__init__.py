@@ -1,0 +1,1 @@
+"""What writes the measured pages and figures of docs."""

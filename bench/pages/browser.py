@@ -1,0 +1,200 @@
+"""A headless Chromium: what a page does in it, and pictures of pages for the documentation.
+
+``python -m bench.pages.browser PAGE.html docs/img/report.png [--height 1500] [--script JS] [--element CSS]``
+``python -m bench.pages.browser FLIGHT.rrd docs/img/live-view.png [--width 1500] [--height 900]``: rerun's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--hide-scrollbars",
+)
+WITHOUT_GL = ("--disable-gpu",)
+SOFTWARE_GL = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+_PATIENCE_S = 200.0
+_STILL_S = 3.0  # without a change, after which a viewer has drawn all that it has
+
+
+def missing() -> str:
+    """What a browser test lacks here, or nothing."""
+    found = [name for name in ("chromium", "chromedriver") if shutil.which(name) is None]
+    try:
+        import selenium  # noqa: F401
+    except ImportError:
+        found.append("selenium")
+    return "" if not found else f"not installed: {', '.join(found)} (apt: chromium, chromium-driver)"
+
+
+class Browser:
+    """One page at a time; what it asks the network for and tells the console is noted."""
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def open(self, page: Path | str, width_px: int, height_px: int = 900) -> None:
+        """Load a file or an address in a window of this size."""
+        self.resize(width_px, height_px)
+        self.requests()  # those of the page before, and of the browser's own first one
+        self.driver.get(page if isinstance(page, str) else page.resolve().as_uri())
+
+    def wait_until_still(self) -> None:
+        """Wait until what is shown has colours and does not change any more.
+
+        Raises:
+            TimeoutError: it is blank, or changes on and on.
+        """
+        from selenium.common.exceptions import TimeoutException
+
+        before, since = b"", time.monotonic()
+        end = since + _PATIENCE_S
+        while time.monotonic() < end:
+            try:
+                now = self.driver.get_screenshot_as_png()
+            except TimeoutException:  # it is busy drawing
+                continue
+            if now != before:
+                before, since = now, time.monotonic()
+            elif time.monotonic() - since > _STILL_S and len(now) > 50_000:  # a blank one has a few kilobytes
+                return
+            time.sleep(0.5)
+        raise TimeoutError("the page did not come to rest")
+
+    def resize(self, width_px: int, height_px: int) -> None:
+        """Change the window."""
+        size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+
+    def run(self, script: str) -> Any:
+        """What a script returns."""
+        return self.driver.execute_script(script)
+
+    def press(self, key: str) -> None:
+        """A key of the keyboard, by its name in the DOM."""
+        for kind in ("keyDown", "keyUp"):
+            codes = {"ArrowLeft": 37, "ArrowRight": 39, "Tab": 9, "Home": 36, "End": 35}
+            event = {"type": kind, "key": key, "code": key, "windowsVirtualKeyCode": codes[key]}
+            self.driver.execute_cdp_cmd("Input.dispatchKeyEvent", event)
+
+    def complaints(self) -> list[str]:
+        """What the console was told of errors and warnings."""
+        return [entry["message"] for entry in self.driver.get_log("browser")]
+
+    def requests(self) -> list[str]:
+        """The addresses that were asked for, those inside the page (data:) left out."""
+        events = (json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance"))
+        sent = (e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent")
+        return [url for url in sent if not url.startswith("data:")]
+
+    def save(self, path: Path, element: str | None = None) -> None:
+        """A picture of the window, or of one element."""
+        if element is None:
+            self.driver.save_screenshot(str(path))
+        else:
+            self.driver.find_element("css selector", element).screenshot(str(path))
+
+
+@contextmanager
+def open_browser(gl: tuple[str, ...] = WITHOUT_GL) -> Iterator[Browser]:
+    """A browser with a profile of its own, closed at the end; with ``SOFTWARE_GL`` it draws in 3D."""
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which("chromium") or ""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        for flag in (*FLAGS, *gl, f"--user-data-dir={profile}"):
+            options.add_argument(flag)
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+        driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
+        try:
+            yield Browser(driver)
+        finally:
+            driver.quit()
+
+
+@contextmanager
+def serve_recording(recording: Path) -> Iterator[str]:
+    """The address of rerun's viewer in the browser, on loopback, with a recording in it.
+
+    Raises:
+        TimeoutError: it does not begin to listen.
+    """
+    data_port, page_port = _free_port(), _free_port()
+    command = [sys.executable, "-m", "rerun_cli", "--serve-web", "--bind", "127.0.0.1"]
+    command += ["--port", str(data_port), "--web-viewer-port", str(page_port), str(recording)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    server = subprocess.Popen(command, start_new_session=True, **quiet)  # Python starts the server proper
+    try:
+        end = time.monotonic() + _PATIENCE_S
+        while not (_listens(page_port) and _listens(data_port)):
+            if time.monotonic() > end or server.poll() is not None:
+                raise TimeoutError("rerun did not begin to listen")
+            time.sleep(0.2)
+        source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
+        yield f"http://127.0.0.1:{page_port}/?url={source}&renderer=webgl&hide_welcome_screen=1"
+    finally:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as made:
+        made.bind(("127.0.0.1", 0))
+        return int(made.getsockname()[1])
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as made:
+        return made.connect_ex(("127.0.0.1", port)) == 0
+
+
+def main() -> None:
+    """Take a picture of a page, or of a recording in rerun's viewer."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("page", type=Path)
+    parser.add_argument("picture", type=Path)
+    parser.add_argument("--width", type=int, default=1280)
+    parser.add_argument("--height", type=int, default=1500)
+    parser.add_argument("--script", default="", help="run before the picture is taken")
+    parser.add_argument("--element", help="CSS selector of what is taken; all of the window unless given")
+    arguments = parser.parse_args()
+    if arguments.page.suffix == ".rrd":
+        with serve_recording(arguments.page) as address, open_browser(SOFTWARE_GL) as browser:
+            browser.open(address, arguments.width, arguments.height)
+            browser.wait_until_still()
+            browser.save(arguments.picture)
+        return
+    with open_browser() as browser:
+        browser.open(arguments.page, arguments.width, arguments.height)
+        browser.run(arguments.script)
+        browser.save(arguments.picture, arguments.element)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""docs/flights.md: the tables and the picture of what :mod:`bench.accuracy.flights` flew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bench.pages.text import machine, paragraph, table
+
+TITLES = {
+    "gazebo-a1": "town A1, drawn by Gazebo",
+    "gazebo-a2": "town A1, flight A2 with hard turns",
+    "gazebo-a1-evening": "A1 in low evening light, map of noon",
+    "nust": "campus, video on a satellite map of another date",
+    "caliterra": "bare ground from 30 to 50 m, photographs",
+    "built-in": "built-in flight",
+}
+COLOURS = ("#d55e00", "#e69f00", "#0072b2", "#999999")
+WITHIN_M = (0.1, 30.0)
+INTRO = (
+    "Made by `make bench-flights`, one run of it, on {machine}, one thread. Each flight is followed from its "
+    "true start (sigma 15 m) by the navigator, with the telemetry that was recorded; only every n-th frame is "
+    "flown, as the headings say, so that predictions reach further than in a real flight."
+)
+METHODS = (
+    "`scenematch SIFT` weighs the telemetry's heading, roll and pitch in its pose, where they are there; the "
+    "second row does not. `OpenCV features, scenematch pose` takes keypoints, descriptors and the brute-force "
+    "matcher of OpenCV in the windows of equations 4 and 5, and the same PnP; both describe the map once. "
+    "`paper's SIFT` is the paper's recipe taken literally; it refuses next to nothing."
+)
+FIGURES = (
+    "RMS and median are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **false** those "
+    "of them that are also more than 3 of their own sigmas off. Agreeing is the mean share of matches that the "
+    "pose explains. The campus has a truth good to about a metre, and it is the ground in the middle of each "
+    "frame, made without a tilt: fixes there are moved to where their own axis meets the ground before they are "
+    "scored."
+)
+VARIANTS = (
+    "The built-in flight once more, by `scenematch SIFT`, told less or told wrong. The attitude's error is the "
+    "angle of the whole rotation. A frame without height takes that of the last fix; without one, the whole map "
+    "is searched."
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one method made of one flight.
+
+    Attributes:
+        flight, who: names.
+        step: every how many frames one was flown.
+        summary: the figures of summary.json.
+        error_m: (N,) horizontal error of every frame, NaN where refused or not scored.
+        inlier_share: mean share of matches that agree with the pose, None without a fix.
+        attitude_rms_deg: None where truth has none.
+    """
+
+    flight: str
+    who: str
+    step: int
+    summary: dict[str, Any]
+    error_m: NDArray[np.float64]
+    inlier_share: float | None
+    attitude_rms_deg: float | None
+
+
+def write(docs: Path, runs: list[Run], variants: list[Run]) -> None:
+    """Write the page and its picture below ``docs``."""
+    (docs / "img").mkdir(parents=True, exist_ok=True)
+    _chart(runs).savefig(docs / "img" / "sift-flights.png", dpi=130, facecolor="white")
+    lines = ["# Flights by SIFT", "", *paragraph(INTRO.format(machine=machine()))]
+    lines += [*paragraph(METHODS), *paragraph(FIGURES)]
+    lines += ["![share of frames placed within a distance](img/sift-flights.png)", ""]
+    for flight in dict.fromkeys(run.flight for run in runs):
+        own = [run for run in runs if run.flight == flight]
+        every = f"every {own[0].step}. frame" if own[0].step > 1 else "every frame"
+        lines += [f"## {TITLES.get(flight, flight)} ({own[0].summary['frames']} frames, {every})", ""]
+        lines += _table(own, "who")
+    lines += [
+        "## Built-in flight, told less or told wrong",
+        "",
+        *paragraph(VARIANTS),
+        *_table(variants, "telemetry"),
+    ]
+    (docs / "flights.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def _table(runs: list[Run], first: str) -> list[str]:
+    columns = [
+        first,
+        "fixes",
+        "RMS m",
+        "median m",
+        "wrong",
+        "false",
+        "agreeing",
+        "height RMS m",
+        "attitude RMS deg",
+    ]
+    return table([*columns, "median ms"], [_cells(run) for run in runs])
+
+
+def _cells(run: Run) -> list[str]:
+    def shown(value: float | None, form: str = ".2f") -> str:
+        return "-" if value is None or not np.isfinite(value) else format(value, form)
+
+    got = run.summary
+    return [
+        run.who,
+        str(got["fixes"]),
+        shown(got["rms_m"]),
+        shown(got["median_m"]),
+        str(got["wrong_over_10m"]),
+        str(got["false_fixes"]),
+        shown(run.inlier_share),
+        shown(got["height_rms_m"]),
+        shown(run.attitude_rms_deg),
+        shown(got["latency_ms"]["p50"], ".1f"),
+    ]
+
+
+def _chart(runs: list[Run]) -> Figure:
+    """Share of all frames that were placed within so many metres, one panel a flight."""
+    flights, names = (list(dict.fromkeys(getattr(run, key) for run in runs)) for key in ("flight", "who"))
+    columns = min(3, len(flights))
+    figure = Figure(figsize=(3.6 * columns, 3.1 * -(-len(flights) // columns) + 0.5), layout="constrained")
+    distances = np.geomspace(*WITHIN_M, 300)
+    for index, flight in enumerate(flights):
+        ax = figure.add_subplot(-(-len(flights) // columns), columns, index + 1)
+        for run in (run for run in runs if run.flight == flight):
+            within = (run.error_m[:, None] <= distances).mean(axis=0)  # a refused frame is never within
+            colour = COLOURS[names.index(run.who) % len(COLOURS)]
+            ax.plot(distances, 100.0 * within, color=colour, linewidth=2, label=run.who if index == 0 else None)
+        ax.set_xscale("log")
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.set_ylim(0, 102)
+        ax.set_xlim(*WITHIN_M)
+        ax.set_title(TITLES.get(flight, flight), fontsize=9)
+        ax.grid(which="both", alpha=0.25)
+        if index % columns == 0:
+            ax.set_ylabel("% of frames within")
+        if index + columns >= len(flights):
+            ax.set_xlabel("metres from the truth")
+    figure.legend(loc="outside upper center", ncols=len(names), frameon=False, fontsize=9)
+    return figure

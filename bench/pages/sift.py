@@ -1,0 +1,237 @@
+"""The page's sections on SIFT: features of all libraries, time and quality in one table, and the whole step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.pages.text import bullets, paragraph, table
+
+Row = dict[str, Any]
+
+BASELINE = "OpenCV SIFT"
+PAPER_NCC, PAPER_SIFT = "paper's NCC", "paper's SIFT"
+TIMES = (
+    "Milliseconds a picture, grey uint8 in, whatever the library returns out: one picture at a time, and {batch} "
+    "at a time (one call of `sift`; for the others a loop, with two threads one picture on each, which COLMAP "
+    "does not let run side by side). `ratio` is OpenCV SIFT's time over this one's, one picture, one thread."
+)
+PAIRS = (
+    "Quality is the mean over pairs, left of the slash drone pictures warped by known homographies (any turn, "
+    "0.7 to 1.4 times the scale, tilt, gamma, exposure, blur, noise), right of it frames against the piece of "
+    "map that they show, by true poses and surface models:"
+)
+FIGURES = (
+    "**repeat**: keypoints in the common ground that the other picture has too, within 1.5 px and 1.5 times the "
+    "scale. Chance gives up to 9 % at 150 x 150, 2 % at 300 x 300, and less above.",
+    "**score**: correct matches over keypoints in the common ground, of the picture with fewer.",
+    "**right**: share of the mutual matches with ratio below 0.8 that lie within 3 px of the truth; **matches**: "
+    "how many those are; **error**: their median distance from it.",
+)
+CONDITIONS = (
+    "All have the same pictures, at most 300 keypoints (OpenCV and COLMAP count each orientation as one), and "
+    "their own defaults otherwise. With contrast 0.02 OpenCV keeps weak keypoints, as `scenematch` does. Its "
+    "positions have a bias of 0.25 px, which a turn turns into an error. COLMAP keeps its coarsest keypoints, "
+    "OpenCV and `scenematch` those of highest contrast. `upright` is told the turn between the pictures, as a "
+    "heading tells it. Ground that roofs hide from a frame counts as common."
+)
+STEP = (
+    "The paper's case on the built-in flight: half scale, the window of equations 4 and 5, a prior a few metres "
+    "off. `paper's` is its recipe taken literally with OpenCV (features of frame and window in every frame, "
+    "brute force, `solvePnPRansac` on flat ground); it refuses nothing. `scenematch` finds the map's features "
+    "once, before the flight; what that saves stands apart, for it and for OpenCV. It also judges the pose and "
+    "states a covariance. NCC stands here because the paper compares the two: how many times as long SIFT takes is"
+)
+PAPER_RATIO = 121 / 40  # Table I of the paper: SIFT's time over NCC's
+PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.4}
+COLOURS = {
+    "scenematch": "#d55e00",
+    "scenematch, upright": "#e69f00",
+    "OpenCV SIFT": "#0072b2",
+    "OpenCV SIFT, contrast 0.02": "#56b4e9",
+    "COLMAP SIFT": "#009e73",
+    "kornia SIFT": "#cc79a7",
+    "OpenCV ORB": "#999999",
+    "OpenCV AKAZE": "#444444",
+}
+
+
+def sections(rows: list[Row]) -> list[str]:
+    """Markdown of both sections, of what was measured."""
+    features = [row for row in rows if row["task"] == "features"]
+    steps = [row for row in rows if row["task"] == "sift step"]
+    return (_features_section(features) if features else []) + (_step_section(steps) if steps else [])
+
+
+def charts(rows: list[Row]) -> dict[str, Figure]:
+    """Pictures by file name."""
+    features = [row for row in rows if row["task"] == "features"]
+    if not features:
+        return {}
+    return {"sift-ratio.png": _ratio_chart(features), "sift-quality.png": _quality_chart(features)}
+
+
+# ------------------------------------------------------------------------------------------------- features
+
+
+def _sizes(rows: list[Row]) -> list[tuple[int, int]]:
+    return list(dict.fromkeys((row["size"][0], row["size"][1]) for row in rows))
+
+
+def _peers(rows: list[Row]) -> list[str]:
+    return list(dict.fromkeys(row["peer"] for row in rows))
+
+
+def _time_ms(rows: list[Row], peer: str, size: tuple[int, int], batch: int, threads: int) -> float:
+    """Median milliseconds a picture, NaN where it was not measured."""
+    for row in rows:
+        if (row["peer"], tuple(row["size"]), row["batch"], row["threads"]) == (peer, size, batch, threads):
+            return float(row["median_ms"]) / batch
+    return float("nan")
+
+
+def _ratio(rows: list[Row], peer: str, size: tuple[int, int], batch: int = 1, threads: int = 1) -> float:
+    return _time_ms(rows, BASELINE, size, batch, threads) / _time_ms(rows, peer, size, batch, threads)
+
+
+def _figures(rows: list[Row], peer: str, size: tuple[int, int]) -> Row:
+    return next(row for row in rows if row["peer"] == peer and tuple(row["size"]) == size)
+
+
+def _shown(value: float, form: str) -> str:
+    return "-" if not np.isfinite(value) else format(value, form)
+
+
+def _both(row: Row, name: str, form: str) -> str:
+    """A figure of the warped pairs / of the frames on their map."""
+    return " / ".join("-" if row[kind] is None else _shown(row[kind][name], form) for kind in ("warped", "on_map"))
+
+
+def _features_section(rows: list[Row]) -> list[str]:
+    batch = max(row["batch"] for row in rows)
+    lines = ["## Features: a picture in, at most 300 keypoints with descriptors out", ""]
+    lines += paragraph(TIMES.format(batch=batch)) + paragraph(PAIRS) + bullets(*FIGURES) + paragraph(CONDITIONS)
+    lines += ["![times as fast as OpenCV SIFT](img/sift-ratio.png)", ""]
+    lines += ["![time and correct matches](img/sift-quality.png)", ""]
+    columns = ["who", "1 thread", "2 threads", f"{batch}, 1 thread", f"{batch}, 2 threads", "ratio"]
+    columns += ["keypoints", "repeat %", "score %", "right %", "matches", "error px"]
+    for size in _sizes(rows):
+        figures = _figures(rows, BASELINE, size)
+        pairs = f"{figures['warped_pairs']} pairs warped, {figures['on_map_pairs']} on their map"
+        lines += [f"### {size[0]} x {size[1]} ({pairs})", ""]
+        lines += table(columns, [_feature_cells(rows, peer, size, batch) for peer in _peers(rows)])
+    return lines
+
+
+def _feature_cells(rows: list[Row], peer: str, size: tuple[int, int], batch: int) -> list[str]:
+    row = _figures(rows, peer, size)
+    percent = {
+        kind: None if row[kind] is None else {name: 100.0 * value for name, value in row[kind].items()}
+        for kind in ("warped", "on_map")
+    }
+    times = [_shown(_time_ms(rows, peer, size, b, t), ".1f") for b, t in ((1, 1), (1, 2), (batch, 1), (batch, 2))]
+    return [
+        peer,
+        *times,
+        _shown(_ratio(rows, peer, size), ".2f"),
+        _both(row, "keypoints", ".0f"),
+        *(_both(percent, name, ".0f") for name in ("repeatability", "matching_score", "inlier_ratio")),
+        _both(row, "correct", ".0f"),
+        _both(row, "error_px", ".2f"),
+    ]
+
+
+def _ratio_chart(rows: list[Row]) -> Figure:
+    """Bars: one group a size, one bar a peer, for one picture and for a batch."""
+    figure, batch = Figure(figsize=(11, 4.8), layout="constrained"), max(row["batch"] for row in rows)
+    sizes, names = _sizes(rows), [name for name in _peers(rows) if name != BASELINE]
+    left: Axes | None = None
+    for index, (count, threads) in enumerate(((1, 1), (batch, 2))):
+        ax = figure.add_subplot(1, 2, index + 1, sharey=left)
+        left = left or ax
+        for place, name in enumerate(names):
+            at = np.arange(len(sizes)) + (place - (len(names) - 1) / 2) * 0.13
+            ratios = [_ratio(rows, name, size, count, threads) for size in sizes]
+            bars = ax.bar(at, ratios, 0.12, color=COLOURS[name], label=name if index == 0 else None)
+            labels = [_shown(ratio, ".1f" if ratio >= 1 else ".2f").replace("-", "") for ratio in ratios]
+            ax.bar_label(bars, labels, fontsize=7, padding=2, rotation=90, bbox=PLATE)
+        ax.axhline(1.0, color=COLOURS[BASELINE], linewidth=1.5)
+        ax.set_yscale("log")
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.margins(y=0.12)
+        ax.set_xticks(range(len(sizes)), [f"{w} x {h}" for w, h in sizes])
+        ax.set_title("one picture, one thread" if count == 1 else f"{count} pictures, two threads", fontsize=10)
+        ax.grid(axis="y", alpha=0.3)
+    assert left is not None
+    left.set_ylabel("times as fast as OpenCV SIFT")
+    figure.legend(loc="outside upper center", ncols=len(names), frameon=False, fontsize=8)
+    return figure
+
+
+def _quality_chart(rows: list[Row]) -> Figure:
+    """Time against correct matches: up and to the left is better."""
+    figure, sizes = Figure(figsize=(10, 4.2), layout="constrained"), _sizes(rows)
+    for index, size in enumerate(sizes):
+        ax = figure.add_subplot(1, len(sizes), index + 1)
+        for name in _peers(rows):
+            row, time_ms = _figures(rows, name, size), _time_ms(rows, name, size, 1, 1)
+            for kind, marker in (("warped", "o"), ("on_map", "^")):
+                if row[kind] is not None:
+                    ax.plot(time_ms, row[kind]["correct"], marker, color=COLOURS[name], markersize=8, alpha=0.85)
+        ax.set_xscale("log")
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.margins(y=0.08)
+        ax.set_ylim(bottom=0)
+        ax.set_title(f"{size[0]} x {size[1]}", fontsize=10)
+        ax.set_xlabel("ms a picture, one thread")
+        ax.grid(which="both", alpha=0.25)
+        if index == 0:
+            ax.set_ylabel("correct matches a pair")
+    handles = [figure.axes[0].plot([], [], "o", color=COLOURS[name], label=name)[0] for name in _peers(rows)]
+    for marker, what in (("o", "warped pictures"), ("^", "frames on their map")):
+        handles += figure.axes[0].plot([], [], marker, color="none", markeredgecolor="black", label=what)
+    figure.legend(handles=handles, loc="outside upper center", ncols=5, frameon=False, fontsize=8)
+    return figure
+
+
+# ----------------------------------------------------------------------------------------------------- step
+
+
+def _step_section(rows: list[Row]) -> list[str]:
+    time_ms = {(row["peer"], row["threads"]): row["median_ms"] for row in rows}
+    cells = [
+        [
+            row["peer"],
+            str(row["threads"]),
+            f"{row['median_ms']:.2f}",
+            f"{row['p95_ms']:.2f}",
+            f"{time_ms[PAPER_SIFT, row['threads']] / row['median_ms']:.2f}",
+            f"{row['fixes']} of {row['frames']}",
+            f"{row['rms_m']:.2f}",
+            "-" if row["height_rms_m"] is None else f"{row['height_rms_m']:.2f}",
+        ]
+        for row in rows
+    ]
+    columns = ["who", "threads", "median ms", "p95 ms", "times the paper's SIFT", "fixes", "RMS m", "height RMS m"]
+    return [
+        "## The whole SIFT step: a 300 x 300 colour frame in, pose out",
+        "",
+        *paragraph(STEP),
+        *table(["threads", "paper, published", "paper's recipe, here", "scenematch"], _step_ratios(time_ms)),
+        *table(columns, cells),
+    ]
+
+
+def _step_ratios(time_ms: dict[tuple[str, int], float]) -> list[list[str]]:
+    return [
+        [
+            str(threads),
+            f"{PAPER_RATIO:.1f}",
+            f"{time_ms[PAPER_SIFT, threads] / time_ms[PAPER_NCC, threads]:.1f}",
+            f"{time_ms['scenematch SIFT', threads] / time_ms['scenematch NCC', threads]:.1f}",
+        ]
+        for threads in sorted({threads for _, threads in time_ms})
+    ]

@@ -1,0 +1,1 @@
+"""The commands, a file each, or a file for each group of commands: arguments in, a run called, results printed."""

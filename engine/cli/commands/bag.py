@@ -1,0 +1,33 @@
+"""The command `bag`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console
+from engine.cli.options import JsonOption
+
+
+def bag(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Flight folder.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE|DIR", help="The bag; a file X.bag for ros1.")],
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            "--format", metavar="ros1|ros2-sqlite3|ros2-mcap", help="Without it ros1 for X.bag, else ros2-mcap."
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a bag that exists.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A flight folder as a bag of ROS 1 or ROS 2.
+
+    With pictures, calibration, telemetry and truth under the names that a camera driver and MAVROS use.
+    """
+    from engine.runs.bag_conversion import convert_to_bag
+
+    facts = convert_to_bag(directory, out, kind, force=force, progress=console.PROGRESS)
+    console.facts(facts, as_json, title=f"flight in {directory}")

@@ -1,0 +1,211 @@
+"""The commands of `bridge`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console
+from engine.cli.options import (
+    CameraOption,
+    DeadlineOption,
+    DeviceOption,
+    FirmwareOption,
+    JsonOption,
+    MapOption,
+    MapSigmaOption,
+    MaxSigmaOption,
+    MessageOption,
+    MethodOption,
+    RerunConnectOption,
+    RerunOption,
+    SecondsOption,
+    StartOption,
+    SurfaceOption,
+    ThreadsOption,
+    use_threads,
+)
+
+
+def mavlink(
+    connect: Annotated[
+        str,
+        typer.Option(
+            "--connect",
+            metavar="LINK",
+            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+        ),
+    ],
+    map_path: MapOption,
+    camera: CameraOption,
+    surface: SurfaceOption = None,
+    map_sigma_m: MapSigmaOption = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
+    ] = None,
+    telemetry: Annotated[
+        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
+    ] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless given."),
+    ] = None,
+    camera_source: Annotated[
+        str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
+    ] = None,
+    exposure_to_grab_ms: Annotated[
+        float | None,
+        typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
+    ] = None,
+    firmware: FirmwareOption = "ardupilot",
+    message: MessageOption = "",
+    max_sigma_m: MaxSigmaOption = 10.0,
+    system_id: Annotated[
+        int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
+    ] = 1,
+    key: Annotated[
+        Path | None,
+        typer.Option("--key", metavar="FILE", help="Secret of MAVLink's signing; unsigned is ignored."),
+    ] = None,
+    listen_anywhere: Annotated[
+        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
+    ] = False,
+    set_origin: Annotated[
+        bool, typer.Option("--set-origin/--no-set-origin", help="Give an autopilot without an origin the map's.")
+    ] = True,
+    origin_alt_m: Annotated[
+        float | None,
+        typer.Option("--origin-alt-m", metavar="M", help="Its height above sea level; else the map's ground."),
+    ] = None,
+    use_velocity: Annotated[
+        bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is used.")
+    ] = True,
+    method: MethodOption = "auto",
+    start: StartOption = None,
+    device: DeviceOption = "auto",
+    deadline_ms: DeadlineOption = 121.0,
+    seconds: SecondsOption = None,
+    recording: RerunOption = None,
+    viewer: RerunConnectOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Fixes to an autopilot by MAVLink.
+
+    Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
+    played at their own pace, until they end.
+    """
+    from engine.runs.live_viewing import LiveViewTarget
+    from engine.runs.mavlink_bridge import BridgeFiles, BridgeSettings, MavlinkSettings, run_mavlink_bridge
+
+    use_threads(threads)
+    files = BridgeFiles(
+        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
+        camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
+        map_sigma_m=map_sigma_m,
+    )  # fmt: skip
+    link = MavlinkSettings(
+        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
+        message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
+        use_velocity=use_velocity,
+    )  # fmt: skip
+    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    live_view = LiveViewTarget(recording, viewer)
+    status = run_mavlink_bridge(files, link, settings, live_view=live_view, progress=console.PROGRESS)
+    console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
+
+
+def mavlink_params(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, created by this run.")],
+    firmware: FirmwareOption = "ardupilot",
+    message: MessageOption = "",
+    delay_ms: Annotated[
+        int, typer.Option("--delay-ms", metavar="MS", help="From capture to arrival; the bridge prints it.")
+    ] = 100,
+    max_sigma_m: MaxSigmaOption = 10.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+) -> None:
+    """Parameters for an autopilot.
+
+    Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
+    """
+    from engine.runs.mavlink_bridge import write_parameter_file
+
+    write_parameter_file(firmware, message, out, delay_ms=delay_ms, max_sigma_m=max_sigma_m, force=force)
+    console.say(f"written to {out}")
+
+
+def ros(
+    map_path: MapOption,
+    version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
+    surface: SurfaceOption = None,
+    map_sigma_m: MapSigmaOption = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
+    ] = None,
+    image: Annotated[
+        str, typer.Option("--image-topic", metavar="NAME", help="sensor_msgs/Image.")
+    ] = "/camera/image_raw",
+    camera_info: Annotated[
+        str, typer.Option("--camera-info-topic", metavar="NAME", help="sensor_msgs/CameraInfo.")
+    ] = "/camera/camera_info",
+    imu: Annotated[
+        str, typer.Option("--imu-topic", metavar="NAME", help="sensor_msgs/Imu with an orientation.")
+    ] = "/mavros/imu/data",
+    compass: Annotated[
+        str, typer.Option("--compass-topic", metavar="NAME", help="std_msgs/Float64, degrees; outranks the Imu.")
+    ] = "/mavros/global_position/compass_hdg",
+    height: Annotated[
+        str, typer.Option("--height-topic", metavar="NAME", help="std_msgs/Float64, metres above take-off.")
+    ] = "/mavros/global_position/rel_alt",
+    ranging: Annotated[
+        str, typer.Option("--range-topic", metavar="NAME", help="sensor_msgs/Range; outranks the height.")
+    ] = "/mavros/rangefinder/rangefinder",
+    velocity: Annotated[
+        str, typer.Option("--velocity-topic", metavar="NAME", help="geometry_msgs/TwistStamped, east and north.")
+    ] = "/mavros/local_position/velocity_local",
+    firmware: Annotated[
+        str,
+        typer.Option("--firmware", metavar="none|ardupilot|px4", help="For whom the poses are, behind MAVROS."),
+    ] = "none",
+    origin: Annotated[
+        str | None, typer.Option("--origin", metavar="LAT,LON", help="Of the poses; without it the map's.")
+    ] = None,
+    method: MethodOption = "auto",
+    start: StartOption = None,
+    device: DeviceOption = "auto",
+    deadline_ms: DeadlineOption = 121.0,
+    seconds: SecondsOption = None,
+    recording: RerunOption = None,
+    viewer: RerunConnectOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """A node of ROS 1 or ROS 2.
+
+    Hears pictures, attitude and height, and publishes poses, fixes, diagnostics and the window that was searched.
+    An empty name of a topic leaves it out.
+    """
+    from engine.adapters.ros import RosTopics
+    from engine.runs.live_viewing import LiveViewTarget
+    from engine.runs.mavlink_bridge import BridgeSettings
+    from engine.runs.ros_bridge import RosSettings, run_ros_bridge
+
+    use_threads(threads)
+    topics = RosTopics(
+        image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
+        velocity=velocity,
+    )  # fmt: skip
+    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    ros_settings = RosSettings(
+        map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
+        firmware=firmware, origin=origin,
+    )  # fmt: skip
+    live_view = LiveViewTarget(recording, viewer)
+    status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)
+    console.facts(asdict(status), as_json, title=f"ROS {version} on {image}")

@@ -1,0 +1,79 @@
+"""The command `compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console, tables
+from engine.cli.options import (
+    BudgetOption,
+    CameraOption,
+    ForceOption,
+    FrameStampsOption,
+    ImageTopicOption,
+    JsonOption,
+    LogOffsetOption,
+    MapOption,
+    MapSigmaOption,
+    OptionalDeviceOption,
+    OutOption,
+    StartOption,
+    SurfaceOption,
+    ThreadsOption,
+    use_threads,
+)
+
+
+def compare(
+    map_path: MapOption,
+    camera: CameraOption,
+    frames: Annotated[
+        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
+    ],
+    out: OutOption,
+    telemetry: Annotated[
+        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
+    ] = None,
+    image_topic: ImageTopicOption = None,
+    frame_stamps: FrameStampsOption = None,
+    log_offset_s: LogOffsetOption = 0.0,
+    surface: SurfaceOption = None,
+    map_sigma_m: MapSigmaOption = None,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", metavar="FILE", help="truth.csv; else the one beside the telemetry.")
+    ] = None,
+    runs: Annotated[
+        list[str] | None,
+        typer.Option("--run", metavar="METHOD[/PROFILE]|FILE", help="Once a run; without it the paper's Table I."),
+    ] = None,
+    start: StartOption = None,
+    device: OptionalDeviceOption = None,
+    budget_ms: BudgetOption = None,
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Several methods or settings over one flight.
+
+    Follows the flight once a run, each into a folder of its own as track does, and tells them apart in one table
+    and one chart.
+    """
+    from engine.runs.comparison import compare as compare_runs
+    from engine.runs.comparison import parse_runs
+    from engine.runs.inputs import FlightFiles
+
+    use_threads(threads)
+    settings = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
+    files = FlightFiles(
+        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
+        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
+    )  # fmt: skip
+    results = compare_runs(files, out, settings, force=force, progress=console.PROGRESS)
+    if as_json:
+        console.print_json(results)
+    else:
+        tables.print_comparison(results, str(frames))
+        console.say(f"written to {out}")

@@ -1,0 +1,102 @@
+"""The command `track`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console, tables
+from engine.cli.options import (
+    BudgetOption,
+    ForceOption,
+    FrameStampsOption,
+    ImageTopicOption,
+    JsonOption,
+    LogOffsetOption,
+    MapOption,
+    MapSigmaOption,
+    OptionalDeviceOption,
+    OutOption,
+    RerunConnectOption,
+    RerunOption,
+    SettingsOption,
+    StartOption,
+    SurfaceOption,
+    ThreadsOption,
+    use_threads,
+)
+
+
+def track(
+    map_path: MapOption,
+    frames: Annotated[
+        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
+    ],
+    out: OutOption,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            "--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file; a bag may have its own."
+        ),
+    ] = None,
+    telemetry: Annotated[
+        Path | None,
+        typer.Option(
+            "--telemetry", metavar="FILE", help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; without it EXIF."
+        ),
+    ] = None,
+    image_topic: ImageTopicOption = None,
+    frame_stamps: FrameStampsOption = None,
+    log_offset_s: LogOffsetOption = 0.0,
+    surface: SurfaceOption = None,
+    map_sigma_m: MapSigmaOption = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth", metavar="FILE", help="truth.csv, or a log; without it the one beside the telemetry."
+        ),
+    ] = None,
+    settings_path: SettingsOption = None,
+    method: Annotated[
+        str | None,
+        typer.Option("--method", metavar="ncc|sift|auto", help="ncc, unless the settings say otherwise."),
+    ] = None,
+    start: StartOption = None,
+    device: OptionalDeviceOption = None,
+    budget_ms: BudgetOption = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile", metavar="engine|paper", help="paper is the paper's own recipe; engine unless given."
+        ),
+    ] = None,
+    recording: RerunOption = None,
+    viewer: RerunConnectOption = None,
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Follow a flight; track.csv and figures.
+
+    Writes track.csv (one row a frame), summary.json and figures into the output folder. Without --start the
+    flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
+    """
+    from engine.runs.inputs import FlightFiles
+    from engine.runs.live_viewing import LiveViewTarget
+    from engine.runs.settings import load_settings
+    from engine.runs.tracking import track as track_flight
+
+    use_threads(threads)
+    files = FlightFiles(
+        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
+        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
+    )  # fmt: skip
+    settings = load_settings(
+        settings_path, method=method, profile=profile, device=device, start=start, budget_ms=budget_ms
+    )
+    live_view = LiveViewTarget(recording, viewer)
+    summary = track_flight(files, out, settings, force=force, live_view=live_view, progress=console.PROGRESS)
+    title = f"{settings.method} ({settings.profile} profile) on {frames}"
+    tables.print_summary(summary, as_json, title=title, out=out)

@@ -1,0 +1,83 @@
+"""The auto method: NCC and SIFT, each a second opinion of the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from engine.integrity import are_consistent
+from engine.methods.explanation import Explanation
+from engine.methods.ncc import Ncc
+from engine.methods.options import MatcherOptions
+from engine.methods.query import Query
+from engine.methods.sift import Sift
+from engine.orthomap import OrthoMap
+from engine.values import Fix, NoFix, Reason, Result, Window
+
+
+class Auto:
+    """NCC where height and heading are known, then SIFT where there is time; two fixes must agree.
+
+    Args:
+        site: the map.
+        device: where tensors live.
+        options: settings of both.
+    """
+
+    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
+        self.ncc = Ncc(site, device, options)
+        self.sift = Sift(site, device, options)
+
+    @property
+    def parts(self) -> Mapping[str, Ncc | Sift]:
+        """Both, by name."""
+        return {"ncc": self.ncc, "sift": self.sift}
+
+    @property
+    def cache_counters(self) -> dict[str, int]:
+        """How many entries of each cache were created so far."""
+        return self.ncc.cache_counters | self.sift.cache_counters
+
+    def prepare(self) -> None:
+        """Prepare both methods' indexes of the map."""
+        self.ncc.prepare()
+        self.sift.prepare()
+
+    def warmup(self, query: Query) -> None:
+        """Run every variant of every step of both methods."""
+        if query.prior is None:
+            self.locate(query)
+            return
+        self.ncc.warmup(query)
+        self.sift.warmup(query)
+
+    def locate(self, query: Query) -> Result:
+        """The more accurate of two fixes that agree, or the only one.
+
+        Refinement comes last: it makes a fix more accurate, where the second method makes it more certain.
+        """
+        if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
+            return self.sift.locate(query)
+        first = self.ncc.correlate(query)
+        second = self.sift.locate(query, is_second=isinstance(first, Fix))
+        if isinstance(first, NoFix):
+            return first if isinstance(second, NoFix) and second.reason is Reason.LATE else second
+        if isinstance(second, NoFix):
+            return self.ncc.refine(query, first)
+        apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+        if not are_consistent(apart_m, (first.covariance_m2 + second.covariance_m2)[:2, :2]):
+            detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
+            return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
+        refined = self.ncc.refine(query, first)
+        fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
+        # Both compare one picture with one map under one prior, so their odds are not multiplied.
+        stated = [fix.confidence for fix in fixes if fix.confidence is not None]
+        best = min(fixes, key=lambda fix: fix.sigma_m)
+        return replace(best, stage="verified", confidence=max(stated, default=None))
+
+    def explain(self, query: Query, window: Window) -> Explanation:
+        """As NCC does."""
+        return self.ncc.explain(query, window)

@@ -1,0 +1,174 @@
+"""Correlation of one hypothesis: the frame aligned with the map by a height and a heading, and its peak."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from engine.align import MIN_SHRINK, GroundView, Patch, enhance, rectify, view_of
+from engine.indexes.prepared import PreparedMap, Region
+from engine.methods.options import NccOptions
+from engine.methods.query import Query
+from engine.ncc_fft import match_template, ncc
+from engine.peaks import find_peak
+from engine.values import GridPose, NoFix, Peak, Reason, Window
+from engine.window import level_crop
+
+Array = NDArray[np.float64]
+
+METHOD = "ncc"
+_GROUND_SHARE = 0.3  # of the height: within this distance of a frame's middle its ground is taken for a plane
+_SPREAD_SIGMAS = 2.0  # and within so many sigmas of the prior, where the position is less certain
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """A frame in the pixels of one level of the map's pyramid.
+
+    Attributes:
+        pose: the height and heading by which it was aligned.
+        level: of the pyramid.
+        jacobian: (2, 2) metres per pixel of the level.
+        view: how the ground is seen.
+        patch: the rectified frame.
+        template: (h, w) the patch, enhanced.
+    """
+
+    pose: GridPose
+    level: int
+    jacobian: Array
+    view: GroundView
+    patch: Patch
+    template: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Correlator:
+    """One frame with the map that it is correlated with.
+
+    Attributes:
+        query: the frame.
+        prepared: the map.
+        options: settings.
+    """
+
+    query: Query
+    prepared: PreparedMap
+    options: NccOptions
+
+    def align(self, pose: GridPose, level: int, nadir_px: Array | None = None) -> Aligned | NoFix:
+        """Equations 2 and 3: the frame in the pixels of one map level.
+
+        Args:
+            pose: the height and heading to align it by.
+            level: of the pyramid.
+            nadir_px: (2,) where its ground is looked up; None takes the prior's place, or level ground.
+        """
+        query, options = self.query, self.options
+        attitude, height = pose.grid_attitude, pose.height_agl_m
+        assert attitude is not None  # a hypothesis has both
+        assert height is not None
+        jacobian = query.jacobian * 2.0**level
+        view = view_of(query.camera, attitude, height, jacobian)
+        if view is not None:
+            slope = self._slope(view, height, level, nadir_px)
+            if slope.any():
+                view = view_of(query.camera, attitude, height, jacobian, slope) or view
+        if view is None:
+            return query.refuse_tilted(attitude, METHOD)
+        rows, columns = query.site.level_shape(level)
+        if (MIN_SHRINK * options.fraction) ** 2 * view.area_px > rows * columns:
+            return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
+        patch = rectify(query.gray, query.camera, view, fraction=options.fraction)
+        if patch is None:
+            detail = "the frame covers fewer than 8 x 8 pixels of the map"
+            return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
+        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        template = torch.from_numpy(enhanced).to(query.device)
+        return Aligned(pose, level, jacobian, view, patch, template)
+
+    def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
+        """Rise (2,) of the ground per pixel of the level, about a wider area the vaguer the prior is."""
+        query = self.query
+        reach_m, place = _GROUND_SHARE * height_m, nadir_px
+        if place is None and query.prior is not None:
+            reach_m, place = max(reach_m, _SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
+        if place is None:
+            return np.zeros(2)
+        return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
+
+    def window(self, aligned: Aligned) -> Window | None:
+        """The adaptive window in full-resolution map pixels; the whole map where there is no prior."""
+        query = self.query
+        nadir = query.prior_px
+        if nadir is None:
+            return Window(0, 0, query.site.width_px, query.site.height_px)
+        scale = 2.0**aligned.level
+        height, width = aligned.template.shape
+        footprint = (aligned.view.footprint_px[0] * scale, aligned.view.footprint_px[1] * scale)
+        center = nadir + aligned.view.center_px * scale
+        min_px = ((width + 4) * scale, (height + 4) * scale)
+        return query.window(center, footprint, min_px, margin=self.options.margin)
+
+    def cut(self, window: Window, level: int) -> Region:
+        """The prepared map under a window of full-resolution pixels."""
+        return self.prepared.cut(level_crop(self.query.site, window, level), level)
+
+    def search(self, aligned: Aligned, window: Window) -> Peak | None:
+        """The peak in a window, in pixels of the aligned level; None where the template is nowhere on the map."""
+        query, options = self.query, self.options
+        height, width = aligned.template.shape
+        with query.scheduler.stage("map"):
+            region = self.cut(window, aligned.level)
+        if region.window.width_px < width or region.window.height_px < height:
+            return None
+        exclusion_px = options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+        with query.scheduler.stage("match"):
+            if region.valid is None:
+                peak = match_template(
+                    region.search, aligned.template, exclusion_px=exclusion_px, exhaustive=options.exhaustive
+                )
+            else:
+                scores = self.masked_scores(region, aligned.template[None])
+                if not bool((scores > -1.0).any()):
+                    return None
+                peak = find_peak(scores[0], exclusion_px=exclusion_px)
+        x, y = peak.x + region.window.x0, peak.y + region.window.y0
+        return Peak(x, y, peak.score, peak.second_score, peak.curvature)
+
+    def surface(self, aligned: Aligned, window: Window) -> tuple[torch.Tensor, Array] | None:
+        """The whole surface that :meth:`search` finds its peak on, for reports.
+
+        Returns:
+            Scores (H', W') of the template's top-left pixel, and that place (2,) of the first in pixels of the
+            level; None where the template does not fit the window.
+        """
+        height, width = aligned.template.shape
+        region = self.cut(window, aligned.level)
+        if region.window.width_px < width or region.window.height_px < height:
+            return None
+        template = aligned.template[None]
+        if region.valid is None:
+            scores = ncc(region.search.image[None], template[None])[0, 0]
+        else:
+            scores = self.masked_scores(region, template)[0]
+        return scores, np.array([region.window.x0, region.window.y0], np.float64)
+
+    def masked_scores(self, region: Region, templates: torch.Tensor) -> torch.Tensor:
+        """Scores (T, H', W') where the region has nodata; -1 where too little of a template lies on map."""
+        assert region.valid is not None
+        scores = ncc(
+            region.search.image[None],
+            templates[None],
+            search_valid=region.valid[None],
+            min_overlap=self.options.min_valid_share,
+        )
+        return scores[0]
+
+    def nadir_px(self, peak: Peak, aligned: Aligned) -> Array:
+        """The camera's nadir (2,) in map pixels, from where its patch was found."""
+        place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
+        return self.query.site.full_from_level(place, aligned.level)

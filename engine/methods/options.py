@@ -1,0 +1,177 @@
+"""The settings of all methods."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from engine.align import check_score
+from engine.errors import OptionError
+from engine.integrity import AssumedErrors, PeakRule, with_map_accuracy
+from engine.learned import PairMatcher
+from engine.orthomap import OrthoMap
+from engine.pose import PoseOptions
+
+PROFILES = ("engine", "paper")
+MAP_FEATURES = ("prepared", "per_frame")
+MIN_HEIGHT_M = 1.0
+"""The lowest height that is searched where the height is unknown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NccOptions:
+    """Settings of the NCC method.
+
+    Attributes:
+        margin: the 1.3 of equations 4 and 5.
+        fraction: the rectified patch's size against the frame's.
+        score: what is correlated: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
+        enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
+        min_valid_share: a place counts only where this share of the patch lies on map that is not nodata.
+        exhaustive: score every place of the window at full resolution.
+        heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
+            also where the frame has none.
+        height_search_share: the height may be off by this share; 0 trusts it.
+        refine: refine the pose densely after the peak, where heading and height are trusted.
+        rule: when a peak is believed.
+        errors: what is assumed of the telemetry and the map.
+    """
+
+    margin: float = 1.3
+    fraction: float = 0.7
+    score: str = "local"
+    enhance_radius_px: int = 8
+    min_valid_share: float = 0.9
+    exhaustive: bool = False
+    heading_search_deg: float = 0.0
+    height_search_share: float = 0.0
+    refine: bool = True
+    rule: PeakRule = field(default_factory=PeakRule)
+    errors: AssumedErrors = field(default_factory=AssumedErrors)
+
+    def __post_init__(self) -> None:
+        if math.isinf(self.margin):
+            raise OptionError(f"margin: expected a finite number, got {self.margin}")
+        if not self.margin >= 1.0:
+            raise OptionError(f"margin: expected 1 or more, got {self.margin}")
+        for name in ("fraction", "min_valid_share"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
+        for name, limit in (("heading_search_deg", 180.0), ("height_search_share", 0.5)):
+            if not 0.0 <= getattr(self, name) <= limit:
+                raise OptionError(f"{name}: expected 0 to {limit:g}, got {getattr(self, name)}")
+        check_score(self.score)
+        if self.enhance_radius_px < 0:
+            raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
+
+    def trusts(self, heading_deg: float | None) -> bool:
+        """Whether a frame's own heading and height are the only hypothesis."""
+        return heading_deg is not None and self.heading_search_deg == self.height_search_share == 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiftOptions:
+    """Settings of the SIFT method.
+
+    Attributes:
+        margin: the 1.3 of equations 4 and 5.
+        scale: the frame is reduced to this before detection; the paper's 0.5.
+        max_keypoints: features taken from the frame; the map's are as dense.
+        map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
+        max_map_keypoints: upper limit for a window that is described per frame.
+        ratio: best against second-best descriptor distance (Lowe's test).
+        upright: where the heading is known, turn the descriptors by it and not by each keypoint's gradients.
+        max_turn_deg: where the heading is known and descriptors are not upright, how far the angles of a match may
+            contradict it; None does not ask.
+        max_scale_factor: where the height is known, by which factor the scales of a match may contradict it; None
+            does not ask.
+        second_look: where nothing is found, look again without the heading and with heights up to
+            ``height_factor`` off.
+        height_factor: see above; 1 trusts the height also then.
+        max_height_m: where the height is unknown, it is at most this.
+        matcher: takes the place of features: it is given the reduced frame and the crop of the map, and what it
+            matches is lifted and solved for the pose as features are.
+        min_deviation: standard deviation in grey levels below which a frame has no texture.
+        max_tilt_deg: a pose further off the vertical is taken for a wrong one.
+        use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
+            features alone can hardly tell a tilt from a displacement.
+        min_confidence: probability of :func:`engine.confidence.probability` below which a pose is not believed.
+        pose: settings of PnP and RANSAC.
+        errors: what is assumed of the telemetry and the map.
+    """
+
+    margin: float = 1.3
+    scale: float = 0.5
+    max_keypoints: int = 300
+    map_features: str = "prepared"
+    max_map_keypoints: int = 6000
+    ratio: float = 0.8
+    upright: bool = True
+    max_turn_deg: float | None = 30.0
+    max_scale_factor: float | None = 1.5
+    second_look: bool = True
+    height_factor: float = 2.0
+    max_height_m: float = 500.0
+    matcher: PairMatcher | None = None
+    min_deviation: float = 3.0
+    max_tilt_deg: float = 45.0
+    use_attitude: bool = True
+    min_confidence: float = 0.97
+    pose: PoseOptions = field(default_factory=PoseOptions)
+    errors: AssumedErrors = field(default_factory=AssumedErrors)
+
+    def __post_init__(self) -> None:
+        for name in ("margin", "height_factor", "max_height_m", "min_deviation"):
+            if math.isinf(getattr(self, name)):
+                raise OptionError(f"{name}: expected a finite number, got {getattr(self, name)}")
+        for name in ("margin", "height_factor"):
+            if not getattr(self, name) >= 1.0:
+                raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+        if not self.min_deviation >= 0.0:
+            raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
+        if not 0.0 <= self.min_confidence < 1.0:
+            raise OptionError(f"min_confidence: expected 0 or more and below 1, got {self.min_confidence}")
+        for name in ("scale", "ratio"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
+        for name, least in (
+            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M), ("max_tilt_deg", 0.0)
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not value > least:
+                raise OptionError(f"{name}: expected above {least:g}, got {value}")
+        if self.map_features not in MAP_FEATURES:
+            raise OptionError(
+                f"map_features: expected one of {', '.join(MAP_FEATURES)}, got {self.map_features!r}"
+            )
+        for name in ("max_keypoints", "max_map_keypoints"):
+            if not getattr(self, name) >= 4:
+                raise OptionError(f"{name}: expected 4 or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatcherOptions:
+    """Settings of both methods.
+
+    Attributes:
+        profile: "engine", or "paper" for the paper's own recipe with OpenCV.
+        ncc: settings of the NCC method.
+        sift: settings of the SIFT method.
+    """
+
+    profile: str = "engine"
+    ncc: NccOptions = field(default_factory=NccOptions)
+    sift: SiftOptions = field(default_factory=SiftOptions)
+
+    def __post_init__(self) -> None:
+        if self.profile not in PROFILES:
+            raise OptionError(f"profile: expected one of {', '.join(PROFILES)}, got {self.profile!r}")
+
+    def on_map(self, site: OrthoMap) -> MatcherOptions:
+        """The same with the accuracy that a map states in place of the one assumed of any map."""
+        ncc, sift = self.ncc, self.sift
+        return replace(
+            self,
+            ncc=replace(ncc, errors=with_map_accuracy(site, ncc.errors)),
+            sift=replace(sift, errors=with_map_accuracy(site, sift.errors)),
+        )

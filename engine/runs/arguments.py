@@ -1,0 +1,145 @@
+"""Arguments of runs: positions and numbers that are read, choices that are checked; messages name the argument.
+
+The argument that a message is about stands first, before a colon; others stand in backquotes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+from engine import device as devices
+from engine.budget import Budget
+from engine.errors import EngineError, OptionError
+from engine.values import MAX_SIGMA_M, Prior
+
+START_SIGMA_M = 15.0
+"""Uncertainty of a position that was given without one."""
+_QUOTED = re.compile(r"`(\w+)`")
+
+
+def parse_position(name: str, text: str | None) -> Prior | None:
+    """Read LAT,LON[,SIGMA_M]; None where nothing was given.
+
+    Raises:
+        OptionError: the text is of another form, or a number is out of range.
+    """
+    if text is None:
+        return None
+    numbers = _numbers(name, text, "LAT,LON[,SIGMA_M]", (2, 3))
+    sigma_m = numbers[2] if numbers[2:] else START_SIGMA_M
+    if sigma_m > MAX_SIGMA_M:
+        raise OptionError(f"{name}: expected a SIGMA_M of at most {MAX_SIGMA_M:g} m, got {sigma_m:g}")
+    try:
+        return Prior(lat_deg=numbers[0], lon_deg=numbers[1], sigma_m=sigma_m)
+    except OptionError as error:
+        raise OptionError(f"{name}: {error}") from None
+
+
+def parse_circle(name: str, text: str | None) -> tuple[float, float, float] | None:
+    """Read LAT,LON,RADIUS_M; None where nothing was given.
+
+    Raises:
+        OptionError: the text is of another form, or a number is out of range.
+    """
+    if text is None:
+        return None
+    lat_deg, lon_deg, radius_m = _numbers(name, text, "LAT,LON,RADIUS_M", (3,))
+    if not (abs(lat_deg) <= 90.0 and abs(lon_deg) <= 360.0 and radius_m > 0.0):
+        raise OptionError(f"{name}: expected a place on the Earth and a radius above 0 m, got {text!r}")
+    return lat_deg, lon_deg, radius_m
+
+
+def _numbers(name: str, text: str, form: str, counts: Sequence[int]) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        raise OptionError(f"{name}: expected {form} in degrees and metres, got {text!r}")
+    return numbers
+
+
+def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
+    """The budget of a frame; None where nothing was given. A search of the whole map is not held to it.
+
+    Raises:
+        OptionError: it is not a finite number above 0.
+    """
+    if budget_ms is None:
+        return None
+    if not (math.isfinite(budget_ms) and budget_ms > 0):
+        raise OptionError(f"{name}: expected milliseconds above 0, got {budget_ms:g}")
+    return Budget(total_ms=budget_ms, search_ms=math.inf)
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Refuse a word that is not one of the choices.
+
+    Raises:
+        OptionError: it is not.
+    """
+    if value not in choices:
+        raise OptionError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def check_unused(given: Mapping[str, object], other: str) -> None:
+    """Refuse arguments that have no effect without another one.
+
+    Args:
+        given: values by argument; None where it was not given.
+        other: the argument that they go with.
+
+    Raises:
+        OptionError: names the first that was given.
+    """
+    for name, value in given.items():
+        if value is not None:
+            raise OptionError(f"{name}: expected with `{other}` only")
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        OptionError, DeviceError: see :func:`engine.device.resolve`.
+    """
+    devices.resolve(device)
+
+
+@contextmanager
+def renamed_in_errors(**arguments: str) -> Iterator[None]:
+    """Within it, an error about a field of a lower object names the argument that the field came from.
+
+    Args:
+        arguments: argument by field.
+    """
+    try:
+        yield
+    except EngineError as error:
+        renamed = rename_arguments(str(error), arguments)
+        if renamed == str(error):
+            raise
+        raise type(error)(renamed) from None
+
+
+def rename_arguments(message: str, names: Mapping[str, str], quote: str = "`") -> str:
+    """A message with other names for its arguments: those before the first colon, and those in backquotes.
+
+    Args:
+        message: of an error.
+        names: new name by old one.
+        quote: around the new names of those in backquotes.
+    """
+    subject, colon, rest = message.partition(":")
+    parts = subject.split(", ")
+    if colon and all(part in names for part in parts):
+        message = f"{', '.join(names[part] for part in parts)}:{rest}"
+    return rename_quoted(message, names, quote)
+
+
+def rename_quoted(text: str, names: Mapping[str, str], quote: str = "`") -> str:
+    """A text with other names for the arguments that stand in backquotes; see :func:`rename_arguments`."""
+    return _QUOTED.sub(lambda found: f"{quote}{names[found[1]]}{quote}" if found[1] in names else found[0], text)

@@ -1,0 +1,247 @@
+"""The closed loop: a simulated vehicle that flies by the engine's fixes, with its folder, track and figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.formats.flight import write_flight_folder
+from engine.formats.track import TrackRow, read_track, track_row, write_track
+from engine.formats.truth import read_truth
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
+from engine.orthomap import OrthoMap
+from engine.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
+from engine.report.figures import draw_figures
+from engine.report.metrics import Ground, summarise
+from engine.runs.arguments import check_choice, check_device
+from engine.runs.folders import StrPath, check_folder, prepare_folder
+from engine.runs.inputs import FOLDER_LAYOUT
+from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
+from engine.runs.progress import SILENT, Progress
+from engine.runs.results import SUMMARY, TRACK
+from engine.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
+from engine.sim import FlightStyle, Town, picture_at
+from engine.sim.faults import KINDS, Fault
+from engine.sim.flight import grid_at
+from engine.sim.light import Image
+from engine.sim.loop import START_NS, ClosedLoop
+from engine.sim.pilot import plan_rounds
+from engine.sim.quadrotor import State
+from engine.sim.town import EXACT, generator
+from engine.values import Frame, Prior, Truth
+
+if TYPE_CHECKING:  # rerun is optional
+    from engine.report.live_view import LiveView
+
+FAULT_START_S = 60.0
+"""When a fault begins; in a flight that is shorter than twice that, halfway."""
+_MIN_HALF_SIDE_M = 10.0  # half of a side of the rounds
+_EDGE_M = 6.0  # that a level footprint keeps from the map's edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosedLoopSettings:
+    """How the loop is closed.
+
+    Attributes:
+        minutes: of flight.
+        method: "auto", "ncc" or "sift".
+        fault: what goes wrong: "none", "killed", "shifted" or "frozen".
+        device: where tensors live.
+
+    Raises:
+        OptionError: a word or a number is none of those that are expected.
+        DeviceError: the device is missing.
+    """
+
+    minutes: float = 5.0
+    method: str = "auto"
+    fault: str = "none"
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, METHODS)
+        check_choice("fault", self.fault, KINDS)
+        if not 0.1 <= self.minutes <= 120.0:
+            raise OptionError(f"minutes: expected 0.1 to 120, got {self.minutes:g}")
+        check_device(self.device)
+
+    def planned_fault(self) -> Fault:
+        """The fault with its times: ten seconds, but a map that is shifted stays so."""
+        start_s = min(FAULT_START_S, 30.0 * self.minutes)
+        return Fault(kind=self.fault, start_s=start_s, duration_s=math.inf if self.fault == "shifted" else 10.0)
+
+
+def fly_closed_loop(
+    out: StrPath,
+    world: WorldSettings | None = None,
+    loop: ClosedLoopSettings | None = None,
+    *,
+    force: bool = False,
+    live_view: LiveViewTarget = NO_LIVE_VIEW,
+    progress: Progress = SILENT,
+) -> dict[str, Any]:
+    """Fly by the engine's fixes, and write the flight's folder with its track and figures.
+
+    Args:
+        out: the folder.
+        world: what is flown over; None is the first town.
+        loop: how the loop is closed; None is the defaults.
+        force: whether the folder may be there already.
+        live_view: where the live view goes.
+        progress: is shown what the run does.
+
+    Returns:
+        The figures, as loop.json has them.
+    """
+    out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
+    check_folder(out, force)
+    live_view.check(force=force)
+    progress.message("drawing the world")
+    town, camera = world.build(), Camera.from_fov(300, 300, 60.0)
+    site = town.site()
+    matcher = SceneMatcher(site, camera, loop.method, loop.device)
+    matcher.warmup()
+    flight = plan_closed_loop(town, camera, matcher, world.seed, loop)
+    prepare_folder(out, force, (*FOLDER_OWNED, *LOOP_OWNED))
+    with open_view(matcher, live_view) as view:
+        seconds = 60.0 * loop.minutes
+        count = int(seconds * flight.options.frame_rate_hz)
+        frames = progress.track(_fly(flight, seconds, view), count, "flying")
+        _write_folder(out, frames, flight, town, camera, site)
+    record = _record(out, world, loop, site, town, str(matcher.device))
+    return _write_results(out, flight, site, record)
+
+
+def _write_results(out: Path, flight: ClosedLoop, site: OrthoMap, record: dict[str, Any]) -> dict[str, Any]:
+    """Track, record, figures of merit and plots of a flight that was flown."""
+    flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
+    rows = [
+        track_row(_name(k), answer.result, latency_ms=latency_ms, deadline_met=None)
+        for k, answer in enumerate(flown.answers)
+    ]
+    write_track(out / TRACK, rows)
+    rows = read_track(out / TRACK)  # as they stand in the file, so that evaluate gives the same figures
+    write_loop_csv(out / "loop.csv", flown)
+    figures = summarise_loop(flown)
+    summary = _summarise(out, rows, site, record)
+    figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
+    (out / "loop.json").write_text(json.dumps(figures | {"settings": record}, indent=2) + "\n", encoding="utf-8")
+    scene, fault = record["scene"], flight.fault
+    day = scene["condition"] or "noon"
+    title = f"closed loop, seed {scene['seed']}, {day}, {record['method']}, fault: {fault.kind}"
+    title += f"\ntrue track {figures['plan_rms_m']:.2f} m RMS from the plan"
+    draw_loop(out, flown, title, fault)
+    return figures | {"folder": str(out.resolve())}
+
+
+def _summarise(out: Path, rows: list[TrackRow], site: OrthoMap, record: dict[str, Any]) -> dict[str, Any]:
+    """Write summary.json and the figures of the track, as ``track`` does."""
+    truth, ground = read_truth(out / "truth.csv"), Ground(record["ground_m"], record["ground_amsl_m"])
+    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record}
+    (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    draw_figures(out, rows, truth, site=site, title=f"{record['method']}, closed loop", ground=ground)
+    return summary
+
+
+def plan_closed_loop(
+    town: Town, camera: Camera, matcher: SceneMatcher, seed: int, loop: ClosedLoopSettings
+) -> ClosedLoop:
+    """The flight by its settings, not begun yet: rounds of the town, 150 m above its ground."""
+    site = matcher.site
+    style = FlightStyle()
+    corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
+    reach_m = style.height_agl_m * math.hypot(corner[0], corner[1]) + _EDGE_M
+    half_m = [0.5 * n * site.gsd_m_per_px - reach_m for n in (site.width_px, site.height_px)]
+    if min(half_m) < _MIN_HALF_SIDE_M:
+        sides = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
+        raise OptionError(
+            f"map: expected {2.0 * (reach_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
+        )
+    style = replace(style, height_agl_m=style.height_agl_m + site.ground_m)
+    route = plan_rounds((half_m[0], half_m[1]), 60.0 * loop.minutes, style)
+    rng = generator(seed, 0xCA)
+
+    def view(state: State) -> Image:
+        return picture_at(town, camera, site.frame, state.position_m, state.attitude, rng)
+
+    return ClosedLoop(route, view, matcher, seed=seed, fault=loop.planned_fault())
+
+
+def _name(k: int) -> str:
+    return f"{k:06d}.jpg"
+
+
+def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[Frame]:
+    """The frames of a flight while it is flown, each shown once it is answered."""
+    latency_ms = 1e3 * flight.options.latency_s
+    for k, frame in enumerate(flight.fly(seconds)):
+        if view is not None:
+            answer = flight.flown.answers[-1]
+            view.show(k, _name(k), frame, answer.result, answer.state, latency_ms)
+        yield frame
+
+
+def _write_folder(
+    out: Path, frames: Iterator[Frame], flight: ClosedLoop, town: Town, camera: Camera, site: OrthoMap
+) -> None:
+    """Fly, and write the folder as it goes: pictures, telemetry by the filter, truth, camera and map."""
+    start = flight.flown.start_m
+    lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
+    write_flight_folder(
+        out,
+        frames=((_name(k), frame) for k, frame in enumerate(frames)),
+        truth=_truth_rows(flight, town, site),
+        camera=camera,
+        ortho_rgb=town.ortho,
+        pixel_to_crs=town.pixel_to_crs,
+        crs_epsg=town.crs_epsg,
+        surface_m=town.surface_m,
+        start=Prior(lat_deg=float(lat), lon_deg=float(lon), sigma_m=START_SIGMA_M),
+        georeference_sigma_m=EXACT,
+        slope_sigma_deg=EXACT,
+    )
+
+
+def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Truth]:
+    """Where the vehicle really was, ten times a second; known once it has been flown."""
+    for row in flight.flown.record:
+        east, north, up = (float(v) for v in row.truth.position_m)
+        lat, lon = site.frame.geodetic_from_enu(east, north)
+        attitude = row.truth.attitude
+        yield Truth(
+            timestamp_ns=START_NS + round(row.time_s * 1e9),
+            lat_deg=float(lat),
+            lon_deg=float(lon),
+            alt_amsl_m=town.datum_amsl_m + up,
+            height_agl_m=up - town.world.ground_at(grid_at(town, site.frame, row.truth.position_m)),
+            roll_deg=attitude.roll_deg,
+            pitch_deg=attitude.pitch_deg,
+            heading_deg=attitude.heading_deg,
+        )
+
+
+def _record(
+    out: Path, world: WorldSettings, loop: ClosedLoopSettings, site: OrthoMap, town: Town, device: str
+) -> dict[str, Any]:
+    """What a run was made of, in the words of ``track``, so that ``evaluate`` reads it."""
+    files = {name: str((out / file).resolve()) for name, file in FOLDER_LAYOUT.items()}
+    return files | {
+        "method": loop.method,
+        "profile": "engine",
+        "device": device,
+        "origin": {"lat_deg": site.frame.lat_deg, "lon_deg": site.frame.lon_deg},
+        "ground_m": site.ground_m,
+        "ground_amsl_m": town.datum_amsl_m + site.ground_m,
+        "scene": world.facts(),
+        "closed_loop": {"minutes": loop.minutes, "fault": loop.fault},
+    }

@@ -1,0 +1,86 @@
+"""Scoring a finished track again, perhaps with another truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from engine.errors import EngineError, TelemetryError
+from engine.formats.logs.readers import open_truth
+from engine.formats.settings import nested, options_from_mapping
+from engine.formats.track import TrackRow, read_track
+from engine.matcher import SceneMatcher
+from engine.orthomap import OrthoMap
+from engine.report.metrics import Ground
+from engine.runs.folders import StrPath
+from engine.runs.inputs import FlightFiles, open_map
+from engine.runs.progress import SILENT, Progress
+from engine.runs.record import RunRecord, read_record
+from engine.runs.results import SUMMARY, TRACK, ReportFrames, write_results
+from engine.runs.settings import TrackSettings
+
+
+def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Score a finished track again, and rewrite its summary, figures and page.
+
+    Args:
+        folder: of a finished run.
+        truth: truth.csv or a log; None is the one that the run had.
+        progress: is shown what the run does.
+
+    Returns:
+        The summary.
+
+    Raises:
+        TelemetryError: the folder holds no finished track, or no truth is known.
+    """
+    folder = Path(folder)
+    rows = read_track(folder / TRACK)
+    record = read_record(folder / SUMMARY)
+    path = record.truth if truth is None else truth
+    if path is None:
+        raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
+    truth_rows = open_truth(Path(path), rows[0].timestamp_ns if rows else None)
+    site = open_map(record.map, record.surface, record.map_sigma_m, progress=progress)
+    ground = Ground(record.ground_m, record.ground_amsl_m)
+    frames = _report_frames(record, rows, site)
+    record = replace(record, truth=str(Path(path).resolve()))
+    return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
+
+
+def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> ReportFrames:
+    """The flight and the matcher of a finished run, as far as its record and its files still give them."""
+    try:
+        values = {"method": record.method, "profile": record.profile} | dict(record.changed)
+        settings = options_from_mapping(TrackSettings, nested(values))
+        files = _recorded_files(record)
+        flight = files.open_flight()
+        stamps = [row.timestamp_ns for row in flight.rows]
+        recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
+        if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
+            return ReportFrames(why_missing="the frames or their telemetry are not those of the run any more.")
+        camera, options = files.load_camera(), settings.matcher_options()
+        return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, options))
+    except (EngineError, OSError) as error:
+        return ReportFrames(why_missing=f"{error}.")
+
+
+def _recorded_files(record: RunRecord) -> FlightFiles:
+    """The files of a finished run.
+
+    Raises:
+        TelemetryError: the record does not name them all.
+        OptionError: what it names does not go together.
+    """
+    if record.camera is None or record.frames is None:
+        raise TelemetryError("the record of the run lacks its camera or its frames")
+    return FlightFiles(
+        map=record.map,
+        camera=record.camera,
+        frames=record.frames,
+        telemetry=record.telemetry,
+        frame_stamps=record.frame_stamps,
+        log_offset_s=record.log_offset_s or 0.0,
+        image_topic=record.image_topic,
+    )

@@ -1,0 +1,79 @@
+"""The results of a run: summary.json, the figures and the report page, in the run's folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from engine.errors import EngineError
+from engine.formats.flight import Flight
+from engine.formats.notes import read_notes
+from engine.formats.track import TrackRow
+from engine.matcher import SceneMatcher
+from engine.orthomap import OrthoMap
+from engine.report.explain import choose_frames, explain_frames
+from engine.report.figures import draw_figures
+from engine.report.metrics import Ground, summarise
+from engine.report.page import FinishedTrack, write_page
+from engine.runs.progress import SILENT, Progress
+from engine.runs.record import RunRecord
+from engine.values import Truth
+
+TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"
+FIGURES = ("path.png", "position.png", "height.png", "error.png")
+OWNED = (TRACK, SUMMARY, NOTES, PAGE, *FIGURES)
+"""The files of an output folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFrames:
+    """The frames and the matcher by which the report shows single frames; or None, and why they are not there."""
+
+    flight: Flight | None = None
+    matcher: SceneMatcher | None = None
+    why_missing: str = "the frames were not kept."
+
+
+def write_results(
+    out: Path,
+    rows: list[TrackRow],
+    truth: list[Truth] | None,
+    site: OrthoMap,
+    ground: Ground,
+    record: RunRecord,
+    frames: ReportFrames,
+    *,
+    report: bool = True,
+    progress: Progress = SILENT,
+) -> dict[str, Any]:
+    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones."""
+    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record.facts()}
+    if summary.get("scored_fixes") == 0 and summary["fixes"]:
+        progress.message(f"no fix is scored: {record.truth} says nothing of the times of this flight")
+    (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if not report:
+        return summary
+    for name in FIGURES:
+        (out / name).unlink(missing_ok=True)
+    title = f"{record.method} ({record.profile} profile)"
+    draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
+    notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
+    _write_page(out / PAGE, FinishedTrack(rows, truth, site, ground, summary, notes), frames)
+    return summary
+
+
+def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
+    """The report, with some frames matched again where that can be done."""
+    if frames.flight is None or frames.matcher is None:
+        return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
+    if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:
+        return write_page(path, track, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
+    errors = track.plot_data().errors
+    chosen = choose_frames(track.rows, errors)
+    try:
+        shown = explain_frames(frames.flight, frames.matcher, track.rows, track.notes, chosen, errors)
+    except EngineError as error:
+        return write_page(path, track, why_not=f"No frames are shown: {error}")
+    return write_page(path, track, shown)

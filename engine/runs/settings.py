@@ -1,0 +1,72 @@
+"""How a flight is followed: the settings of a run, as a settings file holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from engine.errors import OptionError
+from engine.formats.settings import read_settings
+from engine.methods import METHODS
+from engine.methods.options import PROFILES, MatcherOptions, NccOptions, SiftOptions
+from engine.navigator import NavigatorOptions
+from engine.runs.arguments import check_choice, check_device, parse_budget, parse_position
+from engine.runs.folders import StrPath
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackSettings:
+    """How a flight is followed: all that a settings file holds.
+
+    Attributes:
+        method: "ncc", "sift" or "auto".
+        profile: "engine", or "paper" for the paper's own recipe, the baseline.
+        device: where tensors live: "auto", "cpu" or "cuda".
+        start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none takes the first
+            position of the telemetry, and where that has none the whole map is searched.
+        budget_ms: time that one frame may take, later answers are refused; none does not hurry.
+        ncc: settings of the NCC method.
+        sift: settings of the SIFT method.
+        navigator: how a position is carried from frame to frame; the paper's profile has none of it.
+
+    Raises:
+        OptionError: a name or a number is none of those that are expected.
+        DeviceError: the device is missing.
+    """
+
+    method: str = "ncc"
+    profile: str = "engine"
+    device: str = "auto"
+    start: str | None = None
+    budget_ms: float | None = None
+    ncc: NccOptions = field(default_factory=NccOptions)
+    sift: SiftOptions = field(default_factory=SiftOptions)
+    navigator: NavigatorOptions = field(default_factory=NavigatorOptions)
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, METHODS)
+        check_choice("profile", self.profile, PROFILES)
+        if (self.method, self.profile) == ("auto", "paper"):
+            raise OptionError("method: expected ncc or sift with `profile` paper, got 'auto'")
+        parse_position("start", self.start)
+        parse_budget("budget_ms", self.budget_ms)
+        check_device(self.device)
+
+    def matcher_options(self) -> MatcherOptions:
+        """What of it is the matcher's."""
+        return MatcherOptions(profile=self.profile, ncc=self.ncc, sift=self.sift)
+
+
+def load_settings(path: StrPath | None, **overrides: Any) -> TrackSettings:
+    """The settings of a file, or the defaults, with what overrides them.
+
+    Args:
+        path: a TOML file as ``scenematch init`` writes it; None is the defaults.
+        overrides: settings by name that count more than the file; None is none.
+
+    Raises:
+        OptionError, OSError: see :func:`engine.formats.settings.read_settings`.
+    """
+    settings = TrackSettings() if path is None else read_settings(Path(path), TrackSettings)
+    return replace(settings, **{name: value for name, value in overrides.items() if value is not None})

@@ -1,0 +1,80 @@
+"""Locating one image on the map, without a flight around it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.formats.frames import read_image
+from engine.matcher import SceneMatcher
+from engine.methods import METHODS
+from engine.runs.arguments import check_choice, check_device, parse_position
+from engine.runs.checks import check_position
+from engine.runs.folders import StrPath
+from engine.runs.inputs import open_map
+from engine.runs.progress import SILENT, Progress
+from engine.values import Fix, Frame, NoFix
+
+
+def locate_image(
+    image: StrPath,
+    map: StrPath,  # noqa: A002 - what the file is, as everywhere
+    camera: StrPath,
+    *,
+    surface: StrPath | None = None,
+    map_sigma_m: float | None = None,
+    height_agl_m: float | None = None,
+    heading_deg: float | None = None,
+    roll_deg: float | None = None,
+    pitch_deg: float | None = None,
+    near: str | None = None,
+    method: str = "auto",
+    device: str = "auto",
+    progress: Progress = SILENT,
+) -> Fix | NoFix:
+    """Match one image.
+
+    Args:
+        image: the file.
+        map: GeoTIFF, a picture with a world file, or a folder of tiles.
+        camera: calibration, a ROS camera_info YAML file.
+        surface: surface model, a GeoTIFF of heights.
+        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        height_agl_m: above the ground; None is unknown, as of the next three.
+        heading_deg: clockwise from true north.
+        roll_deg: right side down.
+        pitch_deg: nose up.
+        near: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
+        method: "ncc", "sift" or "auto".
+        device: where tensors live.
+        progress: is shown the copying of the map.
+
+    Raises:
+        OptionError: an argument is out of its range.
+        MapError, CalibrationError, TelemetryError: a file cannot be read, or does not fit another.
+    """
+    known = {
+        "height_agl_m": height_agl_m, "heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg,
+    }  # fmt: skip
+    _check_numbers(known)
+    check_choice("method", method, METHODS)
+    check_device(device)
+    prior = parse_position("near", near)
+    site = open_map(map, surface, map_sigma_m, progress=progress)
+    calibration = Camera.load(camera)
+    check_position("near", prior, site, OptionError)
+    pixels = read_image(image)
+    calibration.check_size(pixels.shape)
+    frame = Frame(pixels, None, **known)
+    return SceneMatcher(site, calibration, method, device).locate(frame, prior)
+
+
+def _check_numbers(known: Mapping[str, float | None]) -> None:
+    for name, value in known.items():
+        if value is not None and not math.isfinite(value):
+            raise OptionError(f"{name}: expected a finite number, got {value}")
+    height_agl_m = known["height_agl_m"]
+    if height_agl_m is not None and height_agl_m <= 0:
+        raise OptionError(f"height_agl_m: expected metres above 0, got {height_agl_m:g}")

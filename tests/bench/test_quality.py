@@ -1,0 +1,170 @@
+"""The figures of the benchmarks are what they say: perfect features score 1, noise does not, and truth is true."""
+
+import cv2
+import numpy as np
+import pytest
+
+from bench.accuracy import quality
+from bench.accuracy.flights import attitude_rms_deg, moved_to_middle
+from bench.accuracy.quality import Keypoints, ViewPair, judge
+from bench.inputs.map_views import map_pairs
+from bench.inputs.views import by_homography, warped_pairs
+from bench.speed.detectors import detectors
+from engine import Camera, Fix
+from engine.values import Attitude, Timings, Truth
+
+SIZE = 200
+TURN = np.array([[0.0, -1.0, SIZE - 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter: (x, y) to (last - y, x)
+
+
+def pair_by(homography, size=SIZE):
+    blank = np.zeros((size, size), np.uint8)
+    return ViewPair("test", blank, blank, by_homography(np.asarray(homography, float)))
+
+
+def keypoints(xy_px, scale_px=2.0, seed=0):
+    words = np.random.default_rng(seed).normal(size=(len(xy_px), 32)).astype(np.float32)
+    return Keypoints(np.asarray(xy_px, float), np.full(len(xy_px), scale_px), words)
+
+
+@pytest.fixture
+def places():
+    """Points at least 8 px apart."""
+    grid = np.stack(np.meshgrid(np.arange(8, SIZE - 8, 10), np.arange(8, SIZE - 8, 10)), axis=-1).reshape(-1, 2)
+    return grid + np.random.default_rng(1).uniform(-1, 1, grid.shape)
+
+
+def seen_by(pair, places, **options):
+    """The same points in the second picture."""
+    homography = np.linalg.inv(TURN)
+    return keypoints(by_homography(homography)(places), **options)
+
+
+def test_the_same_features_in_a_turned_picture_are_perfect(places):
+    pair = pair_by(TURN)
+    figures = judge(keypoints(places), seen_by(pair, places), pair)
+    assert figures.repeatability == figures.matching_score == figures.inlier_ratio == 1.0
+    assert figures.correct == figures.keypoints == len(places)
+    assert figures.error_px < 1e-9
+
+
+def test_the_turn_and_the_scale_of_a_pair_are_those_of_its_map():
+    pair = pair_by(TURN)
+    assert pair.scale == pytest.approx(1.0)
+    # The first's x axis points up in the second: (x, y) of the second goes to (last - y, x).
+    assert pair.turn_deg == pytest.approx(-90.0)
+    assert pair_by(np.diag([2.0, 2.0, 1.0])).scale == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("off_px", "repeated", "right"), [(1.4, 1.0, 1.0), (2.0, 0.0, 1.0), (3.1, 0.0, 0.0)])
+def test_a_shifted_keypoint_counts_up_to_the_tolerances(places, off_px, repeated, right):
+    pair = pair_by(np.eye(3))
+    figures = judge(keypoints(places), keypoints(places + np.array([off_px, 0.0])), pair)
+    assert (figures.repeatability, figures.inlier_ratio) == (repeated, right)
+
+
+@pytest.mark.parametrize(("factor", "repeated"), [(1.4, 1.0), (1.6, 0.0), (1 / 1.4, 1.0), (1 / 1.6, 0.0)])
+def test_a_keypoint_of_another_scale_is_not_repeated(places, factor, repeated):
+    figures = judge(keypoints(places), keypoints(places, scale_px=2.0 * factor), pair_by(np.eye(3)))
+    assert figures.repeatability == repeated
+
+
+def test_scales_are_compared_on_the_ground(places):
+    pair = pair_by(np.diag([2.0, 2.0, 1.0]))  # the first shows the ground twice as large
+    first, second = keypoints(places, scale_px=4.0), keypoints(places / 2.0, scale_px=2.0)
+    assert judge(first, second, pair).repeatability == 1.0
+
+
+def test_keypoints_outside_the_common_ground_do_not_count_against_repeatability(places):
+    pair = pair_by([[1, 0, SIZE / 2], [0, 1, 0], [0, 0, 1]])  # the left half of the second is the first's right
+    second = keypoints(places - np.array([SIZE / 2, 0.0]))
+    inside = places[:, 0] >= SIZE / 2
+    figures = judge(keypoints(places), Keypoints(second.xy_px[inside], *_part(second, inside)), pair)
+    assert inside.sum() < len(places)
+    assert figures.repeatability == 1.0
+
+
+def _part(points, chosen):
+    return points.scale_px[chosen], points.descriptors[chosen]
+
+
+def test_words_that_say_nothing_find_next_to_nothing(places):
+    figures = judge(keypoints(places, seed=1), keypoints(places, seed=2), pair_by(np.eye(3)))
+    assert figures.repeatability == 1.0
+    assert figures.matching_score < 0.02
+
+
+def test_no_keypoints_score_nothing(places):
+    none = Keypoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.float32))
+    figures = judge(keypoints(places), none, pair_by(np.eye(3)))
+    assert (figures.repeatability, figures.matching_score, figures.correct) == (0.0, 0.0, 0.0)
+    assert np.isnan(figures.error_px)
+    assert quality.mean([figures, judge(none, none, pair_by(np.eye(3)))]).keypoints == len(places) / 4.0
+
+
+def correlation(pair):
+    """Of the second picture with the first laid on it by the pair's map."""
+    rows, columns = pair.second.shape
+    pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    moved = pair.first_from_second(pixels.astype(float))
+    inside = quality.inside(moved, pair.first.shape).reshape(rows, columns)
+    x, y = moved.astype(np.float32).reshape(rows, columns, 2).transpose(2, 0, 1)
+    laid = cv2.remap(pair.first, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR)
+    assert inside.mean() > 0.3
+    return np.corrcoef(laid[inside], pair.second[inside])[0, 1]
+
+
+@pytest.mark.parametrize("size", [(150, 150), (300, 300)])
+def test_pairs_show_the_same_ground_where_their_map_says(size):
+    assert min(correlation(pair) for pair in warped_pairs(size, 5)) > 0.85
+    assert min(correlation(pair) for pair in map_pairs(size, 4)) > 0.8
+
+
+def test_every_detector_finds_a_blob_where_it_is():
+    """OpenCV's and kornia's own biases are below half a pixel; x for y, or a corner for a centre, is more."""
+    v, u = np.mgrid[:160, :160]
+    x, y, sigma = 80.0, 70.0, 4.0
+    bright = 40 + 150 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
+    for name, create in detectors().items():
+        if name in ("OpenCV ORB", "OpenCV AKAZE"):
+            continue  # they look for corners
+        detector = create()
+        found = detector.keypoints(detector.make()(bright.astype(np.uint8), 0.0))
+        nearest = np.argmin(np.linalg.norm(found.xy_px - (x, y), axis=1))
+        assert np.abs(found.xy_px[nearest] - (x, y)).max() < 0.7, name
+        assert 0.6 < found.scale_px[nearest] / sigma < 1.6, name
+
+
+def fix_with(attitude, up_m=100.0):
+    return Fix(
+        timestamp_ns=0,
+        lat_deg=0.0,
+        lon_deg=0.0,
+        east_m=5.0,
+        north_m=-3.0,
+        up_m=up_m,
+        covariance_m2=np.eye(3),
+        attitude=attitude,
+        score=1.0,
+        method="sift",
+        window=None,
+        timings=Timings(),
+        map_xy_px=(0.0, 0.0),
+    )
+
+
+def test_the_attitudes_error_is_the_angle_between_the_attitudes():
+    truth = [Truth(timestamp_ns=0, lat_deg=0.0, lon_deg=0.0, roll_deg=2.0, pitch_deg=0.0, heading_deg=359.0)]
+    assert attitude_rms_deg([fix_with(Attitude(2.0, 0.0, 2.0))], truth) == pytest.approx(3.0)
+    assert attitude_rms_deg([fix_with(Attitude(6.0, 0.0, 359.0))], truth) == pytest.approx(4.0)
+    assert attitude_rms_deg([], truth) is None
+
+
+def test_a_fix_moves_to_where_its_axis_meets_the_ground(ground):
+    camera = Camera.from_fov(300, 300, 60.0)
+    level = moved_to_middle(fix_with(Attitude(0.0, 0.0, 30.0)), ground.site, camera)
+    assert (level.east_m, level.north_m) == pytest.approx((5.0, -3.0))
+    nose_up = moved_to_middle(
+        fix_with(Attitude(0.0, 10.0, 0.0)), ground.site, camera
+    )  # heading north, looks ahead
+    assert (nose_up.east_m, nose_up.north_m) == pytest.approx((5.0, -3.0 + 100.0 * np.tan(np.radians(10.0))))

@@ -1,0 +1,649 @@
+"""The command line as a user meets it: results, exit codes, and one clear line for everything that is wrong."""
+
+import contextlib
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import torch
+from PIL import Image
+
+from engine.cli.app import run
+from engine.errors import OptionError
+from engine.formats.geotiff import write_geotiff
+from engine.runs import tracking as track_module
+from engine.runs.simulation import write_flight
+from engine.sim import plan_flight
+
+COLUMNS = (
+    "timestamp_ns,frame,status,reason,lat_deg,lon_deg,east_m,north_m,up_m,sigma_east_m,sigma_north_m,"
+    "covariance_en_m2,score,method,window_width_px,window_height_px,latency_ms,deadline_met"
+)
+FRAMES = 6
+FIGURES = {"path.png", "position.png", "height.png", "error.png"}
+WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"} | FIGURES
+SCRIPT = Path(sys.executable).with_name("scenematch")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A flight folder of six frames, to be read and not written."""
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, plan_flight(frames=FRAMES))
+    return folder
+
+
+@pytest.fixture
+def copy(flight, tmp_path):
+    """The same, to be spoiled."""
+    return Path(shutil.copytree(flight, tmp_path / "copy"))
+
+
+@pytest.fixture(scope="module")
+def done(flight, tmp_path_factory):
+    """A finished NCC track of the flight."""
+    out = tmp_path_factory.mktemp("done") / "out"
+    assert run(track(flight, out)) == 0
+    return out
+
+
+def track(folder, out, *more, **replaced):
+    files = {
+        "map": "map.tif",
+        "surface": "dsm.tif",
+        "camera": "camera.yaml",
+        "frames": "frames",
+        "telemetry": "telemetry.csv",
+    } | replaced
+    options = [f"--{name}={folder / file}" for name, file in files.items() if file is not None]
+    return ["track", *options, "--threads=1", f"--out={out}", *map(str, more)]
+
+
+def error_line(capsys, arguments, code):
+    """The one line that a refused command leaves on standard error."""
+    assert run([str(argument) for argument in arguments]) == code
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.endswith("\n")
+    assert printed.err.count("\n") == 1, printed.err
+    assert printed.err.startswith("scenematch: ")
+    assert "\x1b" not in printed.err
+    return printed.err
+
+
+def refused(capsys, folder, out, code, *words, more=(), **replaced):
+    """A track is refused in one line that has these words, and no output folder is made."""
+    line = error_line(capsys, track(folder, out, *more, **replaced), code)
+    for word in words:
+        assert str(word) in line
+    assert not out.exists()
+
+
+def edit(path, old, new, count=1):
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, count), encoding="utf-8")
+
+
+def cells(path):
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def set_cell(path, row, column, value):
+    rows = cells(path)
+    rows[row][column] = value
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+# ------------------------------------------------------------------------------------------------ what works
+
+
+def test_track_writes_one_row_a_frame_and_every_file(done):
+    assert (done / "track.csv").read_text(encoding="utf-8").splitlines()[0] == COLUMNS
+    rows = cells(done / "track.csv")
+    assert [row["frame"] for row in rows] == [f"{i:06d}.jpg" for i in range(FRAMES)]
+    assert all(row["status"] == "fix" and row["method"] == "ncc" for row in rows)
+    assert all(row["deadline_met"] == "" and row["reason"] == "" for row in rows)
+    assert {file.name for file in done.iterdir()} == WRITTEN
+    for name in FIGURES:
+        with Image.open(done / name) as picture:
+            assert picture.format == "PNG"
+            assert np.asarray(picture.convert("L")).std() > 5
+
+
+def test_summary_tells_what_the_run_was_made_of(done, flight):
+    summary = json.loads((done / "summary.json").read_text(encoding="utf-8"))
+    assert summary["frames"] == summary["fixes"] == summary["scored_fixes"] == FRAMES
+    assert summary["status"] == {"fix": FRAMES, "no_fix": 0}
+    assert summary["rms_m"] < 5
+    assert set(summary["latency_ms"]) == {"p50", "p95", "p99", "max"}
+    assert summary["settings"]["map"] == str((flight / "map.tif").resolve())
+    assert summary["settings"]["truth"] == str((flight / "truth.csv").resolve())
+    assert (summary["settings"]["method"], summary["settings"]["profile"]) == ("ncc", "engine")
+
+
+def test_track_prints_a_table_and_keeps_the_rest_from_standard_output(flight, tmp_path, capsys):
+    assert run(track(flight, tmp_path / "out")) == 0
+    printed = capsys.readouterr()
+    assert re.search(r"^RMS error +\d+\.\d\d m$", printed.out, re.MULTILINE)
+    assert "\x1b" not in printed.out + printed.err
+    assert printed.err == f"written to {tmp_path / 'out'}\n"
+
+
+def test_json_is_all_there_is_on_standard_output(flight, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(track(flight, out, "--json", "--method=sift", "--budget-ms=60000")) == 0
+    printed = capsys.readouterr()
+    summary = json.loads(printed.out)
+    assert printed.err == ""
+    assert summary == json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["height_rms_m"] < 5
+    assert (out / "height.png").is_file()
+    assert {row["deadline_met"] for row in cells(out / "track.csv")} == {"true"}
+
+
+def test_evaluate_reproduces_the_summary(done, tmp_path, capsys):
+    folder = Path(shutil.copytree(done, tmp_path / "again"))
+    before = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert run(["evaluate", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == before
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == before
+
+
+def test_evaluate_takes_another_truth_and_drops_figures_that_no_longer_hold(done, flight, tmp_path, capsys):
+    folder = Path(shutil.copytree(done, tmp_path / "again"))
+    late = tmp_path / "late.csv"
+    late.write_text((flight / "truth.csv").read_text(encoding="utf-8"), encoding="utf-8")
+    for row in range(FRAMES):
+        set_cell(late, row, "timestamp_ns", str(10**15 + row))
+    assert run(["evaluate", str(folder), f"--truth={late}", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["scored_fixes"] == 0
+    assert str(late) in printed.err
+    assert not (folder / "error.png").exists()
+    assert (folder / "path.png").exists()
+
+
+def test_start_comes_before_the_telemetry(flight, tmp_path):
+    truth = cells(flight / "truth.csv")[0]
+    # So far from the truth, and so sure of it, that nothing but the start itself can lead astray.
+    lat = float(truth["lat_deg"]) + 0.002
+    out = tmp_path / "out"
+    assert run(track(flight, out, f"--start={lat},{truth['lon_deg']},1")) == 0
+    assert cells(out / "track.csv")[0]["status"] == "no_fix" or (
+        abs(float(cells(out / "track.csv")[0]["lat_deg"]) - lat) < 0.001
+    )
+
+
+def test_a_flight_without_truth_is_tracked_and_not_scored(copy, tmp_path, capsys):
+    (copy / "truth.csv").unlink()
+    out = tmp_path / "out"
+    assert run(track(copy, out, surface=None)) == 0
+    assert "RMS" not in capsys.readouterr().out
+    assert "rms_m" not in json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    line = error_line(capsys, ["evaluate", out], 1)
+    assert "--truth" in line
+
+
+def test_track_without_telemetry_reads_the_photographs_exif(copy, tmp_path):
+    for index, path in enumerate(sorted((copy / "frames").iterdir())):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = f"2024:05:06 10:00:{index:02d}"
+        with Image.open(path) as picture:
+            pixels = picture.copy()
+        pixels.save(path, exif=exif, quality=95)
+    out = tmp_path / "out"
+    assert run(track(copy, out, "--method=sift", telemetry=None)) == 0
+    rows = cells(out / "track.csv")
+    assert [row["timestamp_ns"][-9:] for row in rows] == ["000000000"] * FRAMES
+    assert [row["reason"] for row in rows][:2] == ["unconfirmed"] * 2  # without a position three must agree
+    assert sum(row["status"] == "fix" for row in rows) >= FRAMES - 2
+
+
+def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(track(flight, out, "--budget-ms=0.001")) == 0
+    rows = cells(out / "track.csv")
+    # The second frame knows no place to look at: its search of the whole map is not held to the budget.
+    assert [row["reason"] for row in rows] == ["late", "unconfirmed", *["late"] * (len(rows) - 2)]
+    assert "deadlines missed" in capsys.readouterr().out
+
+
+def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsys):
+    out = tmp_path / "demo"
+    assert run(["demo", "--frames=4", "--threads=1", f"--out={out}"]) == 0
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 80
+    for row in ("NCC, as published", "NCC, paper's recipe", "SIFT, scenematch"):
+        assert row in printed
+    runs = {"ncc-paper", "ncc-engine", "sift-paper", "sift-engine"}
+    assert set(json.loads((out / "table.json").read_text(encoding="utf-8"))) == runs
+    assert runs < {path.name for path in out.iterdir()}
+    # Once more and shorter: nothing of the first run is left beside the second.
+    assert run(["demo", "--frames=2", "--threads=1", f"--out={out}", "--force", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert {name: result["frames"] for name, result in json.loads(printed.out).items()} == dict.fromkeys(runs, 2)
+    assert len(list((out / "flight" / "frames").iterdir())) == 2
+    assert "left out" not in printed.err
+
+
+def test_locate_finds_a_picture_without_a_prior(flight, capsys):
+    image, truth = flight / "frames" / "000000.jpg", cells(flight / "truth.csv")[0]
+    base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
+    assert run([*base, "--json", "--threads=1"]) == 0
+    fix = json.loads(capsys.readouterr().out)
+    assert fix["status"] == "fix"
+    assert abs(fix["lat_deg"] - float(truth["lat_deg"])) < 1e-4
+    assert np.shape(fix["covariance_m2"]) == (3, 3)
+    assert run([*base, "--method=ncc"]) == 1
+    printed = capsys.readouterr()
+    assert "no_height" in printed.out
+    assert printed.err == ""
+
+
+def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
+    """The built-in map says that it is exact; --map-sigma-m counts more, and adds up with the rest."""
+    image = flight / "frames" / "000000.jpg"
+    base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}", "--json"]
+    variances = []
+    for option in ([], ["--map-sigma-m=3"]):
+        assert run([*base, *option, "--threads=1"]) == 0
+        variances.append(np.diag(json.loads(capsys.readouterr().out)["covariance_m2"]))
+    np.testing.assert_allclose(variances[1] - variances[0], 9.0, rtol=1e-4)
+    assert "--map-sigma-m: expected a number above 0" in error_line(capsys, [*base, "--map-sigma-m=0"], 2)
+
+
+def test_locate_near_and_its_refusals(flight, capsys):
+    image = flight / "frames" / "000000.jpg"
+    base = ["locate", image, f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
+    assert "--height-agl" in error_line(capsys, [*base, "--height-agl=-3"], 2)
+    assert "--heading" in error_line(capsys, [*base, "--heading=nan"], 2)
+    assert "--near" in error_line(capsys, [*base, "--near=10,10"], 2)
+    assert "--method" in error_line(capsys, [*base, "--method=orb"], 2)
+    missing = flight / "none.jpg"
+    assert str(missing) in error_line(capsys, ["locate", missing, *base[2:]], 1)
+
+
+def test_map_info(flight, capsys):
+    path = str(flight / "map.tif")
+    assert run(["map", "info", path, f"--surface={flight / 'dsm.tif'}"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^gsd_m_per_px +0\.5\d+$", printed, re.MULTILINE)
+    assert run(["map", "info", path, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["width_px"], facts["height_px"]) == (900, 1000)
+
+
+def test_doctor(capsys):
+    assert run(["doctor"]) == 0
+    assert "torch" in capsys.readouterr().out
+    assert run(["doctor", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["missing"] == "nothing"
+    assert facts["numba"] == metadata.version("numba")
+
+
+def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
+    stated = [
+        "numpy>=2.0", "no-such-package<2,>=1", 'pillow>=10; extra == "pictures"',
+        'no-such-tool; platform_system == "Linux" and extra == "pictures"', 'pytest>=8.3; extra == "test"',
+    ]  # fmt: skip
+    monkeypatch.setattr(metadata, "requires", lambda _: stated)
+    assert run(["doctor", "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["missing"] == ["no-such-package"]
+    told = f"pillow {metadata.version('pillow')}, no-such-tool is not installed"
+    assert [(name, value) for name, value in facts.items() if "extra" in name] == [("extra [pictures]", told)]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [],
+        ["demo"],
+        ["track"],
+        ["locate"],
+        ["evaluate"],
+        ["export"],
+        ["map"],
+        ["map", "info"],
+        ["map", "audit"],
+        ["bridge"],
+        ["bridge", "mavlink"],
+        ["bridge", "mavlink-params"],
+        ["bridge", "ros"],
+        ["simulate"],
+        ["compare"],
+        ["init"],
+        ["bag"],
+        ["doctor"],
+    ],
+)
+def test_help_fits_80_columns_and_is_not_cut_off(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run([*command, "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 80
+    assert "..." not in printed.replace("[ARGS]...", "")
+
+
+def test_no_command_at_all_shows_help(capsys):
+    assert run([]) == 2
+    assert "Commands:" in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert run(["--version"]) == 0
+    assert re.fullmatch(r"\d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+# ---------------------------------------------------------------------------------------------- wrong usage
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["fly"], ["'fly'", "--help"]),
+        (["map", "audit"], ["MAP"]),
+        (["--bogus"], ["--bogus"]),
+        (["track", "--bogus"], ["--bogus", "scenematch track --help"]),
+        (["track"], ["--map"]),
+        (["locate"], ["IMAGE"]),
+        (["map"], ["scenematch map --help"]),
+        (["demo", "--frames=1"], ["--frames"]),
+        (["demo", "--seed=-1"], ["--seed"]),
+        (["demo", "--seed=one"], ["--seed"]),
+        (["demo", "--threads=0"], ["--threads"]),
+        (["demo", "--device=tpu", "--out=never-made"], ["device", "tpu"]),
+    ],
+)
+def test_wrong_usage(arguments, words, capsys):
+    line = error_line(capsys, arguments, 2)
+    for word in words:
+        assert word in line
+    assert not Path("never-made").exists()
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--method=orb",
+        "--profile=fast",
+        "--start=here",
+        "--start=33",
+        "--start=33,35,1,2",
+        "--start=nan,35",
+        "--start=95,35",
+        "--start=33,35,-1",
+        "--start=10,10",
+        "--budget-ms=0",
+        "--budget-ms=-5",
+        "--budget-ms=nan",
+        "--budget-ms=soon",
+    ],
+)
+def test_wrong_options_of_track_are_named(option, flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 2, option.split("=")[0], more=[option])
+
+
+def test_device_names(flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 2, "device", "tpu", more=["--device=tpu"])
+    if not torch.cuda.is_available():
+        refused(capsys, flight, tmp_path / "out", 1, "cuda", more=["--device=cuda"])
+
+
+def test_the_papers_profile_has_no_auto(flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 2, "--method", more=["--method=auto", "--profile=paper"])
+
+
+def test_an_output_folder_is_not_overwritten(done, flight, tmp_path, capsys):
+    before = (done / "track.csv").read_bytes()
+    line = error_line(capsys, track(flight, done), 2)
+    assert "--out" in line
+    assert "--force" in line
+    assert (done / "track.csv").read_bytes() == before
+    file = tmp_path / "file"
+    file.touch()
+    assert str(file) in error_line(capsys, track(flight, file), 2)
+    assert str(file) in error_line(capsys, track(flight, file / "deeper", "--force"), 2)
+
+
+def test_force_replaces_results_and_touches_nothing_else(flight, tmp_path):
+    out = tmp_path / "out"
+    assert run(track(flight, out, "--method=sift")) == 0
+    (out / "notes.txt").write_text("mine", encoding="utf-8")
+    assert (out / "height.png").exists()
+    assert run(track(flight, out, "--force")) == 0
+    assert {file.name for file in out.iterdir()} == {"notes.txt"} | WRITTEN
+    assert {row["method"] for row in cells(out / "track.csv")} == {"ncc"}
+
+
+# ---------------------------------------------------------------------------------------------- wrong input
+
+
+@pytest.mark.parametrize("name", ["map", "surface", "camera", "frames", "telemetry"])
+def test_missing_files_are_named(name, flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 1, flight / "gone", **{name: "gone"})
+
+
+def test_missing_truth_is_named(flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 1, "gone.csv", more=["--truth=gone.csv"])
+
+
+def test_a_picture_is_no_map(copy, tmp_path, capsys):
+    Image.new("L", (64, 64)).save(copy / "map.png")
+    refused(capsys, copy, tmp_path / "out", 1, copy / "map.png", "georeference", map="map.png")
+
+
+@pytest.mark.parametrize("kind", ["no crs", "nan transform", "vrt", "text", "truncated", "empty"])
+def test_broken_maps(kind, copy, tmp_path, capsys):
+    path = copy / "broken.tif"
+    gray = np.full((64, 64), 9, np.uint8)
+    if kind in ("no crs", "nan transform"):
+        origin = np.nan if kind == "nan transform" else 600000.0
+        transform = rasterio.Affine(0.5, 0, origin, 0, -0.5, 3600000.0)
+        crs = None if kind == "no crs" else "EPSG:32636"
+        with rasterio.open(
+            path, "w", driver="GTiff", width=64, height=64, count=1, dtype="uint8", crs=crs, transform=transform
+        ) as file:
+            file.write(gray, 1)
+    elif kind == "vrt":
+        path.write_text('<VRTDataset rasterXSize="64" rasterYSize="64"></VRTDataset>', encoding="utf-8")
+    elif kind == "text":
+        path.write_text("not a raster", encoding="utf-8")
+    elif kind == "truncated":
+        path.write_bytes((copy / "map.tif").read_bytes()[:20000])
+    else:
+        path.touch()
+    refused(capsys, copy, tmp_path / "out", 1, path, map="broken.tif")
+
+
+def test_a_surface_of_another_place(copy, tmp_path, capsys):
+    affine = [[0.5, 0, 400000.0], [0, -0.5, 5000000.0]]
+    write_geotiff(copy / "far.tif", np.zeros((64, 64), np.float32), affine, 32633)
+    refused(capsys, copy, tmp_path / "out", 1, "surface", "far.tif", surface="far.tif")
+
+
+@pytest.mark.parametrize("index", [0, 3])
+@pytest.mark.parametrize("kind", ["empty", "truncated", "text", "other size"])
+def test_broken_pictures_are_found_before_the_run(kind, index, copy, tmp_path, capsys):
+    path = copy / "frames" / f"{index:06d}.jpg"
+    if kind == "other size":
+        Image.new("RGB", (64, 48)).save(path)
+    else:
+        content = {"empty": b"", "truncated": path.read_bytes()[:-3000], "text": b"not a picture"}[kind]
+        path.write_bytes(content)
+    refused(capsys, copy, tmp_path / "out", 1, path)
+
+
+def test_a_truncated_png_is_found_before_the_run(copy, tmp_path, capsys):
+    path = copy / "frames" / "000004.jpg"
+    with Image.open(path) as picture:
+        picture.save(path.with_suffix(".png"))
+    path.unlink()
+    path = path.with_suffix(".png")
+    path.write_bytes(path.read_bytes()[:-2000])
+    edit(copy / "telemetry.csv", "000004.jpg", "000004.png")
+    refused(capsys, copy, tmp_path / "out", 1, path)
+
+
+def test_frames_that_are_neither_folder_nor_video(copy, tmp_path, capsys):
+    (copy / "flight.mp4").write_bytes(b"no video at all")
+    refused(capsys, copy, tmp_path / "out", 1, copy / "flight.mp4", frames="flight.mp4")
+    (copy / "nothing").mkdir()
+    refused(capsys, copy, tmp_path / "out", 1, copy / "nothing", frames="nothing")
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("frame", "nowhere.jpg", ["line 4", "frame", "nowhere.jpg"]),
+        ("frame", "000001.jpg", ["line 4", "frame", "line 3"]),
+        ("timestamp_ns", "5", ["line 4", "timestamp_ns"]),
+        ("timestamp_ns", "", ["line 4", "timestamp_ns"]),
+        ("height_agl_m", "nan", ["line 4", "height_agl_m", "nan"]),
+        ("height_agl_m", "-150", ["line 4", "height_agl_m", "-150"]),
+        ("heading_deg", "north", ["line 4", "heading_deg", "north"]),
+    ],
+)
+def test_wrong_telemetry(column, value, words, copy, tmp_path, capsys):
+    set_cell(copy / "telemetry.csv", 2, column, value)
+    refused(capsys, copy, tmp_path / "out", 1, copy / "telemetry.csv", *words)
+
+
+def test_telemetry_without_a_column(copy, tmp_path, capsys):
+    edit(copy / "telemetry.csv", "timestamp_ns", "time")
+    refused(capsys, copy, tmp_path / "out", 1, copy / "telemetry.csv", "timestamp_ns")
+
+
+def test_telemetry_without_what_the_method_needs(copy, tmp_path, capsys):
+    edit(copy / "telemetry.csv", "heading_deg", "course")
+    refused(capsys, copy, tmp_path / "out", 1, "heading_deg", "sift")
+    edit(copy / "telemetry.csv", "height_agl_m", "height")
+    more = ["--method=sift", "--profile=paper"]
+    refused(capsys, copy, tmp_path / "out", 1, "height_agl_m", more=more)
+
+
+def test_a_map_of_another_place_than_the_flight(copy, tmp_path, capsys):
+    set_cell(copy / "telemetry.csv", 0, "lat_deg", "48.1")
+    refused(capsys, copy, tmp_path / "out", 1, copy / "telemetry.csv", "map.tif", "48.1")
+
+
+def test_wrong_truth(copy, tmp_path, capsys):
+    set_cell(copy / "truth.csv", 1, "lat_deg", "north")
+    refused(capsys, copy, tmp_path / "out", 1, copy / "truth.csv", "lat_deg")
+
+
+def test_a_camera_of_another_resolution(copy, tmp_path, capsys):
+    edit(copy / "camera.yaml", "image_width: 300", "image_width: 640")
+    refused(capsys, copy, tmp_path / "out", 1, "camera", "640 x 300", "300 x 300")
+
+
+@pytest.mark.parametrize("text", ["", "][", "image_width: 300\n", "just words"])
+def test_broken_camera_files(text, copy, tmp_path, capsys):
+    (copy / "camera.yaml").write_text(text, encoding="utf-8")
+    refused(capsys, copy, tmp_path / "out", 1, copy / "camera.yaml")
+
+
+def test_evaluate_of_what_is_no_finished_track(done, tmp_path, capsys):
+    assert str(tmp_path) in error_line(capsys, ["evaluate", tmp_path], 1)
+    folder = Path(shutil.copytree(done, tmp_path / "again"))
+    for content in ("[]", "{}", "{", '{"settings": []}', '{"settings": {"map": "x"}}'):
+        (folder / "summary.json").write_text(content, encoding="utf-8")
+        assert "summary.json" in error_line(capsys, ["evaluate", folder], 1)
+    (folder / "summary.json").unlink()
+    assert "summary.json" in error_line(capsys, ["evaluate", folder], 1)
+    edit(folder / "track.csv", "fix", "perhaps")
+    assert "track.csv" in error_line(capsys, ["evaluate", folder], 1)
+
+
+def test_an_output_folder_that_cannot_be_made(flight, tmp_path, capsys, monkeypatch):
+    def deny(self, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", deny)
+    line = error_line(capsys, track(flight, tmp_path / "out"), 1)
+    assert f"{tmp_path / 'out'}: Permission denied" in line
+
+
+def test_an_error_in_the_middle_of_a_flight_names_the_frame_and_keeps_the_rows(
+    flight, tmp_path, capsys, monkeypatch
+):
+    def failing(self, frame, prior=None):
+        if frame.timestamp_ns == int(cells(flight / "telemetry.csv")[2]["timestamp_ns"]):
+            raise OptionError("sigma_m: expected 0 m or more, got nan")
+        return original(self, frame, prior)
+
+    original = track_module.Navigator.update
+    monkeypatch.setattr(track_module.Navigator, "update", failing)
+    out = tmp_path / "out"
+    line = error_line(capsys, track(flight, out), 1)
+    assert "000002.jpg" in line
+    assert "sigma_m" in line
+    assert len(cells(out / "track.csv")) == 2
+
+
+# ------------------------------------------------------------------------------------------- interruption
+
+
+def test_an_interrupted_run_keeps_its_rows(flight, tmp_path, capsys, monkeypatch):
+    out, seen = tmp_path / "out", []
+
+    def interrupting(*args, **kwargs):
+        seen.append(args)
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)
+
+    original = track_module.track_row
+    monkeypatch.setattr(track_module, "track_row", interrupting)
+    assert "interrupted" in error_line(capsys, track(flight, out), 130)
+    assert len(cells(out / "track.csv")) == 3
+    assert not (out / "summary.json").exists()
+    assert "summary.json" in error_line(capsys, ["evaluate", out], 1)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_the_console_script_in_a_narrow_pipe_and_under_ctrl_c(flight, tmp_path):
+    environment = os.environ | {"COLUMNS": "30", "TERM": "dumb"}
+    gone = flight / ("a-folder-with-a-rather-long-name/" * 3 + "map.tif")
+    command = [str(SCRIPT), *track(flight, tmp_path / "out", map=gone)]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert result.stderr.count("\n") == 1
+    assert str(gone) in result.stderr
+
+    (tmp_path / "flight.mp4").write_bytes(b"no video at all")
+    command = [str(SCRIPT), *track(flight, tmp_path / "out", frames=tmp_path / "flight.mp4")]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (1, "", 1), result.stderr
+
+    out = tmp_path / "demo"
+    command = [str(SCRIPT), "demo", "--threads=1", f"--out={out}"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stderr.readline().startswith("drawing")
+        for _ in range(20):  # as a user does it: C code may swallow the first
+            process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                printed, rest = process.communicate(timeout=3)
+                break
+    assert process.returncode == 130
+    assert printed == ""
+    assert rest.endswith("scenematch: interrupted\n")
+    assert "Traceback" not in rest

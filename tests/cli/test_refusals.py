@@ -1,0 +1,114 @@
+"""What is refused before any work is done for it: in one line that begins with the option as it was typed."""
+
+import numpy as np
+import pytest
+
+from engine.cli.app import run
+from engine.errors import OptionError, TelemetryError
+from engine.formats.geotiff import write_geotiff
+from engine.formats.telemetry import read_telemetry
+from engine.integrity import AssumedErrors
+
+BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
+PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]
+ROS = ["bridge", "ros", "--map=m.tif"]
+SIMULATE = ["simulate", "--out=o"]
+TRACK = ["track", "--map=m.tif", "--camera=c.yaml", "--frames=f", "--out=o"]
+LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
+COMMANDS = {
+    "bridge": PLAYED, "ros": ROS, "simulate": [*SIMULATE, "--closed-loop"], "track": TRACK, "locate": LOCATE,
+    "demo": ["demo", "--out=o"],
+}  # fmt: skip
+
+
+def said(capsys, arguments, code=2):
+    """The one line on standard error."""
+    assert run(arguments) == code
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err.count("\n")) == ("", 1), printed
+    return printed.err.removeprefix("scenematch: ")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [
+        *((PLAYED, "--origin-alt-m", value) for value in ("nan", "inf", "-inf", "1e9", "-10001")),
+        *((LIVE, "--exposure-to-grab-ms", value) for value in ("nan", "inf", "1e308", "-1")),
+        *((PLAYED, "--rate-hz", value) for value in ("nan", "inf", "0", "1e-300")),
+        *((command, "--deadline-ms", value) for command in (PLAYED, ROS) for value in ("nan", "0", "-1")),
+        *((command, "--map-sigma-m", value) for command in (TRACK, LOCATE) for value in ("nan", "0", "1e200")),
+        *((command, "--start", "48,16,1e200") for command in (PLAYED, ROS, TRACK)),
+        *((TRACK, "--log-offset-s", value) for value in ("nan", "inf", "1e10")),
+        (LOCATE, "--near", "48,16,1e200"),
+        *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
+        *((command, "--device", "gpu") for command in COMMANDS.values()),
+        (PLAYED, "--firmware", "x"),
+        (PLAYED, "--message", "x"),
+        (PLAYED, "--max-sigma-m", "1e308"),
+        (ROS, "--firmware", "x"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, tmp_path, monkeypatch, capsys):
+    if option in ("--firmware", "--message", "--max-sigma-m"):
+        pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    monkeypatch.chdir(tmp_path)
+    assert said(capsys, [*command, f"{option}={value}"]).startswith(f"{option}: expected ")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "wanted"),
+    [
+        ([*LIVE, "--telemetry=t.csv"], "--telemetry", "--frames"),
+        ([*LIVE, "--rate-hz=3"], "--rate-hz", "--frames"),
+        ([*PLAYED, "--exposure-to-grab-ms=3"], "--exposure-to-grab-ms", "--camera-source"),
+        ([*PLAYED, "--no-set-origin", "--origin-alt-m=3"], "--origin-alt-m", "--set-origin"),
+        ([*SIMULATE, "--device=cpu"], "--device", "--closed-loop"),
+        ([*SIMULATE, "--minutes=1"], "--minutes", "--closed-loop"),
+    ],
+)
+def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, capsys):
+    assert said(capsys, command) == f"{option}: expected with {wanted} only\n"
+
+
+def test_a_topic_is_of_a_bag(capsys):
+    assert said(capsys, [*TRACK, "--image-topic=/down"]) == "--image-topic: expected a bag as frames, got f\n"
+
+
+@pytest.mark.parametrize("source", ["9" * 20, "9" * 5000, "7", "²", "no-such-file.mp4"])
+def test_a_camera_that_does_not_open_is_told(source):
+    from engine.adapters.pictures import capture
+
+    with pytest.raises(TelemetryError, match=r"^camera_source: expected a camera or stream that opens, got "):
+        next(capture(source))
+
+
+@pytest.mark.parametrize("link", ["udpout:192.168..1:14550", f"udpout:{'x' * 300}:5", "tcp:a..b:5"])
+def test_a_host_that_cannot_be_one_is_told(link):
+    from engine.adapters.links import parse_connection
+
+    with pytest.raises(OSError, match="cannot be the name of a host"):
+        parse_connection(link).open()
+
+
+# ----------------------------------------------------------------------------------------- as wide as no map
+
+
+def test_a_sigma_wider_than_any_map_is_refused_in_the_telemetry(tmp_path):
+    table = tmp_path / "telemetry.csv"
+    table.write_text("timestamp_ns,frame,lat_deg,lon_deg,sigma_m\n1,a.jpg,48,16,1e200\n", encoding="utf-8")
+    with pytest.raises(TelemetryError, match=r"line 2, sigma_m: expected a number from 0 to 1e\+06, got '1e200'"):
+        read_telemetry(table)
+
+
+def test_an_assumed_error_wider_than_any_map_is_refused():
+    with pytest.raises(OptionError, match=r"map_m: expected at most 1e\+06, got 1e\+200"):
+        AssumedErrors(map_m=1e200)
+
+
+def test_an_audit_names_its_options(tmp_path, capsys):
+    affine = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_000_000.0]])
+    write_geotiff(tmp_path / "m.tif", np.full((500, 500), 9, np.uint8), affine, 32633)
+    audit = ["map", "audit", str(tmp_path / "m.tif"), f"--out={tmp_path / 'o'}"]
+    assert said(capsys, [*audit, "--height-agl=-1"]).startswith("--height-agl: expected metres above 0")
+    assert said(capsys, [*audit, "--sigma-m=-1"]).startswith("--sigma-m: expected a number above 0")

@@ -1,0 +1,370 @@
+"""Large maps: matched as a small one is, in bounded memory; copies that are carried on; searches refused."""
+
+import io
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from rasterio.enums import Resampling
+from rasterio.windows import Window as RasterWindow
+from rich.console import Console
+
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
+from engine.cli import console
+from engine.cli.app import run
+from engine.maps import metric_copy
+from engine.maps.rasters import GrayReader
+from engine.runs.checks import check_start
+from engine.values import Window
+
+SIDE = 17_000
+CORNER = (12_288, 6_656)  # of the town on the large map: on its cells, so that the same landmarks are chosen
+MARGIN = 512  # of other ground around it
+UTM = "EPSG:32633"
+
+
+@pytest.fixture(scope="module")
+def gray(sim_town):
+    return np.maximum(cv2.cvtColor(sim_town.ortho, cv2.COLOR_RGB2GRAY), 1)
+
+
+@pytest.fixture(scope="module")
+def large_path(tmp_path_factory, sim_town, gray):
+    """A sparse GeoTIFF of 17,000 x 17,000 pixels with overviews; all but the town is nodata."""
+    path = tmp_path_factory.mktemp("large") / "map.tif"
+    (a, b, c), (d, e, f) = sim_town.pixel_to_crs
+    corner = Affine(a, b, c - a / 2, d, e, f - e / 2) @ Affine.translation(-CORNER[0], -CORNER[1])
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM, "transform": corner, "nodata": 0}
+    profile |= {"tiled": True, "sparse_ok": True, "compress": "deflate", "width": SIDE, "height": SIDE}
+    around = np.pad(gray, MARGIN, mode="reflect")
+    with rasterio.Env(SPARSE_OK_OVERVIEW="ON"), rasterio.open(path, "w", **profile) as dataset:
+        place = RasterWindow(CORNER[0] - MARGIN, CORNER[1] - MARGIN, around.shape[1], around.shape[0])
+        dataset.write(around, 1, window=place)
+        dataset.build_overviews([2, 4, 8, 16, 32], Resampling.average)
+    return path
+
+
+@pytest.fixture(scope="module")
+def large(large_path):
+    return OrthoMap.open(large_path)
+
+
+@pytest.fixture(scope="module")
+def small(sim_town, gray):
+    return OrthoMap.from_arrays(gray, sim_town.pixel_to_crs, UTM)
+
+
+def prior_of(flight, index, sigma_m=10.0):
+    row = flight.truth[index]
+    return Prior(lat_deg=row.lat_deg, lon_deg=row.lon_deg, sigma_m=sigma_m)
+
+
+def frame_of(flight, index):
+    return flight.frames[index]
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift"])
+def test_a_frame_is_found_where_the_small_map_has_it_in_a_part_of_the_memory(
+    large_path, small, sim_flight, method
+):
+    """The grey levels and validity of the whole would take 578 MB."""
+    frame, prior = frame_of(sim_flight, 5), prior_of(sim_flight, 5)
+    camera = sim_flight.camera
+    at_home = SceneMatcher(small, camera, method, "cpu").locate(frame, prior)
+    tracemalloc.start()
+    matcher = SceneMatcher(OrthoMap.open(large_path), camera, method, "cpu")
+    abroad = matcher.locate(frame, prior)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert isinstance(at_home, Fix)
+    assert isinstance(abroad, Fix)
+    assert np.subtract(abroad.map_xy_px, at_home.map_xy_px) == pytest.approx(CORNER, abs=0.1)
+    assert (abroad.lat_deg, abroad.lon_deg) == pytest.approx((at_home.lat_deg, at_home.lon_deg), abs=1e-6)
+    assert peak_bytes < SIDE * SIDE / 2
+
+
+@pytest.mark.parametrize("level", [1, 2, 3, 5])
+def test_coarse_levels_are_the_files_own_overviews_at_the_same_place(large, small, level):
+    rows, columns = small.level_shape(level)
+    first = [-(-v >> level) for v in CORNER]  # whole pixels of the level inside the town
+    shift = [(n << level) - v for n, v in zip(first, CORNER, strict=True)]
+    window = Window(*first, columns - 2, rows - 2)
+    town = small.gray(Window(*shift, window.width_px << level, window.height_px << level))
+    mean = town.reshape(window.height_px, 1 << level, window.width_px, 1 << level).mean(axis=(1, 3))
+    assert np.abs(large.gray(window, level) - mean).max() <= 0.5 * level + 0.5  # each halving rounds
+    assert large.valid(window, level).all()
+
+
+def test_what_holds_no_map_is_nodata_and_the_warm_up_finds_a_place_that_does(large):
+    assert large.is_large
+    assert not large.fully_valid
+    assert not large.valid(Window(100, 100, 50, 50)).any()
+    assert large.info()["nodata_share"] > 0.98
+    x, y = np.rint(large.inner_px).astype(int)
+    assert large.valid(Window(x - 200, y - 200, 400, 400)).all()
+
+
+# ------------------------------------------------------------------------------------------------- searching
+
+
+def test_without_a_place_to_begin_at_a_map_that_is_too_large_is_refused_in_one_line(
+    large, sim_flight, monkeypatch
+):
+    monkeypatch.setattr("engine.orthomap.SEARCH_LIMIT_PX", 1_000_000)
+    for method in ("ncc", "sift", "auto"):
+        refused = SceneMatcher(large, sim_flight.camera, method, "cpu").locate(frame_of(sim_flight, 5))
+        assert isinstance(refused, NoFix)
+        assert refused.reason is Reason.MAP_TOO_LARGE
+        assert "9.01 x 9.01 km" in refused.detail
+    with pytest.raises(OptionError, match=r"^--start: expected a place to begin at.*the map of 9.01 x 9.01 km"):
+        check_start(None, large)
+    check_start(Prior(lat_deg=48.0, lon_deg=16.0, sigma_m=10.0), large)
+
+
+def test_a_small_map_may_be_searched(small):
+    check_start(None, small)
+
+
+def test_a_vague_place_is_searched_coarse_to_fine_and_too_vague_a_one_refused(large, sim_flight, monkeypatch):
+    frame, prior = frame_of(sim_flight, 5), prior_of(sim_flight, 5, sigma_m=400.0)
+    matcher = SceneMatcher(large, sim_flight.camera, "ncc", "cpu")
+    truth = large.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+    found = matcher.locate(frame, prior)
+    assert isinstance(found, Fix)
+    assert np.hypot(*(np.array(found.map_xy_px) - truth)) < 4.0
+    assert found.window.area_px > 16e6
+    monkeypatch.setattr("engine.methods.ncc.MAX_WINDOW_PX", 100_000)
+    refused = matcher.locate(frame, prior)
+    assert isinstance(refused, NoFix)
+    assert refused.reason is Reason.MAP_TOO_LARGE
+
+
+# -------------------------------------------------------------------------------------------- surface models
+
+
+def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_town, monkeypatch):
+    rows, columns = gray.shape
+    heights = np.random.default_rng(3).uniform(100.0, 130.0, (rows, columns)).astype(np.float32)
+    heights[300:420, 200:500] = -9999.0
+    (a, b, c), (d, e, f) = sim_town.pixel_to_crs
+    profile = {"driver": "GTiff", "count": 1, "crs": UTM, "transform": Affine(a, b, c - a / 2, d, e, f - e / 2)}
+    profile |= {"width": columns, "height": rows}
+    for name, data in (("map.tif", gray), ("dsm.tif", heights)):
+        with rasterio.open(tmp_path / name, "w", dtype=data.dtype, **profile) as dataset:
+            dataset.write(data, 1)
+    kept = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
+    monkeypatch.setattr("engine.maps.surface.SURFACE_LIMIT_PX", 10_000)
+    monkeypatch.setattr("engine.maps.surface.TILE_PX", 100)
+    monkeypatch.setattr("engine.maps.surface.MAX_PATCHES", 3)
+    tiled = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
+    xy = np.random.default_rng(4).uniform(-5.0, [columns + 5.0, rows + 5.0], (60, 40, 2))
+    known = np.array([[150.0, 100.0]])
+    np.testing.assert_array_equal(tiled.surface_at(xy), _with(kept, xy, tiled.ground_m))
+    np.testing.assert_array_equal(tiled.surface_at(known), kept.surface_at(known))
+    assert tiled.ground_plane([150.0, 100.0], 30.0)[0] == kept.ground_plane([150.0, 100.0], 30.0)[0]
+    assert tiled.ground_m == pytest.approx(kept.ground_m, abs=1.0)
+
+
+def _with(site, xy, ground_m):
+    """The surface of a map with another level for what is unknown."""
+    heights = site.surface_at(xy)
+    return np.where(heights == site.ground_m, ground_m, heights)
+
+
+def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_path, sim_town):
+    (a, b, c), (d, e, f) = sim_town.pixel_to_crs
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "crs": UTM, "width": 40, "height": 40}
+    corner = Affine(a, b, c - a / 2, d, e, f - e / 2) @ Affine.translation(200, 300)
+    with rasterio.open(tmp_path / "dsm.tif", "w", transform=corner, **profile) as dataset:
+        dataset.write(np.full((40, 40), 77.0, np.float32), 1)
+    assert OrthoMap.open(large_path, tmp_path / "dsm.tif").ground_m == 77.0
+
+
+# ---------------------------------------------------------------------------------------------------- copies
+
+
+@pytest.fixture
+def tiny_limits(monkeypatch):
+    """A map of a few hundred pixels a side counts as large, and its copy has tiles of 128."""
+    for module in ("maps.metric_copy", "maps.pyramid"):
+        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr(metric_copy, "TILE_PX", 128)
+    monkeypatch.setattr(metric_copy, "COARSEST_PX", 64)
+
+
+@pytest.fixture
+def picture(request, tmp_path):
+    """A smooth map without overviews, in metres unless told otherwise; a corner and a tile inside are nodata."""
+    noise = np.random.default_rng(1).uniform(0.0, 255.0, (400, 500))
+    data = np.clip(128.0 + 8.0 * (cv2.GaussianBlur(noise, (0, 0), 4.0) - 127.5), 1, 254).astype(np.uint8)
+    data[:128, :128] = data[128:256, 256:384] = 0
+    crs, corner = (UTM, Affine(0.5, 0, 607400, 0, -0.5, 5345369))
+    if getattr(request, "param", "metric") == "in degrees":
+        crs, corner = "EPSG:4326", Affine(1e-5, 0, 33.0, 0, -8e-6, 32.0)
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": crs, "transform": corner, "nodata": 0}
+    with rasterio.open(tmp_path / "map.tif", "w", width=500, height=400, **profile) as dataset:
+        dataset.write(data, 1)
+    return tmp_path / "map.tif"
+
+
+def whole(site, level=0):
+    rows, columns = site.level_shape(level)
+    return Window(0, 0, columns, rows)
+
+
+def same(one, other):
+    """Equal, but for the rounding of places in blocks that begin elsewhere, where it was resampled."""
+    valid = one.valid(whole(one))
+    assert np.array_equal(valid, other.valid(whole(other)))
+    apart = np.abs(one.gray(whole(one))[valid].astype(int) - other.gray(whole(other))[valid])
+    assert apart.max() <= (1 if one.info()["resampled"] else 0)
+    assert (apart > 0).mean() < 1e-3
+    assert one.bounds_deg == other.bounds_deg
+
+
+@pytest.mark.parametrize("picture", ["metric", "in degrees"], indirect=True)
+def test_a_large_map_without_overviews_is_copied_and_is_the_same(picture, tmp_path, request):
+    small = OrthoMap.open(picture, cache_dir=tmp_path / "small")
+    request.getfixturevalue("tiny_limits")
+    copied = OrthoMap.open(picture, cache_dir=tmp_path / "cache")
+    assert copied.is_large
+    same(copied, small)
+    for level in (1, 2, 3):
+        both = copied.valid(whole(copied, level), level) & small.valid(whole(small, level), level)
+        apart = (
+            copied.gray(whole(copied, level), level)[both].astype(int)
+            - small.gray(whole(small, level), level)[both]
+        )
+        assert both.mean() > 0.5
+        assert np.abs(apart).mean() < 1.0
+    (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.name != "hashes")
+    names = sorted(path.name for path in folder.iterdir())
+    assert "tiles.txt" in names
+    assert not [name for name in names if name.endswith(".part")]
+    if small.info()["resampled"] is False:
+        assert "0001-0002.tif" not in names  # nothing but nodata lies there
+        assert "0000-0000.tif" in names  # nor here, but the map begins with it
+
+
+def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limits, monkeypatch):
+    cache = tmp_path / "cache"
+    made = []
+    write = metric_copy._write
+
+    def counted(target, *arguments, **options):
+        if len(made) == 5:
+            target.with_suffix(".part").write_bytes(b"II*\0 half a tile")
+            raise KeyboardInterrupt
+        made.append(target.name)
+        return write(target, *arguments, **options)
+
+    monkeypatch.setattr(metric_copy, "_write", counted)
+    with pytest.raises(KeyboardInterrupt):
+        OrthoMap.open(picture, cache_dir=cache)
+    first = list(made)
+    monkeypatch.setattr(metric_copy, "_write", lambda t, *a, **o: made.append(t.name) or write(t, *a, **o))
+    site = OrthoMap.open(picture, cache_dir=cache)
+    assert len(first) == 5
+    assert len(made) == len(set(made)) > 5  # none was made twice
+    count = len(made)
+    same(OrthoMap.open(picture, cache_dir=cache), site)
+    assert len(made) == count
+
+
+@pytest.mark.parametrize("picture", ["metric", "in degrees"], indirect=True)
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(picture, tmp_path, request, size):
+    if size == "large":
+        request.getfixturevalue("tiny_limits")
+    told = []
+
+    def opened():
+        return OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: told.append(pixels))
+
+    site = opened()
+    if size == "small" and not site.info()["resampled"]:
+        assert told == []  # nothing to copy
+        return
+    area_px, done = site.width_px * site.height_px, [pixels for pixels, _ in told]
+    assert told[-1] == (area_px, area_px)
+    assert done == sorted(done)
+    assert {total for _, total in told} == {area_px}
+    if size == "large":
+        assert done[0] == 0  # before anything is read
+        assert len(told) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
+    count = len(told)
+    opened()
+    assert len(told) == count
+
+
+def test_a_copy_that_is_carried_on_begins_where_it_was(picture, tmp_path, tiny_limits):
+    OrthoMap.open(picture, cache_dir=tmp_path / "cache")
+    (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.name != "hashes")
+    (folder / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
+    told = []
+    OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: told.append(pixels))
+    assert told == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tiny_limits, monkeypatch, terminal):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    stream = io.StringIO()
+    monkeypatch.setattr(console, "_errors", Console(file=stream, force_terminal=terminal, width=100))
+    assert run(["map", "info", str(picture)]) == 0
+    assert ("copying the map into the cache" in stream.getvalue()) == terminal
+    assert stream.getvalue() == "" or terminal
+    shown = stream.getvalue()
+    assert run(["map", "info", str(picture)]) == 0
+    assert stream.getvalue() == shown  # the copy is there
+
+
+@pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "list cut off", "no list"])
+def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, tiny_limits, monkeypatch, damage):
+    cache = tmp_path / "cache"
+    site = OrthoMap.open(picture, cache_dir=cache)
+    pixels, valid = site.gray(whole(site)), site.valid(whole(site))
+    (folder,) = (path for path in cache.iterdir() if path.name != "hashes")
+    tile, told = folder / "0002-0001.tif", folder / "tiles.txt"
+    content, lines = tile.read_bytes(), told.read_text()
+    if damage == "bytes":
+        tile.write_bytes(content[:-40] + bytes(40))
+    elif damage == "cut":
+        tile.write_bytes(content[: len(content) // 2])
+    elif damage == "gone":
+        tile.unlink()
+    else:
+        told.write_text("" if damage == "no list" else lines[: len(lines) - 20])
+    made = []
+    write = metric_copy._write
+    monkeypatch.setattr(metric_copy, "_write", lambda t, *a, **o: made.append(t.name) or write(t, *a, **o))
+    again = OrthoMap.open(picture, cache_dir=cache)
+    assert made
+    assert np.array_equal(again.valid(whole(again)), valid)
+    assert np.array_equal(again.gray(whole(again))[valid], pixels[valid])
+    if damage in ("bytes", "cut", "gone"):
+        assert made == [tile.name]
+
+
+def test_a_large_file_is_hashed_again_when_it_changes(tmp_path, monkeypatch):
+    monkeypatch.setattr(metric_copy, "_REMEMBERED_BYTES", 10)
+    path = tmp_path / "file"
+    path.write_bytes(b"a" * 100)
+    first = metric_copy._file_hash(path, tmp_path)
+    assert metric_copy._file_hash(path, tmp_path) == first
+    path.write_bytes(b"b" * 101)
+    assert metric_copy._file_hash(path, tmp_path) != first
+
+
+def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):
+    from engine.maps.rasters import open_source
+
+    path = tmp_path / "plain.tif"
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM}
+    with rasterio.open(path, "w", width=50, height=40, transform=Affine(1, 0, 6e5, 0, -1, 5e6), **profile) as file:
+        file.write(np.full((40, 50), 9, np.uint8), 1)
+    assert GrayReader(open_source(path)).all_valid
+    assert not GrayReader(open_source(large_path)).all_valid

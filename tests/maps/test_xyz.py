@@ -1,0 +1,347 @@
+"""Tile caches: z/x/y.png is the picture that it was cut from, opened by its names alone, or one clear line."""
+
+import math
+import shutil
+import sqlite3
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from PIL import Image
+from rasterio.shutil import copy
+
+from engine import OrthoMap
+from engine.errors import MapError
+from engine.maps.rasters import open_source, stored_levels
+from engine.maps.xyz_tiles import is_tile_cache
+from engine.values import Window
+
+ZOOM, TILE = 18, 64
+FIRST = (143_000, 90_500)  # column and row, from the north, of the first tile: near Vienna
+COLUMNS, ROWS = 5, 4
+GAPS = ((1, 2), (4, 3))
+STEP_M = 156543.03392804097 * 256 / TILE / 2**ZOOM
+WHOLE = Window(0, 0, COLUMNS * TILE, ROWS * TILE)
+WINDOWS = [WHOLE, Window(60, 50, 77, 91), Window(63, 63, 2, 2), Window(250, 130, 70, 20)]
+TMS = """<?xml version="1.0" encoding="utf-8"?>
+<TileMap version="1.0.0" tilemapservice="http://tms.osgeo.org/1.0.0">
+  <SRS>{srs}</SRS><TileSets profile="{profile}"></TileSets>
+</TileMap>"""
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """(H, W, 3) without pure black or white; what is smooth in it survives a JPEG."""
+    noise = np.random.default_rng(0).integers(0, 256, (ROWS * TILE, COLUMNS * TILE, 3)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 3.0).astype(np.float32)
+    return np.clip(smooth * 4.0 - 384.0, 2, 253).astype(np.uint8)
+
+
+def cut(folder, picture, zoom=ZOOM, *, gaps=GAPS, south_up=False, save=None):
+    """Tiles of a picture whose first one is FIRST on level ZOOM, or the one above that on a coarser level."""
+    coarser = ZOOM - zoom
+    left, top = (v << (ZOOM - zoom) for v in (FIRST[0] >> coarser, FIRST[1] >> coarser))
+    x0, y0 = (FIRST[0] - left) * TILE >> coarser, (FIRST[1] - top) * TILE >> coarser
+    rows, columns = (-(-(n + v) // TILE) for n, v in zip(picture.shape[:2], (y0, x0), strict=True))
+    canvas = np.zeros((rows * TILE, columns * TILE, 3), np.uint8)
+    canvas[y0 : y0 + picture.shape[0], x0 : x0 + picture.shape[1]] = picture
+    for column in range(columns):
+        for row in range(rows):
+            if coarser or (column, row) not in gaps:
+                x, y = (FIRST[0] >> coarser) + column, (FIRST[1] >> coarser) + row
+                path = folder / str(zoom) / str(x) / f"{2**zoom - 1 - y if south_up else y}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                tile = canvas[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+                (save or (lambda tile, path: Image.fromarray(tile).save(path)))(tile, path)
+    return folder
+
+
+def tile_path(folder, column=0, row=0, zoom=ZOOM):
+    return folder / str(zoom) / str((FIRST[0] >> ZOOM - zoom) + column) / f"{(FIRST[1] >> ZOOM - zoom) + row}.png"
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory, picture):
+    """The same as one GeoTIFF."""
+    half = 20037508.342789244
+    at = Affine(STEP_M, 0.0, FIRST[0] * TILE * STEP_M - half, 0.0, -STEP_M, half - FIRST[1] * TILE * STEP_M)
+    path = tmp_path_factory.mktemp("plain") / "map.tif"
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "crs": "EPSG:3857", "transform": at}
+    with rasterio.open(path, "w", width=WHOLE.width_px, height=WHOLE.height_px, **profile) as dataset:
+        dataset.write(np.moveaxis(picture, -1, 0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory, picture):
+    return cut(tmp_path_factory.mktemp("cut") / "tiles", picture)
+
+
+@pytest.fixture
+def own(cache, tmp_path):
+    """A cache that a test may change."""
+    return shutil.copytree(cache, tmp_path / "tiles")
+
+
+@pytest.fixture
+def tiny_limits(monkeypatch):
+    """A map of a few tiles is too large for memory, and for its coarsest level."""
+    for module in ("maps.metric_copy", "maps.pyramid"):
+        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.metric_copy.COARSEST_PX", 200)
+
+
+def there():
+    known = np.ones((WHOLE.height_px, WHOLE.width_px), np.bool_)
+    for column, row in GAPS:
+        known[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE] = False
+    return known
+
+
+@pytest.mark.parametrize("south_up", [False, True], ids=["XYZ", "TMS"])
+@pytest.mark.parametrize("window", WINDOWS, ids=str)
+def test_a_tile_cache_is_the_picture_that_it_was_cut_from_and_a_gap_is_nodata(
+    tmp_path, plain, picture, window, south_up
+):
+    folder = cut(tmp_path / "tiles", picture, south_up=south_up)
+    if south_up:
+        (folder / "tilemapresource.xml").write_text(TMS.format(srs="EPSG:900913", profile="mercator"))
+    whole, cached = OrthoMap.open(plain), OrthoMap.open(folder)
+    assert (cached.width_px, cached.height_px) == (WHOLE.width_px, WHOLE.height_px)
+    assert cached.bounds_deg == pytest.approx(whole.bounds_deg, abs=1e-10)
+    part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
+    known = there()[part]
+    np.testing.assert_array_equal(cached.valid(window), known)
+    np.testing.assert_array_equal(cached.gray(window)[known], whole.gray(window)[known])
+    assert cached.info()["driver"] == ("TMS" if south_up else "XYZ")
+    assert cached.crs.to_epsg() == 3857
+
+
+def test_it_lies_where_the_slippy_map_has_it(cache):
+    site = OrthoMap.open(cache)
+    lat, lon = site.geodetic_from_pixel([[-0.5, -0.5], [TILE - 0.5, TILE - 0.5]])
+    column = (lon + 180.0) / 360.0 * 2**ZOOM
+    row = (1.0 - np.arcsinh(np.tan(np.radians(lat))) / math.pi) / 2.0 * 2**ZOOM
+    assert column == pytest.approx([FIRST[0], FIRST[0] + 1], abs=1e-6)
+    assert row == pytest.approx([FIRST[1], FIRST[1] + 1], abs=1e-6)
+
+
+@pytest.mark.parametrize("south_up", [False, True], ids=["XYZ", "TMS"])
+def test_the_tiles_of_mbtiles_in_a_folder_are_the_map_that_mbtiles_are(tmp_path, plain, south_up):
+    """Whose tiles GDAL cut and reads."""
+    copy(plain, tmp_path / "map.mbtiles", driver="MBTiles", tile_format="PNG")
+    with sqlite3.connect(tmp_path / "map.mbtiles") as base:
+        for zoom, column, row, data in base.execute("SELECT * FROM tiles"):  # MBTiles count rows from the south
+            path = tmp_path / f"tiles/{zoom}/{column}/{row if south_up else 2**zoom - 1 - row}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+    base.close()
+    if south_up:
+        (tmp_path / "tiles/tilemapresource.xml").write_text(TMS.format(srs="EPSG:3857", profile="mercator"))
+    packed, cached = OrthoMap.open(tmp_path / "map.mbtiles"), OrthoMap.open(tmp_path / "tiles")
+    corner = np.rint(cached.pixel_from_geodetic(*packed.geodetic_from_pixel([0.0, 0.0]))).astype(int)
+    lies, everything = (Window(x, y, packed.width_px, packed.height_px) for x, y in (corner.tolist(), (0, 0)))
+    np.testing.assert_array_equal(cached.valid(lies), packed.valid(everything))
+    np.testing.assert_array_equal(cached.gray(lies), packed.gray(everything))
+    assert cached.valid(lies).mean() > 0.5
+    assert cached.gsd_m_per_px == pytest.approx(packed.gsd_m_per_px, rel=1e-6)
+
+
+def test_what_a_tile_is_its_content_says(tmp_path, picture, plain):
+    """Grey with alpha, a colour table, JPEG and WebP under the name of a PNG."""
+    forms = {
+        0: lambda image, path: image.save(path, "WEBP", lossless=True),
+        1: lambda image, path: image.save(path, "JPEG", quality=95),
+        2: lambda image, path: image.convert("L").convert("LA").save(path),
+        3: lambda image, path: image.quantize(256).save(path),
+        4: lambda image, path: image.convert("RGBA").save(path),
+    }
+
+    def save(tile, path):
+        forms[int(path.parent.name) - FIRST[0]](Image.fromarray(tile), path)
+
+    cached = OrthoMap.open(cut(tmp_path / "tiles", picture, gaps=(), save=save))
+    apart = cached.gray(WHOLE).astype(float) - OrthoMap.open(plain).gray(WHOLE)
+    assert cached.valid(WHOLE).all()
+    for column, most in enumerate((0.5, 2.0, 1.0, 8.0, 0.5)):
+        assert np.abs(apart[:, column * TILE : (column + 1) * TILE]).mean() < most
+
+
+def test_endings_may_differ_and_what_is_no_tile_is_passed_over(own):
+    tile_path(own, 2, 2).rename(tile_path(own, 2, 2).with_suffix(".jpg"))
+    before = OrthoMap.open(own)
+    (own / "preview.png").write_bytes(tile_path(own).read_bytes())
+    (own / "leaflet.html").write_text("a viewer")
+    for name in ("007.png", "7.txt", "7", "_7.png"):
+        (tile_path(own).parent / name).write_text("no tile")
+    (own / "19" / "5").mkdir(parents=True)  # a deeper level without a tile
+    after = OrthoMap.open(own)
+    np.testing.assert_array_equal(after.gray(WHOLE), before.gray(WHOLE))
+    assert before.valid(WHOLE).sum() == there().sum()
+
+
+def test_an_empty_file_is_a_gap(own):
+    for place in ((0, 0), (2, 2)):
+        tile_path(own, *place).write_bytes(b"")
+    site = OrthoMap.open(own)
+    assert not site.valid(Window(0, 0, TILE, TILE)).any()
+    assert site.valid(WHOLE).sum() == there().sum() - 2 * TILE**2
+
+
+# ------------------------------------------------------------------------------------- many tiles, and levels
+
+
+def test_opening_reads_one_tile_and_a_large_map_only_its_coarse_ones(
+    cache, tmp_path, picture, tiny_limits, monkeypatch
+):
+    folder = shutil.copytree(cache, tmp_path / "tiles")
+    for zoom in (17, 16):
+        cut(folder, cv2.resize(picture, None, fx=2.0 ** (zoom - ZOOM), fy=2.0 ** (zoom - ZOOM)), zoom)
+    opened = []
+    plainly = Image.open
+    monkeypatch.setattr(Image, "open", lambda path, **kw: opened.append(path.parts[-3:]) or plainly(path, **kw))
+    source = open_source(folder)
+    assert len(opened) == 1
+    assert stored_levels(source) == (0, 1, 2)
+    monkeypatch.setattr("engine.maps.rasters.OVERVIEW_PX", 80)
+    site = OrthoMap.open(folder)
+    assert site.is_large
+    assert {place[0] for place in opened[2:]} == {"16"}
+    assert site.valid(Window(0, 0, TILE, TILE)).all()
+    assert opened[-1] == ("18", str(FIRST[0]), f"{FIRST[1]}.png")
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_coarser_zoom_level_is_an_overview_at_the_same_place(own, picture, tiny_limits, level):
+    coarse = np.full_like(picture, 0)[:: 1 << level, :: 1 << level]
+    coarse[...] = np.add.outer(np.arange(coarse.shape[0]) % 7 * 10, np.arange(coarse.shape[1]))[..., None]
+    cut(own, coarse, ZOOM - level)
+    site = OrthoMap.open(own)
+    rows, columns = site.level_shape(level)
+    everything = Window(0, 0, columns, rows)
+    known = there()[:: 1 << level, :: 1 << level]
+    np.testing.assert_array_equal(site.valid(everything, level), known)
+    np.testing.assert_array_equal(site.gray(everything, level)[known], coarse[..., 0][known])
+
+
+def test_a_coarser_level_with_gaps_of_its_own_is_none(own, picture, tmp_path, tiny_limits):
+    cut(own, np.full_like(picture, 9)[::2, ::2], 17)
+    tile_path(own, 1, 1, 17).unlink()
+    assert stored_levels(open_source(own)) == (0,)
+    site = OrthoMap.open(own, cache_dir=tmp_path / "copies")
+    rows, columns = site.level_shape(1)
+    both = Window(0, 0, columns, rows)
+    assert (site.gray(both, 1)[site.valid(both, 1)] != 9).mean() > 0.9
+
+
+def test_a_large_cache_without_coarser_levels_is_copied_once_and_again_when_a_tile_changes(
+    own, plain, tmp_path, tiny_limits
+):
+    told = []
+
+    def opened():
+        told.clear()
+        site = OrthoMap.open(own, cache_dir=tmp_path / "copies", on_copy=lambda *pixels: told.append(pixels))
+        return site.gray(WHOLE), site.valid(WHOLE)
+
+    gray, valid = opened()
+    assert told
+    assert told[-1] == (WHOLE.area_px, WHOLE.area_px)
+    np.testing.assert_array_equal(valid, there())
+    np.testing.assert_array_equal(gray[valid], OrthoMap.open(plain).gray(WHOLE)[valid])
+    opened()
+    assert told == []
+    Image.new("RGB", (TILE, TILE), (77, 77, 77)).save(tile_path(own))
+    assert (opened()[0][:TILE, :TILE] == 77).all()
+    assert told
+
+
+# ------------------------------------------------------------------------------------------------- refusals
+
+
+def spoil_size(folder):
+    Image.new("RGB", (TILE * 2, TILE * 2)).save(tile_path(folder, 2, 2))
+    return (
+        r"expected tiles of 64 x 64 px and 8 bits, as the first one, got 128 x 128 px of mode RGB in .*90502\.png"
+    )
+
+
+def spoil_depth(folder):
+    Image.fromarray(np.zeros((TILE, TILE), np.uint16)).save(tile_path(folder, 2, 2))
+    return r"expected tiles of 64 x 64 px and 8 bits, .* of mode I;16 in"
+
+
+def spoil_end(folder):
+    path = tile_path(folder, 2, 2)
+    path.write_bytes(path.read_bytes()[:-300])
+    return r"cannot read the tile .*90502\.png: "
+
+
+def spoil_content(folder):
+    tile_path(folder, 2, 2).write_text("<html>403 Forbidden</html>")
+    return r"cannot read the tile .*90502\.png: cannot identify image file"
+
+
+def spoil_first(folder):
+    Image.new("RGB", (TILE, TILE // 2)).save(tile_path(folder))
+    return r"expected square tiles, got 64 x 32 px in .*90500\.png"
+
+
+def spoil_all(folder):
+    for path in folder.rglob("*.png"):
+        path.write_bytes(b"")
+    return "expected tiles with a picture in .*, got empty files only"
+
+
+def spoil_order(folder):
+    (folder / "18" / "300000").mkdir()
+    (folder / "18" / "300000" / "5.png").write_bytes(b"")
+    return r"expected columns and rows below 262144 on zoom level 18, as z/x/y, got .*18/300000/5\.png"
+
+
+def spoil_extent(folder):
+    (folder / "18" / "3").mkdir()
+    (folder / "18" / "3" / "5.png").write_bytes(tile_path(folder).read_bytes())
+    return "expected tiles of one region, at most 1,000,000 px a side, got 9,152,128 px"
+
+
+def spoil_projection(folder):
+    (folder / "tilemapresource.xml").write_text(TMS.format(srs="EPSG:4326", profile="geodetic"))
+    return r"expected tiles in Web Mercator \(EPSG:3857\), got 'EPSG:4326' in .*tilemapresource\.xml"
+
+
+def spoil_description(folder):
+    (folder / "tilemapresource.xml").write_text("<TileMap>")
+    return r"cannot read .*tilemapresource\.xml"
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        *(spoil_size, spoil_depth, spoil_end, spoil_content, spoil_first, spoil_all),
+        *(spoil_order, spoil_extent, spoil_projection, spoil_description),
+    ],
+    ids=lambda spoil: spoil.__name__,
+)
+def test_what_is_no_tile_of_the_map_is_refused_by_name(own, spoil):
+    words = spoil(own)
+    with pytest.raises(MapError, match=f"^map: {words}") as caught:
+        OrthoMap.open(own)
+    assert "\n" not in str(caught.value)
+
+
+def test_pictures_are_no_surface(plain, cache):
+    with pytest.raises(MapError, match="surface: expected heights, got a folder of pictures"):
+        OrthoMap.open(plain, surface=cache)
+
+
+def test_photographs_by_date_are_no_tiles(tmp_path):
+    (tmp_path / "2024" / "11").mkdir(parents=True)
+    Image.new("RGB", (TILE, TILE)).save(tmp_path / "2024" / "11" / "12.jpg")
+    assert not is_tile_cache(tmp_path)
+    with pytest.raises(
+        MapError, match=r"expected raster files in the folder .*, or tiles as z/x/y.png below it, found none"
+    ):
+        OrthoMap.open(tmp_path)

@@ -1,0 +1,86 @@
+"""The cost model: what it expects after the costs that it has seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from engine.methods.costs import Costs
+
+
+def learned(works, cost, step="step"):
+    costs = Costs()
+    for work in works:
+        costs.learn(step, work, cost(work))
+    return costs
+
+
+def test_what_never_ran_costs_nothing_yet():
+    assert Costs().upper_bound_ms("step", 1e9) == 0.0
+
+
+def test_a_line_is_learned():
+    costs = learned([100, 400, 200, 300] * 40, lambda work: 2.0 + 0.01 * work)
+    for work in (50, 250, 1000):
+        assert costs.upper_bound_ms("step", work) == pytest.approx(2.0 + 0.01 * work, rel=0.05)
+
+
+def test_steps_do_not_mix():
+    costs = learned([1.0] * 5, lambda work: 7.0, "one")
+    costs.learn("other", 1.0, 1.0)
+    assert costs.upper_bound_ms("one", 1.0) == pytest.approx(7.0)
+    assert costs.upper_bound_ms("other", 1.0) == pytest.approx(1.0)
+
+
+def test_more_of_what_was_always_alike_costs_in_proportion():
+    costs = learned([100.0] * 10, lambda work: 4.0)
+    assert costs.upper_bound_ms("step", 300.0) == pytest.approx(12.0)
+    assert costs.upper_bound_ms("step", 10.0) == pytest.approx(4.0)
+
+
+def test_the_upper_bound_is_rarely_exceeded():
+    rng = np.random.default_rng(0)
+    costs, exceeded = Costs(), 0
+    for n in range(3000):
+        work = rng.uniform(100, 400)
+        ms = (1.0 + 0.01 * work) * rng.gamma(100, 0.01)  # spread by a tenth
+        exceeded += n > 100 and ms > costs.upper_bound_ms("step", work)
+        costs.learn("step", work, ms)
+    assert exceeded < 0.02 * 2900
+    assert costs.upper_bound_ms("step", 250.0) < 1.6 * 3.5  # and is no mere large number
+
+
+def test_one_interruption_changes_little():
+    costs = learned([1.0] * 50, lambda work: 2.0)
+    costs.learn("step", 1.0, 500.0)
+    assert costs.upper_bound_ms("step", 1.0) < 4.0
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0, 10.0])
+def test_a_machine_that_changes_pace_is_followed(factor):
+    costs = learned([1.0] * 50, lambda work: 2.0)
+    for _ in range(150):
+        costs.learn("step", 1.0, 2.0 * factor)
+    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(2.0 * factor, rel=0.3)
+
+
+def test_no_estimate_is_negative_or_not_a_number():
+    costs = learned([0.0, 0.0, 5.0], lambda work: 0.0)
+    for work in (0.0, 1.0, 1e12):
+        assert 0.0 <= costs.upper_bound_ms("step", work) < np.inf
+    costs = learned([100.0, 1.0] * 9, lambda work: 1.0 / work)  # dearer the less there is to do
+    assert costs.upper_bound_ms("step", 1000.0) >= 0.0
+
+
+def test_the_cost_of_a_step_that_is_refused_decays():
+    costs = learned([1.0, 1.0, 1.0], lambda work: 5.0)
+    costs.learn("step", 1.0, 9.0)
+    high = costs.upper_bound_ms("step", 1.0)
+    for _ in range(50):
+        costs.note_refusal("step", decay_cost=False)
+    assert 5.0 <= costs.upper_bound_ms("step", 1.0) < high  # the spread is gone, the cost is not
+    for _ in range(300):
+        costs.note_refusal("step", decay_cost=True)
+    assert costs.upper_bound_ms("step", 1.0) < 1.0
+    costs.note_refusal("other", decay_cost=True)
+    assert costs.upper_bound_ms("other", 1.0) == 0.0

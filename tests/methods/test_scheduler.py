@@ -1,0 +1,192 @@
+"""The scheduler: what is done of each method within a budget, and what is refused before it is begun."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import Budget, Fix, Navigator, NoFix, OrthoMap, Prior, Reason, SceneMatcher
+from engine.methods.sift import Sift
+
+NADIR = np.array([315.0, 296.0])
+HURRY = Budget(total_ms=1e6)  # finite, so that costs count, and never over
+
+
+class FixedCosts:
+    """Costs that a test sets, per step and unit of work; nothing is learned."""
+
+    def __init__(self, **per_unit):
+        self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
+
+    def upper_bound_ms(self, step, work):
+        return self.per_unit.get(step, 0.0) * work
+
+    def learn(self, step, work, ms):
+        pass
+
+    def note_refusal(self, step, *, decay_cost):
+        pass
+
+
+@pytest.fixture(scope="module")
+def site(ground):
+    """The ground with a surface model that says how flat it is: only then is a pose refined."""
+    flat = np.zeros(ground.gray.shape, np.float32)
+    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
+
+
+@pytest.fixture
+def make(site, camera):
+    def made(method, **per_unit):
+        matcher = SceneMatcher(site, camera, method, "cpu")
+        matcher._costs = FixedCosts(**per_unit)
+        return matcher
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def frame(ground, camera):
+    return ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0, timestamp_ns=77)
+
+
+@pytest.fixture(scope="module")
+def prior(ground):
+    return ground.prior(NADIR)
+
+
+def off_m(ground, fix):
+    assert isinstance(fix, Fix), fix
+    return float(np.hypot(*(np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR))))
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift"])
+def test_with_time_the_finest_level(ground, make, frame, prior, method):
+    for budget in (None, HURRY):
+        fix = make(method).locate(frame, prior, budget)
+        assert off_m(ground, fix) < 1.0
+        assert fix.stage == {"ncc": "refined", "sift": "fine"}[method]
+
+
+def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, prior):
+    fix, fine = make("ncc", refinement=1e9).locate(frame, prior, HURRY), make("ncc").locate(frame, prior, HURRY)
+    assert isinstance(fix, Fix)
+    assert isinstance(fine, Fix)
+    assert (fix.stage, fix.up_m, fine.stage) == ("fine", None, "refined")
+    assert fine.sigma_m <= fix.sigma_m
+
+
+@pytest.mark.parametrize(("method", "step"), [("ncc", "ncc"), ("sift", "sift")])
+def test_with_less_time_a_coarse_fix_of_the_same_place(ground, make, frame, prior, method, step):
+    fine = make(method)
+    work = []
+    fine._costs.upper_bound_ms = lambda name, pixels: work.append(pixels) or 0.0
+    fine.locate(frame, prior, HURRY)
+    # A pixel costs so much that the finest step is 1.5 times the budget.
+    fix = make(method, **{step: 1.5 * HURRY.total_ms / work[0]}).locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert fix.stage == "coarse"
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_what_cannot_be_in_time_is_not_begun(make, frame, prior, method):
+    result = make(method, ncc=1e9, sift=1e9).locate(frame, prior, HURRY)
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.LATE
+    assert "takes longer" in result.detail
+    assert list(result.timings.stages_ms) == ["grey"]
+
+
+def test_both_methods_verify_each_other(ground, make, frame, prior):
+    fix = make("auto").locate(frame, prior)
+    assert off_m(ground, fix) < 1.0
+    assert fix.stage == "verified"
+
+
+@pytest.mark.parametrize(("costs", "method"), [({"sift": 1e9}, "ncc"), ({"ncc": 1e9}, "sift")])
+def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, costs, method):
+    fix = make("auto", **costs).locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 1.0
+    assert (fix.stage, fix.method) == ({"ncc": "refined", "sift": "fine"}[method], method)
+
+
+def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):
+    honest = Sift.locate
+
+    def elsewhere(*args, **named):
+        fix = honest(*args, **named)
+        return replace(fix, east_m=fix.east_m + 40.0)
+
+    monkeypatch.setattr(Sift, "locate", elsewhere)
+    result = make("auto").locate(frame, prior)
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.INCONSISTENT
+    assert "m apart" in result.detail
+
+
+def test_unknown_height_leaves_features(ground, make, frame, prior):
+    fix = make("auto").locate(replace(frame, height_agl_m=None), prior)
+    assert off_m(ground, fix) < 1.5
+    assert (fix.stage, fix.method) == ("fine", "sift")
+
+
+def test_a_search_of_the_whole_map_has_a_budget_of_its_own(ground, make, frame):
+    dear = {"ncc_search": 1.0}
+    result = make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4))
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.LATE
+    fix = make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4, search_ms=math.inf))
+    assert off_m(ground, fix) < 1.5
+
+
+def test_costs_are_learned_and_then_kept_to(ground, camera, frame, prior):
+    matcher = SceneMatcher(ground.site, camera, "auto", "cpu")
+    matcher.warmup()
+    for step, work in (("ncc", 100_000.0), ("sift", 22_500.0), ("ncc search", 1e5), ("sift search", 22_500.0)):
+        assert matcher._costs.upper_bound_ms(step, work) > 0.0
+    assert isinstance(matcher.locate(frame, prior, Budget(total_ms=1e4)), Fix)
+    refused = matcher.locate(frame, prior, Budget(total_ms=0.3))
+    assert isinstance(refused, NoFix)
+    assert refused.reason is Reason.LATE
+
+
+def test_a_cost_that_is_refused_decays_until_it_is_tried_again(ground, camera, frame, prior):
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
+    matcher._costs.learn("ncc", 1e6, 1e5)  # the machine was slow
+    results = [matcher.locate(frame, prior, Budget(total_ms=2e4)) for _ in range(300)]
+    assert isinstance(results[0], NoFix)
+    assert isinstance(results[-1], Fix)
+
+
+def test_a_vague_prior_does_not_raise_the_cost_of_a_sharp_one(site, camera, frame, prior):
+    """A window is never larger than the map, whatever the prior says: neither is what it is thought to cost."""
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    for vague in (5.0, 1e6, 5.0, 1e6):
+        matcher.locate(frame, replace(prior, sigma_m=vague))
+    assert isinstance(matcher.locate(frame, prior, Budget(total_ms=60_000.0)), Fix)
+
+
+def test_after_warmup_nothing_is_created_in_flight(ground, site, camera):
+    matcher = SceneMatcher(site, camera, "auto", "cpu")
+    matcher.warmup()
+    before = matcher.cache_counters
+    assert all(count > 0 for count in before.values())
+    for number in range(8):
+        place = NADIR + np.array([4.0, -3.0]) * number
+        frame = ground.frame(camera, place, 120.0 + 8 * number, heading_deg=40.0 * number)
+        matcher.locate(frame, ground.prior(place, sigma_m=5.0 + number))
+    assert matcher.cache_counters == before
+
+
+def test_a_late_frame_is_no_sign_of_being_lost(ground, make, frame, prior):
+    matcher = make("ncc", ncc=1e9)
+    priors = []
+    honest = matcher.locate
+    matcher.locate = lambda *args: priors.append(args[1]) or honest(*args)
+    navigator = Navigator(matcher, prior, HURRY)
+    for number in range(30):
+        assert navigator.update(replace(frame, timestamp_ns=number)).reason is Reason.LATE
+    assert all(isinstance(p, Prior) for p in priors)

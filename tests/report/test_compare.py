@@ -1,0 +1,134 @@
+"""compare: several runs over one flight, in one table and one chart."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from engine import OptionError
+from engine.cli.app import run
+from engine.formats.logs.readers import LogClock
+from engine.formats.track import read_track
+from engine.report.comparison import draw_comparison
+from engine.runs.comparison import DEFAULT_RUNS, parse_runs
+from engine.runs.inputs import FlightFiles
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import write_flight
+from engine.runs.tracking import track
+from engine.sim import plan_flight
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare") / "flight"
+    write_flight(folder, plan_flight(frames=4))
+    return folder
+
+
+def command(flight, out, *more):
+    names = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames"}
+    files = [f"--{option}={flight / name}" for option, name in names.items()]
+    return ["compare", *files, f"--telemetry={flight / 'telemetry.csv'}", f"--out={out}", *more]
+
+
+def picture(path):
+    with Image.open(path) as opened:
+        return np.asarray(opened)
+
+
+def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
+    (tmp_path / "few.toml").write_text('method = "sift"\n[sift]\nmax_keypoints = 120\n', encoding="utf-8")
+    out, runs = tmp_path / "out", ["--run=ncc", "--run=sift/paper", f"--run={tmp_path / 'few.toml'}"]
+    assert run(command(flight, out, *runs)) == 0
+    printed = capsys.readouterr().out
+    table = json.loads((out / "table.json").read_text(encoding="utf-8"))
+    assert list(table) == ["ncc", "sift-paper", "few"]
+    assert table["few"]["settings"]["changed"] == {"method": "sift", "sift.max_keypoints": 120}
+    for name, summary in table.items():
+        assert name in printed
+        assert summary == json.loads((out / name / "summary.json").read_text(encoding="utf-8"))
+        assert len(read_track(out / name / "track.csv")) == summary["frames"] == 4
+    assert f"{table['ncc']['rms_m']:.2f}" in printed
+    track(FlightFiles.in_folder(flight), tmp_path / "alone", TrackSettings(method="ncc"), report=False)
+    alone, beside = (read_track(path / "track.csv") for path in (tmp_path / "alone", out / "ncc"))
+    assert [replace(row, latency_ms=None) for row in alone] == [replace(row, latency_ms=None) for row in beside]
+    assert picture(out / "comparison.png").shape[1] > 500
+
+    assert run(command(flight, out, "--run=ncc")) == 2
+    assert "--force" in capsys.readouterr().err
+    assert run(command(flight, out, "--run=sift", "--force", "--json")) == 0
+    assert list(json.loads(capsys.readouterr().out)) == ["sift"]
+
+
+def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp_path, capsys):
+    """The last run is refused: by what the telemetry lacks, by a place, by a file in its folder's place."""
+    rows = [line.split(",") for line in (flight / "telemetry.csv").read_text(encoding="utf-8").splitlines()]
+    column = rows[0].index("heading_deg")
+    text = "\n".join(",".join(cells[:column] + cells[column + 1 :]) for cells in rows)
+    blind = flight / "blind.csv"
+    blind.write_text(text, encoding="utf-8")
+    (tmp_path / "far.toml").write_text('method = "sift"\nstart = "0,0"\n', encoding="utf-8")
+    out = tmp_path / "out"
+    two = ["--run=sift", "--run=ncc"]
+    assert run([*command(flight, out, *two), f"--telemetry={blind}"]) == 1
+    assert "telemetry: ncc needs height_agl_m and heading_deg" in capsys.readouterr().err
+    assert run([*command(flight, out, *two), f"--camera={flight / 'none.yaml'}"]) == 1
+    assert "no such file" in capsys.readouterr().err
+    assert run(command(flight, out, "--run=ncc", f"--run={tmp_path / 'far.toml'}")) == 2
+    assert "--start: expected a place on the map" in capsys.readouterr().err
+    assert not out.exists()
+    out.mkdir()
+    (out / "sift").write_text("mine", encoding="utf-8")
+    assert run(command(flight, out, "--run=ncc", "--run=sift", "--force")) == 2
+    assert "sift is a file" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["sift"]
+
+
+def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_path, monkeypatch):
+    compared = []
+    monkeypatch.setattr("engine.runs.comparison.compare", lambda files, *_, **__: compared.append(files) or {})
+    monkeypatch.setattr("engine.cli.tables.print_comparison", lambda *_: None)
+    log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
+    options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}", f"--frame-stamps={stamps}"]
+    assert run(command(flight, tmp_path, *options, "--log-offset-s=-1.5", "--image-topic=/down")) == 0
+    assert (compared[0].clock(), compared[0].image_topic) == (LogClock(stamps, -1.5), "/down")
+    assert run(command(flight, tmp_path)) == 0
+    assert (compared[1].has_clock, compared[1].image_topic) == (False, None)
+    assert run(command(flight, tmp_path, "--log-offset-s=2")) == 2  # telemetry.csv is no log
+
+
+def test_the_usual_runs_are_table_one():
+    assert list(parse_runs([])) == ["ncc-paper", "ncc-engine", "sift-paper", "sift-engine"]
+    assert len(DEFAULT_RUNS) == 4
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        (["orb"], "runs: expected ncc, sift, auto, one of them with /paper, or a settings file, got 'orb'"),
+        (["ncc", "ncc"], "runs: expected runs of different names, got 'ncc' twice"),
+        (["ncc/fast"], "profile: expected one of engine, paper, got 'fast'"),
+        (["auto/paper"], "method: expected ncc or sift with `profile` paper, got 'auto'"),
+    ],
+)
+def test_a_run_that_cannot_be_is_refused(runs, message):
+    with pytest.raises(OptionError) as caught:
+        parse_runs(runs)
+    assert str(caught.value) == message
+
+
+def test_what_the_command_line_gives_holds_for_every_run(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("budget_ms = 40\n", encoding="utf-8")
+    runs = parse_runs(["ncc", str(path)], budget_ms=121.0, start=None)
+    assert [settings.budget_ms for settings in runs.values()] == [121.0, 121.0]
+
+
+def test_a_chart_without_truth_and_without_a_single_fix(flight, tmp_path):
+    out = tmp_path / "late"
+    assert run(command(flight, out, "--run=ncc", "--budget-ms=0.001")) == 0
+    rows = read_track(out / "ncc" / "track.csv")
+    draw_comparison(tmp_path / "none.png", {"ncc": rows}, None)
+    assert picture(tmp_path / "none.png").std() > 0

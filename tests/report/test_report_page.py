@@ -1,0 +1,358 @@
+"""The report page: its words, what it shows of single matches, and how it behaves in a real browser."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bench.pages.browser import missing, open_browser
+from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
+from engine.formats.notes import FrameNote, frame_note, read_notes, write_notes
+from engine.formats.settings import changed, nested, options_from_mapping
+from engine.formats.track import TrackRow, read_track
+from engine.integrity import PeakRule
+from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
+from engine.report.charts import Plot, ticks
+from engine.report.explain import choose_frames
+from engine.report.metrics import Errors, Ground, summarise
+from engine.report.page import FinishedTrack, write_page
+from engine.report.verdict import MEANINGS, verdict_of
+from engine.runs.evaluation import evaluate
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import write_flight
+from engine.runs.tracking import track
+from engine.sim import plan_flight
+from engine.values import Reason, Window
+
+FRAMES = 8
+DARK = 5  # a frame that shows nothing
+HOSTILE = "<img src=x onerror=hacked=1>"
+
+
+# --------------------------------------------------------------------------------------------- the verdict
+
+
+def summary_of(**known):
+    """Ten frames, nine of them fixed and right, but for what is given."""
+    return {
+        "frames": 10,
+        "fixes": 9,
+        "reasons": {"ambiguous": 1},
+        "latency_ms": {"p95": 9.94},
+        "deadlines_missed": 0,
+        "scored_fixes": 9,
+        "median_m": 0.12,
+        "max_m": 0.42,
+        "wrong_over_10m": 0,
+        "false_fixes": 0,
+    } | known
+
+
+@pytest.mark.parametrize(
+    ("known", "grade", "begins"),
+    [
+        ({}, "good", "9 of 10 frames fixed, none of them wrong; half of the fixes within 0.12 m"),
+        ({"fixes": 5, "scored_fixes": 5}, "mixed", "5 of 10 frames fixed, none of them wrong"),
+        ({"deadlines_missed": 2}, "mixed", "9 of 10 frames fixed, none of them wrong"),
+        ({"wrong_over_10m": 1, "max_m": 12.0}, "mixed", "9 of 10 frames fixed; 1 of them is more than 10 m off"),
+        ({"wrong_over_10m": 2, "false_fixes": 2}, "bad", "2 fixes are false"),
+        (
+            {"scored_fixes": 0},
+            "open",
+            "9 of 10 frames fixed; half of them state a sigma below 0.40 m. With",
+        ),
+        ({"fixes": 0, "scored_fixes": 0}, "bad", "None of 10 frames fixed; most were refused as ambiguous"),
+        ({"frames": 0, "fixes": 0}, "bad", "The track has no frames"),
+    ],
+)
+def test_the_verdict_says_the_worst_first(known, grade, begins):
+    verdict = verdict_of(summary_of(**known), 0.4, 40.0)
+    assert verdict.grade == grade
+    assert verdict.accuracy.startswith(begins)
+    assert ("none of them wrong" in verdict.accuracy) == (begins.find("none of them wrong") > 0)
+
+
+def test_the_verdict_on_time():
+    assert "all of them within the budget of 40 ms" in verdict_of(summary_of(), 0.4, 40.0).latency
+    assert "3 answers came after" in verdict_of(summary_of(deadlines_missed=3), 0.4, 40.0).latency
+    assert "no budget" in verdict_of(summary_of(), 0.4, None).latency
+    assert "9.9 ms" in verdict_of(summary_of(), 0.4, None).latency
+
+
+def test_every_reason_has_its_meaning_in_one_sentence():
+    assert set(MEANINGS) == set(Reason)
+    assert all(re.fullmatch(r"[A-Z][^.]+\.", text) for text in MEANINGS.values())
+
+
+# --------------------------------------------------------------------------------------------- parts
+
+
+@pytest.mark.parametrize("low", [0.0, -3.7, 1e5])
+@pytest.mark.parametrize("span", [1e-3, 0.7, 12.0, 999.0])
+def test_ticks_are_round_and_inside(low, span):
+    found = ticks(low, low + span, 5)
+    values = np.array([value for value, _ in found])
+    assert 2 <= len(found) <= 11
+    assert values.min() >= low - 1e-9 * span
+    assert values.max() <= low + span * (1 + 1e-9)
+    assert [float(text.replace(",", "")) for _, text in found] == pytest.approx(list(values), rel=1e-9, abs=1e-12)
+    step = values[1] - values[0]
+    assert step / 10 ** np.floor(np.log10(step) + 1e-9) == pytest.approx(1, rel=1e-4) or round(
+        step / 10 ** np.floor(np.log10(step)), 3
+    ) in (2, 2.5, 5)
+
+
+def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
+    plot = Plot((0.0, 4.0), (0.0, 1.0))
+    time, values = np.arange(5.0), np.array([0.0, 0.5, np.nan, 0.5, 7.0])
+    assert plot.line(time, values, "truth").count("M") == 2
+    assert plot.dots(time, values, "fix").count("h0") == 3
+    assert plot.overflow(time, values, "over").count("M") == 1
+
+
+def errors_of(distances_m):
+    east = np.array(distances_m, float)
+    error = np.column_stack([east, np.where(np.isfinite(east), 0.0, np.nan)])
+    return Errors(np.zeros_like(error), error, error, np.full((len(east), 2, 2), np.nan))
+
+
+def test_wrong_frames_are_shown_before_refusals_before_others():
+    wrong, refused = {100, 777}, set(range(300, 400))
+    rows = [
+        TrackRow(timestamp_ns=i, frame=str(i), status="no_fix" if i in refused else "fix") for i in range(1000)
+    ]
+    errors = errors_of([np.nan if i in refused else 50.0 if i in wrong else 0.1 for i in range(1000)])
+    chosen = choose_frames(rows, errors)
+    assert chosen == sorted(set(chosen))
+    assert len(chosen) == 60
+    assert wrong <= set(chosen)
+    assert {300, 399, 0, 999} <= set(chosen)
+    assert len(refused & set(chosen)) == 38
+    assert choose_frames(rows[:50], errors_of([0.1] * 50)) == list(range(50))
+    assert len(choose_frames(rows[300:400], errors_of([np.nan] * 100))) == 60
+
+
+def test_notes_come_back_as_they_were(tmp_path):
+    window = Window(3, 4, 50, 60)
+    refusal = NoFix(reason=Reason.AMBIGUOUS, detail='0.41 against 0.40, "here"', window=window)
+    notes = [
+        frame_note("a.jpg", refusal, "lost"),
+        FrameNote(frame="b.jpg", state="tracking", heading_deg=12.5, stage="fine"),
+    ]
+    write_notes(tmp_path / "notes.csv", notes)
+    assert read_notes(tmp_path / "notes.csv") == notes
+    assert (notes[0].window_x0_px, notes[0].window_y0_px) == (3, 4)
+
+
+def test_settings_are_read_back_from_the_record():
+    settings = TrackSettings(
+        method="sift",
+        budget_ms=40.0,
+        ncc=NccOptions(fraction=0.6, rule=PeakRule(min_sigmas=6.0)),
+        sift=SiftOptions(max_turn_deg=None),
+    )
+    record = json.loads(json.dumps(changed(settings)))
+    assert options_from_mapping(TrackSettings, nested(record)) == settings
+
+
+# --------------------------------------------------------------------------------------------- single matches
+
+
+def matched(flight, site, method, profile="engine"):
+    """A matcher and its first fix of a flight, with the frame."""
+    matcher = SceneMatcher(site, flight.camera, method, "cpu", MatcherOptions(profile=profile))
+    frame, truth = flight.frames[0], flight.truth[0]
+    prior = Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=4.0)
+    fix = matcher.locate(frame, prior)
+    assert isinstance(fix, Fix)
+    return matcher, frame, fix
+
+
+@pytest.mark.parametrize("profile", ["engine", "paper"])
+def test_the_surface_is_that_of_the_run(sim_flight, sim_site, profile):
+    matcher, frame, fix = matched(sim_flight, sim_site, "ncc", profile)
+    found = matcher.explain(frame, fix.window)
+    assert found.surface.score == pytest.approx(fix.score, abs=1e-4)
+    assert found.surface.scores.max() == found.surface.score
+    # The frame is nearly level, so that the nadir lies near the middle of what was found.
+    middle = found.outline_px.mean(axis=0)
+    np.testing.assert_allclose(middle, fix.map_xy_px, atol=0.1 * found.rectified.shape[0])
+    at_peak = found.surface.corner_px + found.surface.step_px * np.array(found.surface.peak_px)
+    np.testing.assert_allclose(middle, at_peak, atol=1e-6)
+
+
+def test_the_matches_are_those_of_the_run(sim_flight, sim_site):
+    matcher, frame, fix = matched(sim_flight, sim_site, "sift")
+    found = matcher.explain(frame, fix.window)
+    assert found.matches.agree.mean() == pytest.approx(fix.score, abs=1e-9)
+    # By the outline's own corners: what agrees lies where the frame's pixels see the map.
+    size = np.array([frame.image.shape[1], frame.image.shape[0]]) - 0.5
+    corners = np.array([[-0.5, -0.5], [size[0], -0.5], size, [-0.5, size[1]]])
+    affine, *_ = np.linalg.lstsq(np.c_[corners, np.ones(4)], found.outline_px, rcond=None)
+    there = np.c_[found.matches.frame_px, np.ones(len(found.matches.frame_px))] @ affine
+    off = np.linalg.norm(there - found.matches.map_px, axis=1)[found.matches.agree]
+    assert np.median(off) < 6.0  # houses stand above the level ground of the outline
+
+
+def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
+    matcher, frame, fix = matched(sim_flight, sim_site, "ncc")
+    blind = type(frame)(frame.image)
+    for method in ("ncc", "sift"):
+        found = matcher.explain(blind, fix.window, method)
+        assert (found.rectified, found.surface, found.matches, found.outline_px) == (None,) * 4
+
+
+# --------------------------------------------------------------------------------------------- the page
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A finished run over a flight with a black frame."""
+    folder = tmp_path_factory.mktemp(HOSTILE.replace("/", "")) / "flight"
+    files = write_flight(folder, plan_flight(frames=FRAMES))
+    black = folder / "frames" / f"{DARK:06d}.jpg"
+    Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
+    track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=60_000.0))
+    return folder.parent / "out"
+
+
+@pytest.fixture
+def again(flown, tmp_path):
+    """The same output folder, to be spoiled."""
+    return shutil.copytree(flown, tmp_path / "again")
+
+
+def data_of(page):
+    """What the page's script is given."""
+    text = page.read_text(encoding="utf-8")
+    start = text.index('id="data">') + len('id="data">')
+    return json.loads(text[start : text.index("</script>", start)])
+
+
+def test_the_page_needs_nothing_but_itself(flown):
+    text = (flown / "report.html").read_text(encoding="utf-8")
+    assert set(re.findall(r"https?://[^\s\"'<]+", text)) == {"http://www.w3.org/2000/svg"}
+    assert all(link.startswith("data:image/jpeg;base64,") for link in re.findall(r'(?:href|src)="([^"]*)"', text))
+    assert len(text) < 15e6
+
+
+def test_every_frame_is_shown_with_its_match(flown):
+    frames = data_of(flown / "report.html")["frames"]
+    assert [frame["kind"] for frame in frames] == ["refused" if i == DARK else "fix" for i in range(FRAMES)]
+    assert [len(frame["pictures"]) for frame in frames] == [1 if i == DARK else 4 for i in range(FRAMES)]
+    assert "deviate" in frames[DARK]["detail"]
+
+
+def test_equal_tracks_give_equal_bytes(flown, again):
+    evaluate(again, None)
+    assert (again / "report.html").read_bytes() == (flown / "report.html").read_bytes()
+
+
+def test_without_the_frames_the_page_says_so(flown, again):
+    record = json.loads((again / "summary.json").read_text(encoding="utf-8"))
+    record["settings"]["frames"] = str(again / "gone")
+    (again / "summary.json").write_text(json.dumps(record), encoding="utf-8")
+    evaluate(again, None)
+    assert data_of(again / "report.html")["frames"] == []
+    assert "No frames are shown" in (again / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_run_that_left_no_notes_has_a_page_without_frames(again):
+    (again / "notes.csv").unlink()
+    evaluate(again, None)
+    assert "notes.csv" in (again / "report.html").read_text(encoding="utf-8")
+
+
+def test_without_truth_nothing_is_claimed(flown, tmp_path):
+    rows, record = (
+        read_track(flown / "track.csv"),
+        json.loads((flown / "summary.json").read_text(encoding="utf-8")),
+    )
+    summary = summarise(rows) | {"settings": record["settings"] | {"truth": None}}
+    site = OrthoMap.open(record["settings"]["map"])
+    write_page(tmp_path / "report.html", FinishedTrack(rows, None, site, Ground(), summary, None))
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Without truth nobody can say" in text
+    assert "median error" not in text
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_a_track_without_a_single_fix_has_a_page(flown, tmp_path, count):
+    record = json.loads((flown / "summary.json").read_text(encoding="utf-8"))["settings"]
+    rows = [TrackRow(timestamp_ns=None, frame=str(i), status="no_fix", reason="late") for i in range(count)]
+    summary = summarise(rows) | {"settings": record}
+    write_page(
+        tmp_path / "report.html", FinishedTrack(rows, None, OrthoMap.open(record["map"]), Ground(), summary, None)
+    )
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ("None of" in text, "has no frames" in text) == (count > 0, count == 0)
+    assert "nan" not in re.sub(r'data:image[^"]*', "", text).lower()
+
+
+# --------------------------------------------------------------------------------------------- the browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium."""
+    if missing():
+        pytest.skip(missing())
+    with open_browser() as opened:
+        yield opened
+
+
+PICTURES = "return [...document.querySelectorAll('#pictures image')].map(i => i.getAttribute('href'))"
+
+
+@pytest.mark.parametrize("width_px", [1280, 420])
+def test_the_page_loads_without_complaint_or_network_and_fits(browser, flown, width_px):
+    page = flown / "report.html"
+    browser.open(page, width_px)
+    browser.run("window.scrollTo(0, document.body.scrollHeight)")
+    assert browser.complaints() == []
+    assert browser.requests() == [page.resolve().as_uri()]
+    assert browser.run("return document.documentElement.scrollWidth") == width_px
+    assert browser.run("return typeof hacked") == "undefined"
+    assert browser.run("return document.querySelectorAll('img').length") == 0
+    assert all(browser.run("return [...document.querySelectorAll('svg[role]')].map(s => !!s.ariaLabel)"))
+
+
+def test_keys_move_through_the_frames(browser, flown):
+    browser.open(flown / "report.html", 1280)
+    seen = [browser.run(PICTURES)]
+    for key in ("ArrowRight", "ArrowRight"):
+        browser.press(key)
+        seen.append(browser.run(PICTURES))
+    assert [len(pictures) for pictures in seen] == [4, 4, 4]
+    assert len({pictures[0] for pictures in seen}) == 3
+    assert browser.run("return document.querySelector('#facts h3').textContent") == "000002.jpg"
+    browser.press("ArrowLeft")
+    assert browser.run(PICTURES) == seen[1]
+    browser.run("document.getElementById('slider').focus()")
+    browser.press("End")  # the slider's own
+    assert browser.run("return document.querySelector('#facts h3').textContent") == f"{FRAMES - 1:06d}.jpg"
+    assert browser.complaints() == []
+
+
+def test_a_refusal_is_found_from_its_reason(browser, flown):
+    browser.open(flown / "report.html", 1280)
+    browser.run("document.querySelector('[data-goto]').click()")
+    assert browser.run("return document.querySelector('#facts h3').textContent") == f"{DARK:06d}.jpg"
+    assert browser.run("return document.querySelector('#facts .answer').textContent") == "Refused: no texture"
+
+
+def test_the_map_zooms_about_the_frame_shown(browser, flown):
+    browser.open(flown / "report.html", 1280)
+    box = "return document.getElementById('map').getAttribute('viewBox').split(' ').map(Number)"
+    whole = browser.run(box)
+    browser.run("document.getElementById('zoom-in').click()")
+    near = browser.run(box)
+    x, y = data_of(flown / "report.html")["frames"][0]["xy"]
+    assert near[2] == pytest.approx(0.6 * whole[2])
+    assert near[0] <= x <= near[0] + near[2]
+    assert near[1] <= y <= near[1] + near[3]
+    browser.run("document.getElementById('zoom-all').click()")
+    assert browser.run(box) == whole

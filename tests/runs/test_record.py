@@ -1,0 +1,68 @@
+"""The record of a run in summary.json: read back as it was written, refused in one line where it was spoiled."""
+
+import json
+from dataclasses import fields
+
+import pytest
+
+from engine.errors import OptionError, TelemetryError
+from engine.formats.settings import nested
+from engine.runs.record import RunRecord, read_record
+
+RECORD = RunRecord(
+    map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,
+    frame_stamps="/s.csv", log_offset_s=0.5, heights={"take-off": 3}, method="ncc", profile="engine",
+    device="cpu", changed={"ncc.rule.null_test_below": 1.0}, origin={"lat_deg": 48.0, "lon_deg": 16.0},
+    ground_m=3.5, ground_amsl_m=None, more={"closed_loop": {"minutes": 1.0}},
+)  # fmt: skip
+NAMES = [each.name for each in fields(RunRecord) if each.name != "more"]
+WRONG = (5, True, [1], "x", {"a": None}, float("nan"))
+FITTING = {
+    "heights": {dict}, "changed": {dict}, "attitude": {dict}, "origin": set(), "ground_m": {int},
+    **{name: {int} for name in ("log_offset_s", "map_sigma_m", "budget_ms", "ground_amsl_m")},
+}  # fmt: skip
+
+
+def write(folder, settings):
+    path = folder / "summary.json"
+    path.write_text(json.dumps({"settings": settings}), encoding="utf-8")
+    return path
+
+
+def test_a_record_is_read_as_it_was_written(tmp_path):
+    assert read_record(write(tmp_path, RECORD.facts())) == RECORD
+
+
+@pytest.mark.parametrize("value", WRONG, ids=str)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_value_of_another_kind_is_told_by_name(name, value, tmp_path):
+    path = write(tmp_path, RECORD.facts() | {name: value})
+    if type(value) in FITTING.get(name, {str}) and not (name == "heights" and isinstance(value, dict)):
+        assert getattr(read_record(path), name) == value
+        return
+    with pytest.raises(TelemetryError) as caught:
+        read_record(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: expected the summary that track writes; settings, {name}: expected ")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("name", ["map", "surface", "truth", "method", "origin", "ground_m"])
+def test_a_record_that_lacks_what_evaluate_needs_is_refused(name, tmp_path):
+    settings = RECORD.facts()
+    del settings[name]
+    with pytest.raises(TelemetryError, match="expected the summary that track writes, got something else"):
+        read_record(write(tmp_path, settings))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "5", '{"settings": []}', '{"settings": {"map": 1', "[" * 100_000])
+def test_what_is_no_record_is_refused(text, tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(TelemetryError, match="expected the summary that track writes, got something else"):
+        read_record(path)
+
+
+def test_a_setting_within_another_is_refused():
+    with pytest.raises(OptionError, match=r"ncc\.rule: expected a setting of its own, but ncc is one"):
+        nested({"ncc": 5, "ncc.rule": 1})

@@ -1,0 +1,199 @@
+"""Runs as a library: a flight tracked in three lines of Python, what it reports, and errors by argument."""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+import engine.runs
+from engine import OptionError
+from engine.errors import BackendError, MissingExtraError, require
+from engine.formats.ros.bags import import_rosbags
+from engine.runs import (
+    BridgeFiles,
+    BridgeSettings,
+    FlightFiles,
+    LiveViewTarget,
+    MavlinkSettings,
+    Progress,
+    TrackSettings,
+    WorldSettings,
+    compare,
+    export_track,
+    run_mavlink_bridge,
+    simulate,
+    track,
+    write_parameter_file,
+)
+from engine.runs.executors import on_ray
+
+FRAMES = 3
+
+
+class Recorded(Progress):
+    """Keeps what it is shown."""
+
+    def __init__(self):
+        self.messages, self.updates, self.finished = [], {}, []
+
+    def message(self, text):
+        self.messages.append(text)
+
+    def update(self, description, done, total):
+        self.updates.setdefault(description, []).append((done, total))
+
+    def finish(self, description):
+        self.finished.append(description)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A flight folder, to be read and not written."""
+    folder = tmp_path_factory.mktemp("runs") / "flight"
+    assert simulate(str(folder), WorldSettings(), frames=FRAMES)["frames"] == FRAMES
+    return folder
+
+
+def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    files = FlightFiles.in_folder(str(flight))
+    summary = track(files, "out", TrackSettings(method="sift"))
+    assert (summary["frames"], summary["fixes"]) == (FRAMES, FRAMES)
+    assert summary["rms_m"] < 5.0
+    assert {"track.csv", "summary.json", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert capfd.readouterr() == ("", "")
+
+
+def test_progress_is_shown_what_a_run_does(flight, tmp_path):
+    progress = Recorded()
+    files = FlightFiles(
+        map=flight / "map.tif",
+        camera=flight / "camera.yaml",
+        frames=flight / "frames",
+        telemetry=flight / "telemetry.csv",
+    )
+    (flight / "frames" / "spare.jpg").write_bytes((flight / "frames" / "000000.jpg").read_bytes())
+    track(files, tmp_path / "out", report=False, progress=progress)
+    (flight / "frames" / "spare.jpg").unlink()
+    counted = [(done, FRAMES) for done in range(FRAMES + 1)]
+    assert progress.updates["ncc, engine profile"] == counted
+    assert progress.updates["checking pictures"] == counted
+    assert progress.finished[-1] == "ncc, engine profile"
+    assert progress.messages == ["frames without a row in the telemetry, left out: 1"]
+
+
+def test_a_task_that_is_interrupted_is_finished():
+    progress = Recorded()
+    for item in progress.track("abc", 3, "letters"):
+        if item == "b":
+            break
+    assert (progress.updates, progress.finished) == ({"letters": [(0, 3), (1, 3)]}, ["letters"])
+
+
+def test_a_folder_gives_what_it_has(flight, tmp_path):
+    files = FlightFiles.in_folder(flight)
+    assert (files.surface, files.truth) == (flight / "dsm.tif", flight / "truth.csv")
+    bare = FlightFiles.in_folder(tmp_path)
+    assert (bare.surface, bare.telemetry, bare.truth) == (None, None, None)
+    assert bare.map == tmp_path / "map.tif"
+
+
+def refused(call, *arguments, **named):
+    """The message of an OptionError."""
+    with pytest.raises(OptionError) as caught:
+        call(*arguments, **named)
+    return str(caught.value)
+
+
+def test_errors_name_arguments(flight, tmp_path):
+    files = FlightFiles.in_folder(flight)
+    assert refused(TrackSettings, start="here").startswith("start: expected LAT,LON[,SIGMA_M]")
+    assert refused(TrackSettings, budget_ms=-1.0) == "budget_ms: expected milliseconds above 0, got -1"
+    assert refused(TrackSettings, method="orb") == "method: expected one of ncc, sift, auto, got 'orb'"
+    assert refused(FlightFiles, map="m.tif", frames="f").startswith("camera: expected a calibration")
+    clock = refused(FlightFiles, map="m.tif", frames="f", camera="c.yaml", log_offset_s=1.0)
+    assert clock.startswith("frame_stamps, log_offset_s: expected a log as telemetry")
+    assert refused(track, files, flight) == (
+        f"out: {flight} exists; choose another folder, or add `force` to replace its results"
+    )
+    far = TrackSettings(start="0,0")
+    assert refused(track, files, tmp_path / "out", far).startswith("start: expected a place on the map")
+    assert refused(compare, files, tmp_path / "out", {"far": far}).startswith("start: expected a place on the map")
+    assert refused(export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
+    assert refused(WorldSettings, surface="dsm.tif") == "surface: expected with `map` only, got dsm.tif"
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_public_names_are_sorted_and_there():
+    assert engine.runs.__all__ == sorted(engine.runs.__all__)
+    assert set(engine.runs.__all__) == set(engine.runs._MODULES)
+    for name in engine.runs.__all__:
+        assert getattr(engine.runs, name).__doc__
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        engine.runs.nothing  # noqa: B018
+
+
+def test_the_library_imports_nothing_optional_and_no_command_line():
+    loaded = "print(*[name for name in sys.modules if name.partition('.')[0] in wanted or 'engine.cli' in name])"
+    script = (
+        "import sys; from engine.runs import *; wanted = "
+        "{'rerun', 'ray', 'pymavlink', 'serial', 'rospy', 'rclpy', 'rosbags', 'pyulog', 'rich', 'typer'}; "
+    )
+    done = subprocess.run([sys.executable, "-c", script + loaded], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+# ------------------------------------------------------------------------------------- extras that are missing
+
+
+def serial_link():
+    from engine.adapters.links import parse_connection
+
+    parse_connection("serial:/dev/null:57600").open()
+
+
+def bridge():
+    files = BridgeFiles(map="m.tif", camera="c.yaml", frames="f")
+    run_mavlink_bridge(files, MavlinkSettings(connect="udpout:127.0.0.1:1"), BridgeSettings())
+
+
+def ulog():
+    from engine.formats.logs.ulog import read_ulog
+
+    with tempfile.NamedTemporaryFile(suffix=".ulg") as file:
+        Path(file.name).write_bytes(b"ULog\x01\x12\x35\x01" + bytes(64))
+        read_ulog(Path(file.name))
+
+
+def cluster():
+    with on_ray("local", 1):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("module", "package", "extra", "use"),
+    [
+        ("pymavlink", "pymavlink", "mavlink", bridge),
+        ("pymavlink", "pymavlink", "mavlink", lambda: write_parameter_file("px4", "", "out.params")),
+        ("serial", "pyserial", "mavlink", serial_link),
+        ("rosbags", "rosbags", "bags", import_rosbags),
+        ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
+        ("pyulog", "pyulog", "logs", ulog),
+        ("ray", "ray", "ray", cluster),
+        ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),
+    ],
+)
+def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtraError) as caught:
+        use()
+    assert isinstance(caught.value, BackendError)
+    assert str(caught.value) == (
+        f"expected {package} to be installed, got none: pip install 'scenematch-engine[{extra}]'"
+    )
+
+
+def test_what_is_installed_is_imported():
+    assert require("json", "none").loads("1") == 1
