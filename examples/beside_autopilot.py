@@ -8,7 +8,7 @@ from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions, NedOrigin, pa
 from engine.adapters.pictures import capture, replay
 
 firmware, link, lat, lon, *cameras = sys.argv[1:]  # ardupilot, udpin:127.0.0.1:14550, where it takes off, 0
-set_threads(1)  # two wait for each other where other work shares the processor
+set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()

@@ -6,7 +6,7 @@ from importlib import import_module
 from engine import Camera, Navigator, OrthoMap, SceneMatcher, set_threads
 from engine.adapters.ros import RosBridge, RosOptions, RosTopics
 
-set_threads(1)  # two wait for each other where other work shares the processor
+set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()

@@ -9,7 +9,7 @@ import pytest
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.methods.ncc import Ncc
 from engine.methods.options import NccOptions
-from engine.sim import FlightStyle, SensorNoise, paper_flight
+from engine.sim import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import site_of
 
 EXACT = SensorNoise(
@@ -24,7 +24,7 @@ OFF = [(5.0, 0.05), (-5.0, 0.03), (3.3, -0.05), (-1.7, -0.02), (0.0, 0.0)]
 @pytest.fixture(scope="module")
 def flight():
     """A flight whose telemetry is the truth: what is off, the tests put there."""
-    return paper_flight(3, frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    return plan_flight(3, frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9)).draw()
 
 
 @pytest.fixture(scope="module")
