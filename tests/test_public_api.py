@@ -67,6 +67,7 @@ MODULES = {
     "formats.track": None,
     "formats.truth": None,
     "learned": None,
+    "runs": None,
     "sim": None,
     "sim.loop": None,
     "sim.pilot": None,
