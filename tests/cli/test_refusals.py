@@ -87,7 +87,7 @@ def test_a_camera_that_does_not_open_is_told(source):
 def test_a_host_that_cannot_be_one_is_told(link):
     from engine.adapters.links import parse_connection
 
-    with pytest.raises(OSError, match="cannot be the name of a host"):
+    with pytest.raises(OSError, match="is not a valid host name"):
         parse_connection(link).open()
 
 

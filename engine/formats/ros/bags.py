@@ -252,7 +252,7 @@ def _image_topic(path: Path, reader: Any, topic: str | None) -> str:
     if topic is not None and topic in names:
         return topic
     expected = "one topic with pictures" if topic is None else f"pictures on {topic}"
-    hint = "; choose with --image-topic" if topic is None and names else ""
+    hint = "; choose with `image_topic`" if topic is None and names else ""
     raise TelemetryError(f"{path}: expected {expected}, got {', '.join(names) or 'none'}{hint}")
 
 
