@@ -1,4 +1,4 @@
-"""How long an answer may take: Budget is the wish, Deadline the running clock."""
+"""Time budgets: Budget is the limit, Deadline the running clock."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from engine.errors import OptionError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
-    """Milliseconds that one frame may take from call to answer; infinite where nobody waits.
+    """Milliseconds that one frame may take from call to answer; infinite by default.
 
     Attributes:
         total_ms: of a frame with a prior.
-        search_ms: of a frame without one, which searches the whole map; None is as ``total_ms``.
+        search_ms: of a frame without a prior, which searches the whole map; None is ``total_ms``.
 
     Raises:
         OptionError: one is not above 0.
@@ -33,12 +33,12 @@ class Budget:
 
 
 class Deadline:
-    """A budget that started to run. The clock is monotonic; tests hand in their own.
+    """A budget that is running.
 
     Args:
-        budget: how long.
-        whole_map: whether a search of the whole map is asked for, which may have a budget of its own.
-        clock_ns: monotonic nanoseconds.
+        budget: limits.
+        clock_ns: monotonic nanoseconds; tests pass their own.
+        whole_map: whether the frame searches the whole map, which may have a budget of its own.
     """
 
     __slots__ = ("_budget_ms", "_clock_ns", "_start_ns")
@@ -58,7 +58,7 @@ class Deadline:
 
     @property
     def remaining_ms(self) -> float:
-        """Milliseconds that are left; negative once the deadline is past."""
+        """Milliseconds until the deadline; negative once it has passed."""
         return self._budget_ms - self.elapsed_ms
 
     @property

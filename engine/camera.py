@@ -1,7 +1,7 @@
 """The camera: pinhole intrinsics, lens distortion, and how it is mounted on the body.
 
 Convention:
-    Pixels (x, y) have their centres at integers, the origin at the centre of the top-left pixel (OpenCV's).
+    Pixels (x, y) have their centres at integers, the origin at the centre of the top-left pixel (as in OpenCV).
     The optical frame is x right, y down, z forward. ``mount`` takes optical vectors to body
     forward-right-down: v_body = mount @ v_camera. The default mount looks straight down with the top of
     the picture towards the nose.
@@ -22,14 +22,14 @@ from engine.errors import CalibrationError
 Array = NDArray[np.float64]
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
-"""Names of ROS camera_info and the numbers of coefficients that each takes."""
+"""Names of ROS camera_info, and the valid numbers of coefficients of each."""
 
 
 def _nadir_mount() -> Array:
     return np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-@dataclass(frozen=True, eq=False)  # arrays have no single answer to ==
+@dataclass(frozen=True, eq=False)  # == of arrays is elementwise
 class Camera:
     """Intrinsics and mount of one camera.
 
@@ -64,7 +64,7 @@ class Camera:
                 f"camera_matrix: expected positive focal lengths, got {self.matrix[0, 0]}, {self.matrix[1, 1]}"
             )
         if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], (0.0, 0.0, 0.0, 1.0)):
-            raise CalibrationError(  # a transposed matrix, most of all
+            raise CalibrationError(  # typically a transposed matrix
                 f"camera_matrix: expected fx 0 cx, 0 fy cy, 0 0 1 row by row, got {self.matrix.ravel().tolist()}"
             )
         if self.distortion_model not in DISTORTION_MODELS:
@@ -95,7 +95,7 @@ class Camera:
         """Read a ROS camera_info YAML file, with an optional ``mount``.
 
         Raises:
-            CalibrationError: the file is missing, is not YAML, or lacks or garbles a field.
+            CalibrationError: the file is missing or not YAML, or a field is missing or invalid.
         """
         import yaml
 
@@ -165,7 +165,7 @@ class Camera:
 
     @property
     def distorts(self) -> bool:
-        """Whether pixels must be moved before the pinhole model holds."""
+        """Whether pictures must be undistorted before the pinhole model holds."""
         return bool(self.distortion.any()) or self.distortion_model in ("equidistant", "fisheye")
 
     @cached_property
@@ -182,10 +182,15 @@ class Camera:
         return maps
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture (H, W) or (H, W, 3) that a pinhole of the same matrix would have taken.
+        """The picture that a pinhole camera of the same matrix would have taken.
 
-        The lookup is computed once per camera. Pixels that the lens never saw are 0. An ideal camera's
-        picture comes back as it is.
+        The lookup table is computed once per camera.
+
+        Args:
+            image: (H, W) or (H, W, 3).
+
+        Returns:
+            The same shape, 0 outside the lens's field of view; ``image`` itself where there is no distortion.
 
         Raises:
             CalibrationError: the picture's size is not the camera's.

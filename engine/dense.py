@@ -1,8 +1,8 @@
-"""Dense refinement: the camera's pose for which a picture and the map, seen through the surface, agree best.
+"""Dense refinement: the camera's pose at which a picture and the map on its surface model agree best.
 
-Gauss-Newton on grey levels: samples of the map with their places in space are projected into the picture, and what
-the picture shows there is compared with what the map shows, up to gain and bias. What telemetry knows of attitude
-and height, and a slope of the ground that nobody knows, enter as a Gaussian belief.
+Gauss-Newton on grey levels: 3D samples of the map are projected into the picture, whose levels there are compared
+with the map's, up to gain and bias. Attitude and height of the telemetry, and an unknown slope of the ground,
+enter as a Gaussian prior.
 
 Convention:
     ``cam_from_map``: x_cam = R (X - C). Parameters are, in this order, the centre C in metres east, north and up,
@@ -30,26 +30,26 @@ from numpy.typing import NDArray
 from engine.errors import ShapeError
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 
 MIN_SAMPLES = 60
 _STEPS = 12  # Gauss-Newton steps at most; three or four are usual
-_EDGE_PX = 2.0  # along the picture's edge nothing is sampled
-# What the samples pull is summed over so many cells of the picture, squared: how the sums scatter says how far
-# neighbours share what the map does not show.
+_EDGE_PX = 2.0  # border of the picture that is not sampled
+# The score vector is summed over 8 x 8 cells of the picture: the scatter of the sums accounts for errors that
+# neighbouring samples have in common.
 _CELLS = 8
-_EXCESS = 1.6  # variance besides, at which the errors over six simulated towns at noon fill the covariance
+_EXCESS = 1.6  # variance factor at which the errors over six simulated towns at noon match the covariance
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Points of the map.
+    """Samples of the map.
 
     Attributes:
         points_m: (N, 3) east, north and up.
-        values: (N,) what the map shows there, enhanced as the picture is.
+        values: (N,) levels of the map there, enhanced as the picture is.
         gradients: (N, 2) of the values, per metre to the east and to the north.
-        weights: (N,) 0 to 1, how far place and value are to be relied on.
+        weights: (N,) 0 to 1, reliability of position and value.
     """
 
     points_m: Array
@@ -67,12 +67,12 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the camera is and looks, and how the ground leans.
+    """Pose of the camera, and slope of the ground.
 
     Attributes:
         rotation: (3, 3) of cam_from_map.
         center_m: (3,) east, north, up.
-        slope: (2,) rise of the ground per metre to the east and to the north, besides the samples' heights.
+        slope: (2,) rise of the ground per metre to the east and to the north, in addition to the samples' heights.
     """
 
     rotation: Array
@@ -82,10 +82,10 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class GaussianPrior:
-    """What is known before the pictures are compared.
+    """Gaussian prior of the parameters.
 
     Attributes:
-        pose: the mean; the slope turns the ground about the point below its centre.
+        pose: the mean; the slope pivots at the point below its centre.
         precision: (8, 8) inverse covariance of the parameters, 0 where nothing is known.
     """
 
@@ -95,30 +95,35 @@ class GaussianPrior:
 
 @dataclass(frozen=True, slots=True)
 class EnhancedFrame:
-    """What the camera saw: (H, W) grey levels, enhanced as the map is, and the (3, 3) pinhole that they obey."""
+    """The camera's picture.
 
-    levels: Image
+    Attributes:
+        levels: (H, W) grey levels, enhanced as the map is.
+        matrix: (3, 3) pinhole intrinsics.
+    """
+
+    levels: FloatImage
     matrix: Array
 
 
 @dataclass(frozen=True, slots=True)
 class _Projection:
-    """All samples as a pose sees them.
+    """All samples projected by a pose.
 
     Attributes:
         differences: (N,) of picture and map.
-        places: (3, N) of the samples in the camera.
+        points: (3, N) samples in the camera's axes.
         offsets_m: (2, N) of the samples from the slope's pivot.
         rotation: (3, 3) of the pose.
-        shown: (3, N) derivatives of the differences by the places, as the picture's gradients show them.
-        expected: (3, N) the same, as the map's gradients let expect them.
-        weights: (N,) robust ones, 0 where the picture does not show the sample.
-        cells: (N,) which cell of the picture shows it.
-        correlation: of picture and map at the samples that the picture shows.
+        shown: (3, N) derivatives of the differences by the points, from the picture's gradients.
+        expected: (3, N) the same, from the map's gradients.
+        weights: (N,) robust weights, 0 where a sample is not visible.
+        cells: (N,) cell of the picture.
+        correlation: of picture and map at the visible samples.
     """
 
     differences: Array
-    places: Array
+    points: Array
     offsets_m: Array
     rotation: Array
     shown: Array
@@ -129,14 +134,14 @@ class _Projection:
 
     @property
     def variance(self) -> float:
-        """Of the differences."""
+        """Weighted variance of the differences."""
         return max(float(self.weights @ self.differences**2 / self.weights.sum()), 1e-12)
 
-    def derivatives(self, by_places: Array) -> Array:
-        """(8, N) of the differences by the parameters, from those by the places (3, N)."""
+    def derivatives(self, by_points: Array) -> Array:
+        """(8, N) derivatives of the differences by the parameters, from those by the points (3, N)."""
         from engine.kernels import dense_loops
 
-        return np.asarray(dense_loops.derivatives(by_places, self.places, self.offsets_m, self.rotation))
+        return np.asarray(dense_loops.derivatives(by_points, self.points, self.offsets_m, self.rotation))
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,96 +149,109 @@ class DenseFit:
     """A refined pose.
 
     Attributes:
-        pose: where picture and map agree best.
+        pose: at which picture and map agree best.
         correlation: of picture and map at the samples, before the last step.
-        settled: whether the last step was a small one.
-        look: what was seen before the last step.
+        converged: whether the last step was small.
+        projection: of the samples before the last step.
     """
 
     pose: Pose
     correlation: float
-    settled: bool
-    look: _Projection
+    converged: bool
+    projection: _Projection
 
 
 def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> float:
-    """Weighted correlation of picture and map at the samples that a pose sees; 0 where it sees too few.
+    """Weighted correlation of picture and map at the samples that are visible from a pose.
 
-    The pose is taken as it is, on ground without a further slope.
+    Args:
+        picture: of the camera.
+        samples: of the map.
+        pose: its slope pivots at the point below its own centre.
+
+    Returns:
+        In [-1, 1]; 0 where fewer than :data:`MIN_SAMPLES` are visible.
     """
     offset_m = np.ascontiguousarray((samples.points_m - pose.center_m).T)
-    look = _look(picture, samples, offset_m, pose, pose)
-    return 0.0 if look is None else look.correlation
+    projection = _project(picture, samples, offset_m, pose, pose)
+    return 0.0 if projection is None else projection.correlation
 
 
 def refine(
-    picture: EnhancedFrame, samples: Samples, start: Pose, belief: GaussianPrior, *, last_step_sigmas: float = 0.2
+    picture: EnhancedFrame, samples: Samples, start: Pose, prior: GaussianPrior, *, last_step_sigmas: float = 0.2
 ) -> DenseFit | None:
-    """Gauss-Newton from a start whose picture is a few pixels off at most.
+    """Gauss-Newton from a start whose reprojection is off by a few pixels at most.
 
     Args:
-        picture: what the camera saw.
+        picture: of the camera.
         samples: of the map.
-        start: where to begin.
-        belief: what is known besides.
+        start: initial pose.
+        prior: of the parameters.
         last_step_sigmas: a step this small, in standard deviations of the pose, is the last.
 
     Returns:
-        The pose, or None where too few samples are seen or they leave it undetermined.
+        The pose, or None where too few samples are visible or the pose is not determined.
     """
-    offset_m = np.ascontiguousarray((samples.points_m - belief.pose.center_m).T)
+    offset_m = np.ascontiguousarray((samples.points_m - prior.pose.center_m).T)
     pose = start
-    for left in reversed(range(_STEPS)):
-        look = _look(picture, samples, offset_m, pose, belief.pose)
-        solved = None if look is None else _step(look, pose, belief)
-        if look is None or solved is None:
+    for remaining in reversed(range(_STEPS)):
+        projection = _project(picture, samples, offset_m, pose, prior.pose)
+        solved = None if projection is None else _step(projection, pose, prior)
+        if projection is None or solved is None:
             return None
         step, sigmas_squared = solved
-        pose = _moved(pose, step)
-        settled = sigmas_squared < last_step_sigmas**2
-        if settled or not left:
-            return DenseFit(pose, look.correlation, settled, look)
+        pose = _updated(pose, step)
+        converged = sigmas_squared < last_step_sigmas**2
+        if converged or not remaining:
+            return DenseFit(pose, projection.correlation, converged, projection)
     return None
 
 
-def covariance_of(fit: DenseFit, belief: GaussianPrior) -> Array | None:
-    """(8, 8) of a refined pose, or None where picture and map leave it undetermined.
+def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
+    """Covariance of a refined pose.
 
-    The scatter of what the samples pull, over the squared pull of what both pictures show. Parts of the picture
-    that the map does not show have gradients too, which say nothing of the pose: of the picture's information
-    counts the share that its gradients have in common with the map's.
+    The information of the samples is divided by the scatter of their score vectors from cell to cell (Liang and
+    Zeger). Parts of the picture that are not on the map have gradients without information on the pose: only the
+    share of the information that the picture's gradients have in common with the map's counts.
+
+    Args:
+        fit: from :func:`refine`.
+        prior: the one that it was refined with.
+
+    Returns:
+        (8, 8) in the order of the parameters, or None where the pose is not determined.
     """
-    look = fit.look
-    shown, expected = look.derivatives(look.shown), look.derivatives(look.expected)
-    weighted = shown * look.weights
+    projection = fit.projection
+    shown, expected = projection.derivatives(projection.shown), projection.derivatives(projection.expected)
+    weighted = shown * projection.weights
     information = weighted @ shown.T
-    alone = _inverse(information / look.variance + belief.precision)
-    if alone is None:
+    reference = _inverse(information / projection.variance + prior.precision)
+    if reference is None:
         return None
 
     def size(matrix: Array) -> float:
-        """In the measure of what the samples tell of each parameter besides the belief."""
-        return float(np.sum(alone * matrix))
+        """Trace in units of the covariance of samples and prior."""
+        return float(np.sum(reference * matrix))
 
-    in_common, of_map = size(weighted @ expected.T), size((expected * look.weights) @ expected.T)
-    pulls = 0.5 * (shown + expected) * (look.weights * look.differences)
-    by_cell = np.array([np.bincount(look.cells, pull, _CELLS**2) for pull in pulls], np.float64)
+    in_common, of_map = size(weighted @ expected.T), size((expected * projection.weights) @ expected.T)
+    scores = 0.5 * (shown + expected) * (projection.weights * projection.differences)
+    by_cell = np.array([np.bincount(projection.cells, score, _CELLS**2) for score in scores], np.float64)
     scatter = size(by_cell @ by_cell.T) / size(information)
     if in_common <= 0.0 or scatter <= 0.0:
         return None
     share = min(1.0, in_common**2 / (size(information) * of_map))
-    return _inverse(information * (share / (_EXCESS * scatter)) + belief.precision)
+    return _inverse(information * (share / (_EXCESS * scatter)) + prior.precision)
 
 
-def _step(look: _Projection, pose: Pose, belief: GaussianPrior) -> tuple[Array, float] | None:
+def _step(projection: _Projection, pose: Pose, prior: GaussianPrior) -> tuple[Array, float] | None:
     """The Gauss-Newton step (8,), and in standard deviations, squared."""
-    # The mean of both gradients finds its way from farther than that of the picture alone.
-    derivatives = look.derivatives(0.5 * (look.shown + look.expected))
-    weighted = derivatives * (look.weights / (_EXCESS * look.variance))
-    inverse = _inverse(weighted @ derivatives.T + belief.precision)
+    # The mean of both gradients converges from farther than that of the picture alone (Benhimane and Malis).
+    derivatives = projection.derivatives(0.5 * (projection.shown + projection.expected))
+    weighted = derivatives * (projection.weights / (_EXCESS * projection.variance))
+    inverse = _inverse(weighted @ derivatives.T + prior.precision)
     if inverse is None:
         return None
-    gradient = -weighted @ look.differences - belief.precision @ _away(pose, belief.pose)
+    gradient = -weighted @ projection.differences - prior.precision @ _difference(pose, prior.pose)
     step = inverse @ gradient
     return step, float(step @ gradient)
 
@@ -243,30 +261,30 @@ def _inverse(matrix: Array) -> Array | None:
     return np.asarray(inverse, np.float64) if found else None
 
 
-def _moved(pose: Pose, step: Array) -> Pose:
+def _updated(pose: Pose, step: Array) -> Pose:
     turned = cv2.Rodrigues(step[3:6])[0] @ pose.rotation
     return Pose(turned, pose.center_m + step[:3], pose.slope + step[6:])
 
 
-def _away(pose: Pose, other: Pose) -> Array:
-    """The parameters (8,) that lead from another pose to this one."""
+def _difference(pose: Pose, other: Pose) -> Array:
+    """The parameters (8,) of the step from another pose to this one."""
     turn = cv2.Rodrigues(pose.rotation @ other.rotation.T)[0][:, 0]
     return np.concatenate([pose.center_m - other.center_m, turn, pose.slope - other.slope])
 
 
-def _look(
+def _project(
     picture: EnhancedFrame, samples: Samples, offset_m: Array, pose: Pose, pivot: Pose
 ) -> _Projection | None:
-    """Project the samples, which lie (3, N) metres from the slope's pivot, and compare what is seen there."""
+    """Project the samples, (3, N) metres from the slope's pivot, and compare the picture with the map there."""
     from engine.kernels import dense_loops  # numba takes a while to import
 
-    rotation = np.ascontiguousarray(pose.rotation)  # of one layout, for which the loops are compiled
-    levels, places, shown, expected, weights, cells, count = dense_loops.seen(
+    rotation = np.ascontiguousarray(pose.rotation)  # the memory layout that the loops are compiled for
+    levels, points, shown, expected, weights, cells, count = dense_loops.project(
         picture.levels, picture.matrix, rotation, pose.center_m, pose.slope,
         offset_m, pivot.center_m, samples.gradients, samples.weights, _EDGE_PX, _CELLS,
     )  # fmt: skip
     if count < MIN_SAMPLES:
         return None
-    differences, weights, correlation, gain = dense_loops.compare(levels, samples.values, weights)
+    differences, weights, correlation, gain = dense_loops.compare_levels(levels, samples.values, weights)
     expected *= gain
-    return _Projection(differences, places, offset_m[:2], rotation, shown, expected, weights, cells, correlation)
+    return _Projection(differences, points, offset_m[:2], rotation, shown, expected, weights, cells, correlation)

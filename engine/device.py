@@ -1,4 +1,4 @@
-"""The one device switch: where tensors live, how many threads work, when work is done."""
+"""Selection of the device, number of threads, and synchronisation."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ _WORKER = "scenematch-worker"
 
 
 def resolve(device: str | torch.device = "auto") -> torch.device:
-    """Turn the user's wish into a device that is really there.
+    """The device of a name, if it is available.
 
     Args:
         device: "cpu", "cuda", "cuda:N", a torch.device, or "auto" (CUDA where there is one, else the CPU).
 
     Raises:
-        DeviceError: the device was asked for by name and is missing; only "auto" falls back.
+        DeviceError: the device was requested by name and is missing; only "auto" falls back.
         OptionError: the name is not a device.
     """
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        wanted = torch.device(device)
+        requested = torch.device(device)
     except RuntimeError:
         raise OptionError(f"device: expected cpu, cuda or auto, got {device!r}") from None
-    if wanted.type not in ("cpu", "cuda"):
+    if requested.type not in ("cpu", "cuda"):
         raise OptionError(f"device: expected cpu, cuda or auto, got {device!r}")
-    if wanted.type == "cuda":
+    if requested.type == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if (wanted.index or 0) >= count:
-            raise DeviceError(f"device: {wanted} was asked for, but this machine offers {count} CUDA devices")
-    return wanted
+        if (requested.index or 0) >= count:
+            raise DeviceError(f"device: {requested} was asked for, but this machine offers {count} CUDA devices")
+    return requested
 
 
 def synchronise(device: torch.device) -> None:
-    """Wait until all work queued on ``device`` is done, so that a clock read means something."""
+    """Wait until all work queued on ``device`` is done, for instance before reading a clock."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def set_threads(count: int) -> None:
-    """Let torch and OpenCV use ``count`` threads each.
+    """Set the number of threads of torch and of OpenCV.
 
     Raises:
         OptionError: ``count`` is below 1.
@@ -62,17 +62,17 @@ def set_threads(count: int) -> None:
     cv2.setNumThreads(count)
 
 
-def parts(size: int, wanted: int) -> list[tuple[int, int]]:
-    """Cut a range of ``size`` into at most ``wanted`` parts (begin, end), not more than there are threads."""
-    count = max(1, min(wanted, torch.get_num_threads()))
+def parts(size: int, max_count: int) -> list[tuple[int, int]]:
+    """Divide a range of ``size`` into at most ``max_count`` parts (begin, end), and at most one per thread."""
+    count = max(1, min(max_count, torch.get_num_threads()))
     return [(size * i // count, size * (i + 1) // count) for i in range(count)]
 
 
 def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
-    """Return the work done on each piece, by as many threads as torch has.
+    """Return the results of a function on each piece, computed by as many threads as torch has.
 
-    It pays where the work lets go of Python's lock. A piece of a piece is worked on where it is met, so that no
-    worker waits for another.
+    It is faster only where the function releases Python's global lock. A call inside a worker runs in that worker,
+    so that no worker waits for another.
     """
     threads = torch.get_num_threads()
     if len(pieces) == 1 or threads == 1 or threading.current_thread().name.startswith(_WORKER):

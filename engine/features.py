@@ -2,7 +2,7 @@
 
 The detector is Lowe's: extrema of differences of Gaussians over position and scale, refined by a quadratic.
 The descriptor is Lowe's 4 x 4 cells of 8 orientations. Where the usual loops run over levels and keypoints, the
-work here is a fixed number of tensor ops, in three steps: :mod:`engine.sift.scale_space`,
+work here is a fixed number of tensor ops, in three modules: :mod:`engine.sift.scale_space`,
 :mod:`engine.sift.keypoints`, :mod:`engine.sift.descriptors`.
 
 Convention:
@@ -16,6 +16,8 @@ References:
     Arandjelovic and Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012,
     https://doi.org/10.1109/CVPR.2012.6248018 (RootSIFT).
 """
+
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -32,10 +34,10 @@ from engine.sift.scale_space import make_plan
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Keypoints and descriptors of a batch of images, in slots of fixed number.
+    """Keypoints and descriptors of a batch of images, in a fixed number of slots.
 
-    A slot that holds no keypoint is False in ``valid`` and zero elsewhere. The first slots hold the keypoints
-    within their cell's share (see :func:`sift`), the next those beyond it, both by falling strength.
+    A slot without keypoint is False in ``valid`` and zero elsewhere. The first slots hold the keypoints within
+    their cell's share (see :func:`sift`), the next those beyond it, both by falling strength.
 
     Attributes:
         xy_px: (B, N, 2) positions (x, y), pixel centres at integers.
@@ -55,7 +57,10 @@ class Features:
         """Return kornia's local affine frames, (B, N, 2, 3).
 
         Args:
-            magnification: Half the side of the described square in sigmas; kornia's SIFT takes 6.
+            magnification: Half the side of the described square in sigmas; kornia's SIFT uses 6.
+
+        Returns:
+            (B, N, 2, 3) affine matrices.
 
         Convention:
             The first two columns are the images of the patch's x and y axes, the third is the centre.
@@ -84,44 +89,70 @@ def sift(
     Args:
         images: (B, 1, H, W) floating point, values in [0, 1].
         max_keypoints: Number of slots N.
-        upright: Take every angle as ``up_deg`` instead of the dominant gradient's; cheaper, and right where the
-            heading is known.
-        up_deg: See above; from +x towards +y. Two pictures match where theirs differ by the turn between them.
-        mask: (B, 1, H, W) bool, True where a keypoint may lie.
+        upright: Use ``up_deg`` as every angle instead of the dominant gradient's; faster, for a known heading.
+        up_deg: From +x towards +y; that of two pictures must differ by the rotation between them.
+        mask: (B, 1, H, W) bool, True where keypoints are allowed.
         upsample: Samples per image pixel of the first octave: 1, or 2. The scales are the same.
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
         root: Return RootSIFT (square roots of the L1-normalised descriptor), also of unit L2 norm.
-        spread: The image is divided into spread x spread cells, and keypoints beyond a cell's double share give
-            way to weaker ones elsewhere; 1 ranks by strength alone, which is contrast times the root of scale.
+        spread: Cells along each side of the image; keypoints beyond a cell's double share rank after all others. 1
+            ranks by strength alone, which is contrast times the root of scale.
 
     Returns:
         Features on the images' device; no value is NaN.
+
+    Raises:
+        ShapeError: The images or the mask have another shape.
+        DtypeError: The images are not floating point, or the mask is not bool.
+        OptionError: An option is out of range.
     """
     _check_images(images, mask)
     _check_options(max_keypoints, upsample, contrast_threshold, spread)
-    images = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0)
+    up_rad = math.radians(up_deg) if upright else None
+    options = _SiftOptions(max_keypoints, up_rad, int(upsample), contrast_threshold, root, spread)
+    return _sift_batch(images[:, 0].float().nan_to_num(0.0, 1.0, 0.0), mask, options)
 
-    def work(part: slice) -> Features:
-        plan = make_plan(*images.shape[1:], len(images[part]), int(upsample), images.device)
-        with torch.inference_mode():
-            gaussians, points = detect(images[part], plan, contrast_threshold)
-            if mask is not None:
-                points = points.take(allowed(points, mask[part]))
-            points = points.take(strongest(points, plan, max_keypoints, spread))
-            upward = torch.full_like(points.x, math.radians(up_deg))
-            angle = upward if upright else dominant_angle(gaussians, points, plan)
-            descriptors = describe(gaussians, points, angle, plan, root=root)
-            return _to_slots(points, angle, descriptors, len(images[part]), max_keypoints)
 
+def _sift_batch(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Features:
+    """Features of images (B, H, W) float32 without NaN."""
     if images.device.type != "cpu":
-        return work(slice(None))
-    # One scale space at a time stays near a processor.
-    done = in_parallel(work, [slice(i, i + 1) for i in range(len(images))])
+        return _sift(images, mask, options)
+    # One image at a time: its scale space fits into the CPU's cache.
+    masks = [None] * len(images) if mask is None else mask.split(1)
+    done = in_parallel(lambda one: _sift(*one, options), list(zip(images.split(1), masks, strict=True)))
     return done[0] if len(done) == 1 else Features(*(torch.cat(f) for f in zip(*map(_fields, done), strict=True)))
 
 
+@dataclass(frozen=True, slots=True)
+class _SiftOptions:
+    """Options of :func:`sift`; ``up_rad`` is the angle of upright features, None the dominant gradient's."""
+
+    max_keypoints: int
+    up_rad: float | None
+    upsample: int
+    contrast_threshold: float
+    root: bool
+    spread: int
+
+
+def _sift(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Features:
+    """The same in one scale space."""
+    plan = make_plan(images.shape[1], images.shape[2], len(images), options.upsample, images.device)
+    with torch.inference_mode():
+        gaussians, points = detect(images, plan, options.contrast_threshold)
+        if mask is not None:
+            points = points.take(allowed(points, mask))
+        points = points.take(strongest(points, plan, options.max_keypoints, options.spread))
+        if options.up_rad is None:
+            angle = dominant_angle(gaussians, points, plan)
+        else:
+            angle = torch.full_like(points.x, options.up_rad)
+        descriptors = describe(gaussians, points, angle, plan, root=options.root)
+        return _to_slots(points, angle, descriptors, len(images), options.max_keypoints)
+
+
 def plans_created() -> int:
-    """How many sizes of image were planned for so far; a flight of one camera needs a few."""
+    """Number of scale-space layouts created so far, one per size of image; a flight of one camera needs a few."""
     return make_plan.cache_info().misses
 
 
@@ -129,15 +160,15 @@ def _fields(features: Features) -> tuple[Tensor, ...]:
     return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid
 
 
-_TRAIN_CHUNK = 4096  # train slots that are compared at a time, so that a whole map's never lie in memory at once
+_TRAIN_CHUNK = 4096  # train slots that are compared at a time, which bounds the memory for a whole map's
 _FAR = 1e30
 _FORBIDDEN = -2.0  # below every cosine
-_ROUNDING = 2e-3  # distance that float32 may leave between a descriptor and itself
+_ROUNDING = 2e-3  # distance between a descriptor and itself by float32 rounding
 
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """For every query slot its nearest train slot, and whether it passed the tests.
+    """The nearest train slot of every query slot, and whether the pair passes the tests.
 
     Attributes:
         train_index: (B, N) int64.
@@ -153,7 +184,14 @@ class Matches:
     valid: Tensor
 
     def pairs(self, element: int = 0) -> Tensor:
-        """Return (M, 2) int64, the accepted (query, train) slots of one element of the batch."""
+        """Return the accepted pairs of one element of the batch.
+
+        Args:
+            element: Index in the batch.
+
+        Returns:
+            (M, 2) int64 slots (query, train).
+        """
         query = self.valid[element].nonzero()[:, 0]
         return torch.stack([query, self.train_index[element, query]], dim=1)
 
@@ -171,36 +209,51 @@ def match(
 ) -> Matches:
     """Match descriptors by Euclidean distance, with Lowe's ratio test and a mutual test.
 
-    Where the relation of the images is known, pairs that contradict it can be left out before the nearest is
-    sought: d[q, t] = sqrt(2 - 2 <q, t>) where allowed, else infinite.
+    Pairs that contradict the known rotation or scale have an infinite distance, all others sqrt(2 - 2 <q, t>).
 
     Args:
-        query: Features of B images, or of one that meets each of the train's.
-        train: Features of B images, or of one that meets each of the query's.
-        ratio: Upper bound on nearest over second nearest distance; 1 accepts all.
-        mutual: Ask that the query is also the train's nearest.
+        query: Features of B images, or of one for all of the train's.
+        train: Features of B images, or of one for all of the query's.
+        ratio: Upper bound, in (0, 1], on nearest over second nearest distance; 1 accepts all.
+        mutual: Require that the query is also the train's nearest.
         rotation_deg: Known angle of a train keypoint less that of its query.
-        max_angle_diff_deg: Leave out pairs whose angles differ from ``rotation_deg`` by more.
+        max_angle_diff_deg: Exclude pairs whose angles differ from ``rotation_deg`` by more.
         scale: Known scale of a train keypoint over that of its query.
-        max_scale_factor: Leave out pairs whose scales differ from ``scale`` by more than this factor.
+        max_scale_factor: Exclude pairs whose scales differ from ``scale`` by more than this factor.
+
+    Returns:
+        For each of the N query slots.
+
+    Raises:
+        OptionError: The ratio is not in (0, 1].
     """
-    if not 0 < ratio <= 1:
-        raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
-    found = []
+    _check_ratio(ratio)
     with torch.inference_mode():
-        for begin in range(0, max(1, train.valid.shape[1]), _TRAIN_CHUNK):
-            part = _slots(train, begin, begin + _TRAIN_CHUNK)
-            cosine = query.descriptors @ part.descriptors.mT
-            _forbid(cosine, query, part, rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
-            found.append(_two_nearest(cosine, begin))
-        first, index, second, is_back = found[0] if len(found) == 1 else _merged(found)
+        limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+        first, index, second, is_mutual = _nearest(query, train, limits)
         nearest, next_nearest = _distance(first), _distance(second)
-        # Of two alike neither wins, also where rounding puts one of them at 0.
+        # Two equal distances give a ratio of 1, also where rounding puts one of them at 0.
         quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
         valid = nearest.isfinite() & (quotient <= ratio)
-        if mutual:
-            valid &= is_back
-    return Matches(index, nearest, quotient, valid)
+    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+
+
+def _check_ratio(ratio: float) -> None:
+    if not 0 < ratio <= 1:
+        raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
+
+
+def _nearest(
+    query: Features, train: Features, limits: tuple[float, float | None, float, float | None]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """:func:`_two_nearest` over all train slots, by chunks that bound the memory."""
+    found = []
+    for start in range(0, max(1, train.valid.shape[1]), _TRAIN_CHUNK):
+        part = _slots(train, start, start + _TRAIN_CHUNK)
+        cosine = query.descriptors @ part.descriptors.mT
+        _forbid(cosine, query, part, *limits)
+        found.append(_two_nearest(cosine, start))
+    return found[0] if len(found) == 1 else _merged(found)
 
 
 def _distance(cosine: Tensor) -> Tensor:
@@ -208,9 +261,9 @@ def _distance(cosine: Tensor) -> Tensor:
     return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < _FORBIDDEN, torch.inf)
 
 
-def _slots(features: Features, begin: int, end: int) -> Features:
-    """Some of the slots."""
-    return Features(*(values[:, begin:end] for values in _fields(features)))
+def _slots(features: Features, start: int, end: int) -> Features:
+    """A range of the slots."""
+    return Features(*(values[:, start:end] for values in _fields(features)))
 
 
 def _forbid(
@@ -222,14 +275,16 @@ def _forbid(
     scale: float,
     max_scale_factor: float | None,
 ) -> None:
-    """Push the cosine (B, N, M) of pairs that are not allowed far down; by sums, which cost less than masks."""
+    """Lower the cosine (B, N, M) of excluded pairs by a large number, in place; faster than masks."""
     for valid, dim in ((query.valid, 2), (train.valid, 1)):
         if not bool(valid.all()):
             cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
     if max_angle_diff_deg is not None and max_angle_diff_deg < 180:
-        turned, known = torch.deg2rad(query.angle_deg + rotation_deg), torch.deg2rad(train.angle_deg)
-        turn = torch.stack([turned.cos(), turned.sin()], dim=2) @ torch.stack([known.cos(), known.sin()], dim=1)
-        excess = math.cos(math.radians(max_angle_diff_deg)) - turn
+        expected, actual = torch.deg2rad(query.angle_deg + rotation_deg), torch.deg2rad(train.angle_deg)
+        cos_diff = torch.stack([expected.cos(), expected.sin()], dim=2) @ torch.stack(
+            [actual.cos(), actual.sin()], dim=1
+        )
+        excess = math.cos(math.radians(max_angle_diff_deg)) - cos_diff
         cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
     if max_scale_factor is not None:
         own, other = (query.scale_px * scale).clamp_min(1e-9).log(), train.scale_px.clamp_min(1e-9).log()
@@ -237,34 +292,34 @@ def _forbid(
         cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
 
 
-def _two_nearest(cosine: Tensor, begin: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _two_nearest(cosine: Tensor, start: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """For each query (B, N) the largest cosine, its slot, the second largest, and whether it is its slot's best.
 
-    ``cosine`` (B, N, M) is used up. Slots count from ``begin``.
+    ``cosine`` (B, N, M) is overwritten. Slots count from ``start``.
     """
     if 0 in cosine.shape:
         none = cosine.new_full(cosine.shape[:2], -torch.inf)
         return none, torch.zeros_like(none, dtype=torch.int64), none, none > 0
     index = _argmax(cosine)[:, :, None]
     first = cosine.gather(2, index)
-    is_back = first[:, :, 0] == cosine.amax(dim=1).gather(1, index[:, :, 0])
+    is_mutual = first[:, :, 0] == cosine.amax(dim=1).gather(1, index[:, :, 0])
     second = cosine.scatter_(2, index, -torch.inf).amax(dim=2)
-    return first[:, :, 0], index[:, :, 0] + begin, second, is_back
+    return first[:, :, 0], index[:, :, 0] + start, second, is_mutual
 
 
 def _argmax(values: Tensor) -> Tensor:
-    """values.argmax(2); on a CPU by numpy, which is ten times as fast."""
+    """``values.argmax(2)``; on a CPU by numpy, which is ten times as fast."""
     if values.device.type == "cpu":
         return torch.from_numpy(values.numpy().argmax(2))
     return values.argmax(2)
 
 
 def _merged(found: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The nearest of all chunks, and the second nearest: of its own chunk or another's nearest."""
-    first, index, second, is_back = (torch.stack(values) for values in zip(*found, strict=True))
+    """The nearest over all chunks, and the second nearest: of the same chunk or the nearest of another."""
+    first, index, second, is_mutual = (torch.stack(values) for values in zip(*found, strict=True))
     best = first.argmax(dim=0, keepdim=True)
     others = first.scatter(0, best, second.gather(0, best))
-    return first.gather(0, best)[0], index.gather(0, best)[0], others.amax(dim=0), is_back.gather(0, best)[0]
+    return first.gather(0, best)[0], index.gather(0, best)[0], others.amax(dim=0), is_mutual.gather(0, best)[0]
 
 
 def _check_images(images: Tensor, mask: Tensor | None) -> None:
@@ -293,11 +348,11 @@ def _to_slots(points: Points, angle: Tensor, descriptors: Tensor, batch: int, sl
     """Scatter points, ordered by image, into (B, N) slots."""
     index = points.image * slots + rank(points.image)
 
-    def place(values: Tensor) -> Tensor:
+    def scatter(values: Tensor) -> Tensor:
         out = values.new_zeros(batch * slots, *values.shape[1:])
         out[index] = values
         return out.view(batch, slots, *values.shape[1:])
 
     degrees = torch.rad2deg(angle).remainder(360)
     valid = torch.ones_like(index, dtype=torch.bool)
-    return Features(*map(place, (points.xy_px, points.scale_px, degrees, descriptors, valid)))
+    return Features(*map(scatter, (points.xy_px, points.scale_px, degrees, descriptors, valid)))

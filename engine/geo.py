@@ -1,4 +1,4 @@
-"""Places on the Earth: WGS84, a local east-north-up frame, rotations, and the transport of covariance.
+"""Geodesy: WGS84, a local east-north-up frame, rotations, and the propagation of covariance.
 
 Convention:
     East, north and up are metres in the plane tangent to the ellipsoid at a stated origin.
@@ -19,11 +19,20 @@ Array = NDArray[np.float64]
 WGS84_A_M = 6378137.0
 """Semi-major axis of the WGS84 ellipsoid (NIMA TR8350.2)."""
 WGS84_E2 = 6.69437999014e-3
-"""First eccentricity squared of the same."""
+"""First eccentricity squared of the WGS84 ellipsoid."""
 
 
 def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
-    """Earth-centred coordinates (..., 3) in metres of WGS84 latitude, longitude and ellipsoid height."""
+    """Earth-centred, Earth-fixed coordinates of geodetic ones.
+
+    Args:
+        lat_deg: (...,) WGS84 latitude.
+        lon_deg: (...,) WGS84 longitude.
+        height_m: (...,) above the ellipsoid.
+
+    Returns:
+        (..., 3) metres.
+    """
     lat, lon = np.radians(np.asarray(lat_deg, float)), np.radians(np.asarray(lon_deg, float))
     height = np.asarray(height_m, float)
     normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
@@ -34,9 +43,15 @@ def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLi
 
 
 def geodetic_from_ecef(ecef_m: Array) -> tuple[Array, Array, Array]:
-    """Latitude and longitude in degrees and ellipsoid height in metres of points (..., 3).
+    """Geodetic coordinates of Earth-centred ones.
 
-    Fixed-point iteration on the latitude; five rounds bring points near the ground below a nanometre.
+    Fixed-point iteration on the latitude; after five rounds the error near the ground is below a nanometre.
+
+    Args:
+        ecef_m: (..., 3) metres.
+
+    Returns:
+        WGS84 latitude and longitude in degrees and height above the ellipsoid in metres, (...,) each.
     """
     x, y, z = np.moveaxis(np.asarray(ecef_m, float), -1, 0)
     radius = np.hypot(x, y)
@@ -45,7 +60,7 @@ def geodetic_from_ecef(ecef_m: Array) -> tuple[Array, Array, Array]:
         normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
         lat = np.arctan2(z + WGS84_E2 * normal * np.sin(lat), radius)
     normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
-    # Both forms of the height are exact; the mix below is well conditioned at the equator and at the poles.
+    # This form of the height is well conditioned at the equator and at the poles.
     height = radius * np.cos(lat) + z * np.sin(lat) - WGS84_A_M**2 / normal
     return np.degrees(lat), np.degrees(np.arctan2(y, x)), height
 
@@ -64,7 +79,7 @@ class LocalFrame:
 
     @cached_property
     def enu_from_ecef(self) -> Array:
-        """Rotation (3, 3) that takes the Earth's axes to east, north and up."""
+        """(3, 3) rotation from the Earth's axes to east, north and up."""
         lat, lon = math.radians(self.lat_deg), math.radians(self.lon_deg)
         sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
         return np.array(
@@ -80,15 +95,30 @@ class LocalFrame:
         return ecef_from_geodetic(self.lat_deg, self.lon_deg)
 
     def enu_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
-        """East and north (..., 2) in metres of points on the ellipsoid."""
+        """Local coordinates of points on the ellipsoid.
+
+        Args:
+            lat_deg: (...,) WGS84 latitude.
+            lon_deg: (...,) WGS84 longitude.
+
+        Returns:
+            (..., 2) east and north in metres.
+        """
         offset = ecef_from_geodetic(lat_deg, lon_deg) - self._origin_ecef_m
         return (offset @ self.enu_from_ecef.T)[..., :2]
 
     def convergence_deg(self, lat_deg: float, lon_deg: float) -> float:
-        """Direction of true north at a place in this frame's axes: clockwise from its north, in [-180, 180].
+        """Direction of true north at a position, clockwise from this frame's north, in [-180, 180].
 
-        A heading in these axes is the true heading plus this. It is 0 at the origin; at a place to the east of it
-        about the sine of latitude times the difference of longitude, to the west (negative) in the north.
+        A heading in these axes is the true heading plus this. It is 0 at the origin; east of it about the negative
+        sine of latitude times the difference of longitude.
+
+        Args:
+            lat_deg: of the position.
+            lon_deg: of the position.
+
+        Returns:
+            Degrees.
         """
         lat, lon = math.radians(lat_deg), math.radians(lon_deg - self.lon_deg)
         origin_lat = math.radians(self.lat_deg)
@@ -97,9 +127,17 @@ class LocalFrame:
         return math.degrees(math.atan2(east, north))
 
     def geodetic_from_enu(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[Array, Array]:
-        """Latitude and longitude in degrees of the points on the ellipsoid above (east, north)."""
+        """Geodetic coordinates of the points on the ellipsoid below local ones.
+
+        Args:
+            east_m: (...,).
+            north_m: (...,).
+
+        Returns:
+            WGS84 latitude and longitude in degrees, (...,) each.
+        """
         east, north = np.broadcast_arrays(np.asarray(east_m, float), np.asarray(north_m, float))
-        # The ellipsoid falls away below the tangent plane by d^2 / 2R; two rounds find that drop.
+        # The ellipsoid is below the tangent plane by d^2 / 2R; two rounds find that drop.
         drop = np.zeros_like(east)
         for _ in range(3):
             enu = np.stack([east, north, -drop], axis=-1)
@@ -109,11 +147,18 @@ class LocalFrame:
 
 
 def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
-    """Rotation (3, 3) that takes body forward-right-down vectors to east-north-up.
+    """Rotation from body (forward-right-down) to east-north-up.
 
     Convention:
         Aerospace order: heading about down, then pitch about right, then roll about forward.
-        Heading clockwise from true north, pitch positive nose up, roll positive right side down.
+
+    Args:
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+        heading_deg: clockwise from true north.
+
+    Returns:
+        (3, 3), ``v_enu = enu_from_body(...) @ v_body``.
     """
     sr, sp, sh = (math.sin(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     cr, cp, ch = (math.cos(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
@@ -128,9 +173,13 @@ def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Arra
 
 
 def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
-    """Roll, pitch and heading in degrees of a rotation; the inverse of :func:`enu_from_body`.
+    """Roll, pitch and heading of a rotation; the inverse of :func:`enu_from_body`.
 
-    The heading is in [0, 360). At a pitch of +-90 degrees roll and heading cannot be told apart.
+    Args:
+        enu_from_body_: (3, 3). At a pitch of +-90 degrees roll and heading are not separable.
+
+    Returns:
+        Roll, pitch and heading in degrees, the heading in [0, 360).
     """
     forward, right, down = (enu_from_body_[:, i] for i in range(3))
     heading = wrap_heading_deg(math.degrees(math.atan2(forward[0], forward[1])))
@@ -140,16 +189,32 @@ def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
 
 
 def wrap_heading_deg(heading_deg: float) -> float:
-    """The same direction in [0, 360); the first remainder of a tiny negative angle rounds to 360 itself."""
+    """Wrap to [0, 360); twice, since the remainder of a tiny negative angle rounds to 360."""
     return heading_deg % 360.0 % 360.0
 
 
-def chi_square(apart: Array, covariance: Array) -> float:
-    """Squared length of a difference (N,) in units of its covariance (N, N): N degrees of freedom."""
-    return float(apart @ np.linalg.solve(covariance, apart))
+def chi_square(difference: Array, covariance: Array) -> float:
+    """Squared Mahalanobis length of a difference, chi-square with N degrees of freedom.
+
+    Args:
+        difference: (N,).
+        covariance: (N, N) of the difference.
+
+    Returns:
+        0 or more.
+    """
+    return float(difference @ np.linalg.solve(covariance, difference))
 
 
 def transport_covariance(jacobian: Array, covariance: Array) -> Array:
-    """First-order covariance of f(x): J C J^T, symmetrised against rounding."""
-    moved = jacobian @ covariance @ jacobian.T
-    return np.asarray(0.5 * (moved + moved.T), dtype=np.float64)
+    """First-order covariance of f(x): J C J^T, symmetrised against rounding.
+
+    Args:
+        jacobian: (M, N) of f by x.
+        covariance: (N, N) of x.
+
+    Returns:
+        (M, M).
+    """
+    propagated = jacobian @ covariance @ jacobian.T
+    return np.asarray(0.5 * (propagated + propagated.T), dtype=np.float64)

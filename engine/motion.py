@@ -161,6 +161,9 @@ class DriftModel:
             apart_m: (2,) from one to the other.
             sigma_m: of that, per axis.
             interval_s: between them.
+
+        Returns:
+            VelocityEstimate: (2,) m/s to the east and north, and its standard deviation.
         """
         changed_mps = self.acceleration_mps2 * math.sqrt(interval_s / 3.0)
         return VelocityEstimate(apart_m / interval_s, sigma_m / interval_s + changed_mps)
@@ -178,7 +181,15 @@ class PositionEstimate:
         return chi_square(en_m(fix) - self.en_m, fix.covariance_m2[:2, :2] + self.sigma_m**2 * np.eye(2))
 
     def prior(self, widened: float = 1.0, moved_m: Array | None = None) -> Prior:
-        """The same as a prior, ``widened`` times as uncertain; no vaguer than any map is wide."""
+        """The same as a prior.
+
+        Args:
+            widened: factor on the standard deviation, which is bounded by :data:`engine.values.MAX_SIGMA_M`.
+            moved_m: (2,) movement east and north since the last frame; None is 0.
+
+        Returns:
+            Prior: in metres east and north of the map's origin.
+        """
         east, north = (float(v) for v in self.en_m)
         moved_east, moved_north = (0.0, 0.0) if moved_m is None else (float(v) for v in moved_m)
         sigma_m = min(self.sigma_m * widened, MAX_SIGMA_M)
@@ -188,7 +199,14 @@ class PositionEstimate:
 
 
 def en_m(fix: Fix) -> Array:
-    """(2,) east and north of a fix."""
+    """East and north of a fix.
+
+    Args:
+        fix: a position.
+
+    Returns:
+        (2,) metres.
+    """
     return np.array([fix.east_m, fix.north_m])
 
 

@@ -1,8 +1,8 @@
-"""Batched normalised cross-correlation (equation 1): surfaces, and the peaks on them.
+"""Batched normalised cross-correlation (equation 1): score surfaces, and their peaks coarse to fine.
 
 Convention:
     ``search`` is the crop of the map, ``templates`` the aligned frame under T hypotheses. ``surface[b, t, y, x]``
-    belongs to the template's top-left pixel lying on pixel (x, y) of the crop.
+    is the score with the template's top-left pixel at pixel (x, y) of the crop.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from torch import Tensor
 
 from engine import kernels
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.peaks import FAR, NEAR, best_places, find_peak, fit_summit
+from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit
 from engine.values import Peak
 
 _DTYPES = (torch.uint8, torch.int16, torch.uint16, torch.int32, torch.float16, torch.float32, torch.float64)
 _DOUBLE = (torch.float64, torch.int32)  # float32 would round these
 
-# Coarse to fine: templates are halved while they stay at least this wide and the window is worth it.
+# Coarse to fine: templates are halved while they stay at least this wide and the window is large enough.
 _COARSE_TEMPLATE_PX = 48
-_WORTH_HALVING_PX = 128 * 128
+_MIN_HALVED_PX = 128 * 128
 _CANDIDATES = 6
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
 _MAX_HALVINGS = 3
@@ -41,16 +41,15 @@ def ncc(
     templates_valid: Tensor | None = None,
     min_overlap: float = 0.5,
 ) -> Tensor:
-    """Values in [-1, 1]: normalised cross-correlation of templates with every place of a window.
+    """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
 
     Args:
         search: (B, H, W), any of uint8, int16, uint16, int32, float16, float32, float64.
         templates: (B, T, h, w) with h <= H and w <= W, on the same device.
-        zero_mean: take the means off first (OpenCV's ``TM_CCOEFF_NORMED``); otherwise the paper's equation 1
-            as it stands (``TM_CCORR_NORMED``).
-        search_valid: (B, H, W) bool, or None: all. Invalid pixels take part in no sum.
+        zero_mean: subtract the means (OpenCV's ``TM_CCOEFF_NORMED``); False is equation 1 (``TM_CCORR_NORMED``).
+        search_valid: (B, H, W) bool, or None: all. Invalid pixels are left out of all sums.
         templates_valid: (B, T, h, w) bool, or None: all.
-        min_overlap: with masks, places where less than this share of the template's valid pixels lies on valid
+        min_overlap: with masks, positions where less than this share of the template's valid pixels is on valid
             map score -1.
 
     Returns:
@@ -60,12 +59,10 @@ def ncc(
     Raises:
         ShapeError: the shapes do not fit each other.
         DtypeError: an element type is not in the list above, or a mask is not bool.
-        OptionError: the tensors live on different devices, or hold NaN or infinity, or masks come without
-            ``zero_mean``.
+        OptionError: different devices, NaN or infinity, or masks without ``zero_mean``.
     """
     _check(search, templates)
-    double = torch.float64 in (search.dtype, templates.dtype)
-    out = torch.float64 if double else torch.float32
+    out = torch.float64 if torch.float64 in (search.dtype, templates.dtype) else torch.float32
     if search_valid is not None or templates_valid is not None:
         masks = _masks(search, templates, search_valid, templates_valid)
         if not zero_mean:
@@ -97,7 +94,7 @@ def _check(search: Tensor, templates: Tensor) -> None:
 
 
 def _is_finite(tensor: Tensor) -> bool:
-    """Whether all values are finite; a sum is finite only then, and is much quicker than looking at each."""
+    """Whether all values are finite; a finite sum implies it, and is much faster to compute."""
     return bool(torch.isfinite(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
 
@@ -121,13 +118,13 @@ def _masks(
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """A piece of map that was prepared for matching: what a frame need not compute again.
+    """Part of a map prepared for matching: what does not depend on the frame.
 
     Attributes:
-        image: (H, W) float32, of a mean that is small against its deviation.
+        image: (H, W) float32, its mean small against its standard deviation.
         sums: (2, H+1, W+1) float64 running sums of the picture and of its square.
-        half: the same piece at half resolution, whose pixel (x, y) is the mean of 2 x 2 pixels from (2x, 2y);
-            None where there is no further level.
+        half: the same part at half resolution, whose pixel (x, y) is the mean of 2 x 2 pixels from (2x, 2y);
+            None on the coarsest level.
     """
 
     image: Tensor
@@ -135,7 +132,7 @@ class Search:
     half: Search | None = None
 
     def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
-        """Columns [x0, x0 + width), rows [y0, y0 + height), without a copy.
+        """Crop columns [x0, x0 + width) and rows [y0, y0 + height), without a copy.
 
         The half-resolution level is kept where the crop begins on an even pixel.
         """
@@ -147,7 +144,19 @@ class Search:
 
 
 def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
-    """Running sums and half-resolution levels of a picture (H, W) float32."""
+    """Compute running sums and half-resolution levels.
+
+    Args:
+        image: (H, W) float32, its mean small against its standard deviation.
+        halvings: upper bound on the number of half-resolution levels.
+
+    Returns:
+        Search: with integral images (2, H+1, W+1) float64, and levels down to 48 x 48 pixels.
+
+    Raises:
+        ShapeError: the picture is not (H, W), or is empty.
+        DtypeError: it is not float32.
+    """
     if image.ndim != 2 or 0 in image.shape:
         raise ShapeError(f"image: expected (H, W) with no empty axis, got {tuple(image.shape)}")
     if image.dtype != torch.float32:
@@ -159,7 +168,18 @@ def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
 
 
 def surface(search: Search, templates: Tensor) -> Tensor:
-    """Zero-mean NCC (T, H-h+1, W-w+1) of float32 templates (T, h, w) with a prepared piece of map."""
+    """Zero-mean NCC of templates with a prepared part of a map.
+
+    Args:
+        search: (H, W) from :func:`prepare`.
+        templates: (T, h, w) float32 on the same device, with h <= H and w <= W.
+
+    Returns:
+        (T, H-h+1, W-w+1) float32 in [-1, 1].
+
+    Raises:
+        ShapeError: the templates are not (T, h, w), are empty, or are larger than the map.
+    """
     if templates.ndim != 3 or 0 in templates.shape:
         raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
     _check_fit(search, templates)
@@ -173,7 +193,16 @@ def _check_fit(search: Search, templates: Tensor) -> None:
 
 
 def surfaces(search: Search, templates: Tensor, *, group: int) -> Iterator[Tensor]:
-    """The same for ``group`` templates at a time, which bounds the memory of many templates on a large map."""
+    """Zero-mean NCC for a group of templates at a time, which bounds the memory of many templates on a large map.
+
+    Args:
+        search: (H, W) from :func:`prepare`.
+        templates: (T, h, w) float32 on the same device, with h <= H and w <= W.
+        group: number of templates per tensor.
+
+    Returns:
+        Yields (group, H-h+1, W-w+1) float32, the last one with the remainder of T.
+    """
     inverse_norms = kernels.inverse_norm(search.sums, *templates.shape[-2:])
     for part in templates.split(group):
         yield kernels.prepared_surface(search.image, inverse_norms, _centred(part))
@@ -184,19 +213,25 @@ def _centred(templates: Tensor) -> Tensor:
 
 
 def match_template(search: Search, template: Tensor, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
-    """The peak of one template (h, w) in a prepared piece of map.
+    """The peak of one template in a prepared part of a map.
 
-    Coarse to fine: all places are scored at reduced resolution, the best few at full resolution. It is safe where
-    no place that was left out can win: the coarse scores are taken to be wrong by no more than twice what they
-    were wrong by at the places that were looked at, and by no less than a match between coarse pixels loses.
-    Where that does not exclude every other place, and with ``exhaustive`` or on another device than the CPU, all
-    places are scored at full resolution.
+    Coarse to fine: all positions are scored at reduced resolution, the best few at full resolution. The error of
+    the coarse scores is bounded by twice the largest error at the refined positions, and by at least what a match
+    between coarse pixels loses. Where that bound does not exclude every other position, and with ``exhaustive`` or
+    on another device than the CPU, all positions are scored at full resolution.
 
     Args:
         search: from :func:`prepare`.
         template: (h, w) float32 on the same device.
-        exclusion_px: rivals nearer than this to the peak are the peak itself.
-        exhaustive: score all places at full resolution; the peak is then the reference's.
+        exclusion_px: radius about the peak within which no rival is counted.
+        exhaustive: score all positions at full resolution; the peak is then the reference's.
+
+    Returns:
+        Peak: as :func:`engine.peaks.find_peak`; on the CPU without ``exhaustive`` the second score may be that of
+        a coarse level.
+
+    Raises:
+        ShapeError: the template is not (h, w), is empty, or is larger than the map.
     """
     if template.ndim != 2 or 0 in template.shape:
         raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
@@ -211,18 +246,18 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
 
 
 def _peak_on_device(search: Search, template: Tensor, exclusion_px: float) -> Peak:
-    """:func:`find_peak` of the surface, bit for bit; 28 numbers leave the device, in one copy."""
+    """:func:`find_peak` of the surface, bit for bit; 28 numbers are copied from the device, at once."""
     _check_fit(search, template[None])
     inverse_norms = kernels.inverse_norm(search.sums, *template.shape)
     products = kernels.products(search.image, _centred(template[None]))
-    best, place = kernels.peak(products, inverse_norms)
-    second = kernels.rival(products, inverse_norms, place, math.floor(exclusion_px * exclusion_px))
+    best, position = kernels.peak(products, inverse_norms)
+    second = kernels.rival(products, inverse_norms, position, math.floor(exclusion_px * exclusion_px))
     height, width = inverse_norms.shape
-    near = torch.arange(-2, 3, device=place.device)
-    rows = (place // width + near).clamp_(0, height - 1)[:, None]
-    columns = (place % width + near).clamp_(0, width - 1)
+    near = torch.arange(-2, 3, device=position.device)
+    rows = (position // width + near).clamp_(0, height - 1)[:, None]
+    columns = (position % width + near).clamp_(0, width - 1)
     around = (products[0, rows, columns] * inverse_norms[rows, columns]).clamp_(-1.0, 1.0)
-    found = torch.cat([part.double() for part in (place, best, second, around.flatten())]).cpu().numpy()
+    found = torch.cat([part.double() for part in (position, best, second, around.flatten())]).cpu().numpy()
     y, x = divmod(int(found[0]), width)
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
     r = min(2, x, y, width - 1 - x, height - 1 - y)
@@ -232,48 +267,48 @@ def _peak_on_device(search: Search, template: Tensor, exclusion_px: float) -> Pe
 
 
 def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Peak | None:
-    """The peak by way of the half-resolution levels, or None where they cannot be trusted."""
+    """The peak by way of the half-resolution levels, or None where their errors do not exclude other positions."""
     levels = [(search, template - template.mean())]
     while True:
-        piece, model = levels[-1]
-        (H, W), (h, w) = piece.image.shape, model.shape
-        if len(levels) > _MAX_HALVINGS or piece.half is None or min(h, w) < 2 * _COARSE_TEMPLATE_PX:
+        part, model = levels[-1]
+        (H, W), (h, w) = part.image.shape, model.shape
+        if len(levels) > _MAX_HALVINGS or part.half is None or min(h, w) < 2 * _COARSE_TEMPLATE_PX:
             break
-        if H * W < _WORTH_HALVING_PX or min(H - h, W - w) < 16:
+        if H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
             break
-        levels.append((piece.half, kernels.halved(model)))
+        levels.append((part.half, kernels.halved(model)))
     if len(levels) == 1:
         return None  # nothing to gain
     (coarse, model), scale = levels[-1], 2 ** (len(levels) - 1)
     inverse_norms = kernels.inverse_norm(coarse.sums, *model.shape)
     scores = kernels.prepared_surface(coarse.image, inverse_norms, model[None])[0]
-    places = best_places(scores, _SEPARATION_PX, _CANDIDATES + 1)
+    candidates = best_positions(scores, _SEPARATION_PX, _CANDIDATES + 1)
     loss = _phase_loss(levels[-2][1], model)
     best: Peak | None = None
-    doubt, others = 0.0, []
-    for index, (x, y, score) in enumerate(places):
-        if best is not None and score + doubt < best.score:
-            break  # places come in falling order: none of the rest can win
+    error, peaks = 0.0, []
+    for index, (x, y, score) in enumerate(candidates):
+        if best is not None and score + error < best.score:
+            break  # candidates are in falling order: none of the rest can win
         if index == _CANDIDATES:
             return None
         found = _refined(levels, scores, x, y)
         if found is None:
             return None
-        others.append(found)
+        peaks.append(found)
         best = found if best is None or found.score > best.score else best
-        doubt = max(doubt, 2.0 * abs(found.score - score) + 0.01, loss * best.score + 0.01)
-    assert best is not None  # a surface has a highest place
+        error = max(error, 2.0 * abs(found.score - score) + 0.01, loss * best.score + 0.01)
+    assert best is not None  # a surface has a maximum
     rivals = [
-        (found, place)
-        for found, place in zip(others, places, strict=False)
+        (found, candidate)
+        for found, candidate in zip(peaks, candidates, strict=False)
         if math.hypot(found.x - best.x, found.y - best.y) > exclusion_px
     ]
-    rest = _coarse_rest(scores, [place for _, place in rivals], scale, best, exclusion_px)
+    rest = _coarse_rest(scores, [candidate for _, candidate in rivals], scale, best, exclusion_px)
     return replace(best, second_score=max([rest, *(found.score for found, _ in rivals)]))
 
 
 def _phase_loss(fine: Tensor, coarse: Tensor) -> float:
-    """How much a perfect match loses on the coarser of two levels where it lies between that level's pixels."""
+    """What a perfect match loses on the coarser of two levels where it is between that level's pixels."""
     between = kernels.halved(fine[1:, 1:]).ravel()
     model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
     norm = float(torch.linalg.vector_norm(between) * torch.linalg.vector_norm(model))
@@ -283,25 +318,25 @@ def _phase_loss(fine: Tensor, coarse: Tensor) -> float:
 def _coarse_rest(
     scores: Tensor, rivals: list[tuple[int, int, float]], scale: int, best: Peak, exclusion_px: float
 ) -> float:
-    """The best coarse score outside the peak's exclusion zone and away from the rivals that were looked at."""
-    left, r = scores.numpy().copy(), _SEPARATION_PX
+    """The best coarse score outside the peak's exclusion zone and away from the refined rivals."""
+    remaining, r = scores.numpy().copy(), _SEPARATION_PX
     for x, y, _ in rivals:
-        left[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
+        remaining[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
     down, across = (
-        np.square(np.arange(n) * scale - at) for n, at in zip(left.shape, (best.y, best.x), strict=True)
+        np.square(np.arange(n) * scale - at) for n, at in zip(remaining.shape, (best.y, best.x), strict=True)
     )
-    left[down[:, None] + across <= exclusion_px**2] = -1.0
-    return float(left.max())
+    remaining[down[:, None] + across <= exclusion_px**2] = -1.0
+    return float(remaining.max())
 
 
 def _refined(levels: list[tuple[Search, Tensor]], scores: Tensor, x: int, y: int) -> Peak | None:
-    """A coarse place at full resolution; None where it runs into the window's edge, or too far uphill."""
+    """A coarse position at full resolution; None where the ascent reaches the window's edge or its last step."""
     if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
         return None
-    (piece, model), scale = levels[0], 2 ** (len(levels) - 1)
+    (part, model), scale = levels[0], 2 ** (len(levels) - 1)
     dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].double().numpy())
     y, x = round(scale * (y + dy)), round(scale * (x + dx))
-    scorer = kernels.LocalScores(piece.image.numpy(), piece.sums.numpy(), model.numpy(), (y, x))
+    scorer = kernels.LocalScores(part.image.numpy(), part.sums.numpy(), model.numpy(), (y, x))
     for uphill in range(_UPHILL_STEPS + 1):
         if uphill == _UPHILL_STEPS or not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
             return None

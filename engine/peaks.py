@@ -1,4 +1,4 @@
-"""Peaks of correlation surfaces: the highest places, their rivals, and their summits below the pixel."""
+"""Peaks of correlation surfaces: the highest positions, their rivals, and sub-pixel refinement."""
 
 from __future__ import annotations
 
@@ -9,28 +9,36 @@ from torch import Tensor
 from engine.errors import ShapeError
 from engine.values import Peak
 
-# Of surfaces of more places than this only the best place of every tile is looked at.
+# Of surfaces with more positions than this only the best of every tile is a candidate.
 _TILED_PX = 1 << 18
 _TILE_PX = 16
 
 
-def best_places(scores: Tensor, separation_px: int, count: int) -> list[tuple[int, int, float]]:
-    """The ``count`` highest places (x, y, score) of (H, W) that are more than ``separation_px`` apart.
+def best_positions(scores: Tensor, separation_px: int, count: int) -> list[tuple[int, int, float]]:
+    """The highest positions of a surface that are apart from each other.
 
-    Of every tile of a large surface only the highest place is a candidate.
+    Of every tile of 16 x 16 pixels of a large surface only the highest position is a candidate.
+
+    Args:
+        scores: (H, W), -1 where a position is excluded.
+        separation_px: positions are more than this apart in x or in y.
+        count: upper bound on their number.
+
+    Returns:
+        (x, y, score) in falling order of the score.
     """
     values = scores.cpu().numpy()
     if values.size > _TILED_PX:
         return _best_of_tiles(values, separation_px, count)
-    left, places, r = values.copy(), [], separation_px
+    remaining, positions, r = values.copy(), [], separation_px
     for _ in range(count):
-        y, x = divmod(int(left.argmax()), left.shape[1])
-        score = float(left[y, x])
+        y, x = divmod(int(remaining.argmax()), remaining.shape[1])
+        score = float(remaining[y, x])
         if score <= -1.0:
             break
-        places.append((x, y, score))
-        left[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
-    return places
+        positions.append((x, y, score))
+        remaining[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
+    return positions
 
 
 def _best_of_tiles(values: NDArray[np.float32], separation_px: int, count: int) -> list[tuple[int, int, float]]:
@@ -38,31 +46,34 @@ def _best_of_tiles(values: NDArray[np.float32], separation_px: int, count: int) 
     padded = np.full((height * _TILE_PX, width * _TILE_PX), -1.0, np.float32)
     padded[: values.shape[0], : values.shape[1]] = values
     tiles = padded.reshape(height, _TILE_PX, width, _TILE_PX).max(axis=(1, 3)).ravel()
-    wanted = min(tiles.size, 16 * count)  # neighbouring tiles share one summit
-    order = np.argpartition(-tiles, wanted - 1)[:wanted]
-    places: list[tuple[int, int, float]] = []
+    kept = min(tiles.size, 16 * count)  # neighbouring tiles share one peak
+    order = np.argpartition(-tiles, kept - 1)[:kept]
+    positions: list[tuple[int, int, float]] = []
     for index in order[np.argsort(-tiles[order], kind="stable")]:
         j, i = divmod(int(index), width)
         tile = padded[j * _TILE_PX : (j + 1) * _TILE_PX, i * _TILE_PX : (i + 1) * _TILE_PX]
         y, x = divmod(int(tile.argmax()), _TILE_PX)
         y, x, score = y + j * _TILE_PX, x + i * _TILE_PX, float(tile[y, x])
-        if score > -1.0 and all(max(abs(x - u), abs(y - v)) > separation_px for u, v, _ in places):
-            places.append((x, y, score))
-        if len(places) == count:
+        if score > -1.0 and all(max(abs(x - u), abs(y - v)) > separation_px for u, v, _ in positions):
+            positions.append((x, y, score))
+        if len(positions) == count:
             break
-    return places
+    return positions
 
 
 def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
-    """The highest place of one surface (H', W'), refined below the pixel, with its best rival.
+    """The maximum of a surface, refined to sub-pixel accuracy, with its best rival.
 
     Args:
-        scores: of one template, at least one place.
-        exclusion_px: rivals nearer than this to the peak are the peak itself.
+        scores: (H', W') of one template, at least one position.
+        exclusion_px: radius about the peak within which no rival is counted.
 
     Returns:
         Peak: (x, y) by :func:`fit_summit`, never further than half a pixel from the best whole pixel;
         unrefined on the border of the surface.
+
+    Raises:
+        ShapeError: the surface is not (H, W), or is empty.
     """
     if scores.ndim != 2 or 0 in scores.shape:
         raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
@@ -87,20 +98,20 @@ def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: flo
     return max((float(part.max()) for part in outside if part.size), default=-1.0)
 
 
-# The neighbourhood of a peak as rows and columns (dy, dx): 3 x 3 places, and the four two pixels away.
+# The neighbourhood of a peak as rows and columns (dy, dx): 3 x 3 positions, and the four two pixels away.
 NEAR = np.array([[-1, -1, -1, 0, 0, 0, 1, 1, 1], [-1, 0, 1, -1, 0, 1, -1, 0, 1]])
 FAR = np.array([[-2, 2, 0, 0], [0, 0, -2, 2]])
 # Powers (i, j) of the polynomials c[i, j] x^i y^j that follow it: a quadratic by least squares over the 3 x 3;
-# and, since a peak is sharper than a parabola, one of degree 4 that goes through all 13.
+# and, since a peak is sharper than a parabola, one of degree 4 through all 13.
 _QUADRATIC = [(0, 0), (1, 0), (2, 0), (0, 1), (0, 2), (1, 1)]
 _QUARTIC = [*_QUADRATIC, (3, 0), (4, 0), (0, 3), (0, 4), (2, 1), (1, 2), (2, 2)]
 
 
-def _derivatives(places: NDArray[np.int64], powers: list[tuple[int, int]], n: int) -> NDArray[np.float64]:
-    """Takes the scores at places (dy, dx) to d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2 of the polynomial, n x n each."""
-    y, x = places.astype(float)
+def _derivatives(positions: NDArray[np.int64], powers: list[tuple[int, int]], n: int) -> NDArray[np.float64]:
+    """Matrix from scores at positions (dy, dx) to d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2 of the polynomial, n x n."""
+    y, x = positions.astype(float)
     inverse = np.linalg.pinv(np.stack([x**i * y**j for i, j in powers], axis=1))
-    c = np.zeros((n, n, places.shape[1]))
+    c = np.zeros((n, n, positions.shape[1]))
     for row, power in zip(inverse, powers, strict=True):
         c[power] = row
     slope = np.diag(np.arange(1.0, n), 1)
@@ -116,24 +127,27 @@ _NEWTON_END_PX = 1e-4
 
 
 def fit_summit(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:
-    """Offset (dx, dy) of the summit of a 3 x 3 or 5 x 5 patch from its centre, and its second derivatives (2, 2).
+    """Sub-pixel maximum of a patch, by Newton's method from its centre on a polynomial fit.
 
-    By Newton's method from the centre, on the polynomial through the neighbourhood of the centre. Where the way
-    does not lead to a summit within half a pixel, the offset is cut off there.
+    Args:
+        patch: (3, 3) or (5, 5) scores.
+
+    Returns:
+        Offset (dx, dy) from the centre, clipped to half a pixel, and second derivatives (2, 2) per square pixel.
     """
     n = patch.shape[0]
-    places, take = _SUMMITS[n]
-    derivatives = (take @ patch[places[0], places[1]]).reshape(5, n, n)
+    positions, matrix = _SUMMITS[n]
+    derivatives = (matrix @ patch[positions[0], positions[1]]).reshape(5, n, n)
     orders = np.arange(n)
     x = y = 0.0
     for _ in range(_NEWTON_STEPS):
         gx, gy, xx, xy, yy = (derivatives @ y**orders @ x**orders).tolist()
         determinant = xx * yy - xy * xy
-        if xx >= 0 or determinant <= 0:  # no summit: a ridge, a saddle
+        if xx >= 0 or determinant <= 0:  # no maximum: a ridge, a saddle
             break
         last_x, last_y = x, y
         x = min(0.5, max(-0.5, x - (yy * gx - xy * gy) / determinant))
         y = min(0.5, max(-0.5, y - (xx * gy - xy * gx) / determinant))
-        if n == 3 or abs(x - last_x) + abs(y - last_y) < _NEWTON_END_PX:  # a quadratic takes one step
+        if n == 3 or abs(x - last_x) + abs(y - last_y) < _NEWTON_END_PX:  # a quadratic needs one step
             break
     return x, y, np.array([[xx, xy], [xy, yy]])

@@ -1,6 +1,6 @@
-"""Perspective from N points: where to start, Gauss-Newton on the matches that agree, and the covariance.
+"""Perspective from N points: initial pose, Gauss-Newton on the inliers, and the covariance.
 
-Whether a pose is to be believed is not asked here: :mod:`engine.pose` does.
+Whether a pose is accepted is decided in :mod:`engine.pose`.
 
 Convention:
     ``cam_from_map``: x_cam = R (X - C), camera axes x right, y down, z forward. Matches are columns.
@@ -21,31 +21,31 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Pose = tuple[Array, Array]  # rotation (3, 3) and centre (3,)
+Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
 _STEPS = 12  # Gauss-Newton steps at most; four or five are usual
 _STEP_SIGMAS = 2e-2  # a step this small, in standard deviations of the pose, is the last
-_PAIRS = 24  # pairs of matches that vote for a centre where the attitude is known
-_SLACK = 3.0  # by which a known attitude's error may widen the tolerance at the start
+_PAIRS = 24  # pairs of matches that give candidate centres where the attitude is known
+_SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
 _REACH_SIGMAS = 4.0
-_FAR_PX = 1e9  # where points behind the camera are said to be
+_FAR_PX = 1e9  # assigned coordinates of points behind the camera
 _MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Matches, what is known of the attitude, and what counts as agreement.
+    """Matches, prior of the attitude, and inlier tolerance.
 
     Attributes:
         points: (3, N) map points in metres, about their mean.
         pixels: (2, N) undistorted.
         K: (3, 3) pinhole intrinsics.
         weights: (N,) relative inverse variances of the pixels.
-        attitude: (3, 3) rotation known from elsewhere, or None.
+        attitude: (3, 3) rotation of the prior, or None.
         precision: (3, 3) inverse covariance of its angles about the camera's axes in 1/rad^2, 0 without one.
         tolerance_px: A match agrees if it reprojects at most this far off.
         noise_floor_px: Lower bound on the standard deviation of a pixel.
-        min_inliers: Fewest matches that carry a pose.
+        min_inliers: Fewest inliers of a pose.
     """
 
     points: Array
@@ -61,7 +61,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Reprojection:
-    """All matches as a pose sees them.
+    """All matches reprojected by a pose.
 
     Attributes:
         tangents: (3, N) x / z, y / z and 1 / z in the camera.
@@ -81,9 +81,9 @@ class Fit:
     Attributes:
         rotation: (3, 3).
         center: (3,) in the problem's metres.
-        view: What it sees.
-        inliers: (N,) bool, the matches that agree.
-        information: (6, 6) inverse covariance that the matches give, for the centre in the camera's axes.
+        view: All matches reprojected.
+        inliers: (N,) bool.
+        information: (6, 6) inverse covariance from the matches alone, for the centre in the camera's axes.
         variance_px2: Of a pixel's x and y.
     """
 
@@ -95,11 +95,21 @@ class Fit:
     variance_px2: float
 
 
-# ----------------------------------------------------------------------------------------------- where to start
+# ------------------------------------------------------------------------------------------------- initial pose
 
 
-def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) -> Pose | None:
-    """Return the best pose that three matches fix, or None where there is none."""
+def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) -> Start | None:
+    """Return the best pose of minimal samples, by OpenCV's USAC with MSAC scores.
+
+    Args:
+        problem: The matches.
+        max_iterations: Upper bound on the number of samples.
+        confidence: Probability, in (0, 1), at which the search stops early.
+        seed: Of the samples.
+
+    Returns:
+        Rotation (3, 3) and centre (3,), or None where no sample gives a pose.
+    """
     params = cv2.UsacParams()
     params.threshold = problem.tolerance_px
     params.confidence = confidence
@@ -107,7 +117,7 @@ def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) 
     params.randomGeneratorState = seed
     params.sampler = cv2.SAMPLING_UNIFORM
     params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_NULL  # the refinement below does it better
+    params.loMethod = cv2.LOCAL_OPTIM_NULL  # Gauss-Newton below refines instead
     points, pixels = np.ascontiguousarray(problem.points.T), np.ascontiguousarray(problem.pixels.T)
     try:
         found, _, rotvec, t, inliers = cv2.solvePnPRansac(points, pixels, problem.K, None, params=params)
@@ -120,9 +130,10 @@ def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) 
 
 
 def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
-    """Return the pose near the known attitude, or None unless more than half of the matches agree with it.
+    """Return the pose near the known attitude, or None unless more than half of the matches are its inliers.
 
-    Two matches and the attitude fix the centre. A majority needs no further search: no other pose can have one.
+    Two matches and the attitude determine the centre. A majority needs no further search: no other pose can have
+    one.
     """
     if problem.attitude is None:
         return None
@@ -130,11 +141,11 @@ def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
     pairs = np.random.default_rng(seed).integers(0, count, (2, _PAIRS))
     x = R @ problem.points
     rays = np.linalg.inv(problem.K) @ np.concatenate([problem.pixels, np.ones((1, count))])
-    # x = c + z ray with ray = (., ., 1): the depths differ by what x says; x and y give the first.
+    # x = c + z ray with ray = (., ., 1): x gives the difference of the depths; x and y give the first depth.
     one, two = pairs
     deeper = x[2, one] - x[2, two]
-    apart, across = (x[:, one] - x[:, two] - deeper * rays[:, two])[:2], (rays[:, one] - rays[:, two])[:2]
-    depth = np.sum(apart * across, axis=0) / np.maximum(np.sum(across * across, axis=0), 1e-12)
+    offset, across = (x[:, one] - x[:, two] - deeper * rays[:, two])[:2], (rays[:, one] - rays[:, two])[:2]
+    depth = np.sum(offset * across, axis=0) / np.maximum(np.sum(across * across, axis=0), 1e-12)
     centers = x[:, one] - depth * rays[:, one]
     seen = x[:, None, :] - centers[:, :, None]
     residual = problem.K[:2, :2] @ (seen[:2] / np.maximum(seen[2], 1e-9)).reshape(2, -1)
@@ -143,15 +154,24 @@ def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
     best = int(np.argmax(np.count_nonzero(near, axis=1)))
     if 2 * np.count_nonzero(near[best]) <= count:
         return None
-    fit = refine(problem, R, R.T @ centers[:, best], slack=_SLACK)
+    fit = gauss_newton(problem, R, R.T @ centers[:, best], slack=_SLACK)
     return fit if fit is not None and 2 * np.count_nonzero(fit.inliers) > count else None
 
 
 # ----------------------------------------------------------------------------------------------------- refinement
 
 
-def look(problem: Problem, R: Array, center: Array) -> Reprojection:
-    """Return all matches as the pose sees them."""
+def reproject(problem: Problem, R: Array, center: Array) -> Reprojection:
+    """Reproject all matches.
+
+    Args:
+        problem: The matches.
+        R: (3, 3) rotation of cam_from_map.
+        center: (3,) of the camera, in the problem's metres.
+
+    Returns:
+        Pixels and squared distances; points behind the camera are far off.
+    """
     x = R @ problem.points - (R @ center)[:, None]
     behind = x[2] < 1e-9
     x[2, behind] = 1.0
@@ -165,31 +185,31 @@ def look(problem: Problem, R: Array, center: Array) -> Reprojection:
     return Reprojection(x, projected, residual[0] + residual[1])
 
 
-def refine(problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, slack: float = 1.0) -> Fit | None:
-    """Iterate Gauss-Newton with Tukey's biweight; each step finds anew which matches agree, and their variance.
+def gauss_newton(
+    problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, slack: float = 1.0
+) -> Fit | None:
+    """Iterate Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
 
     Args:
         problem: The matches.
-        R: (3, 3) where to start.
-        center: (3,) where to start.
-        steps: At most this many.
-        slack: Multiple of the tolerance within which the first step takes matches.
+        R: (3, 3) initial rotation.
+        center: (3,) initial centre.
+        steps: Upper bound on the number of steps.
+        slack: Factor on the tolerance in the first step.
 
     Returns:
-        The pose, or None where too few matches agree or they leave it undetermined.
+        The pose, or None where there are too few inliers or they do not determine it.
     """
     square = problem.tolerance_px**2
     reach = slack**2 * square
-    view, variance, freedom = look(problem, R, center), reach / 9, math.inf
+    view, variance, freedom = reproject(problem, R, center), reach / 9, math.inf
     inliers = view.squared <= reach
     for _ in range(steps):
-        count = np.count_nonzero(inliers)
-        if count < problem.min_inliers:
+        if (count := np.count_nonzero(inliers)) < problem.min_inliers:
             return None
         gain, noise = _biweight_factors(0.5 * reach / variance)
         scale = noise * _student(freedom) * variance
-        normal, gradient = _normal_equations(problem, view, np.maximum(1 - view.squared / reach, 0) ** 2)
-        normal, gradient = normal / scale, gradient / scale
+        normal, gradient = _normal_equations(problem, view, np.maximum(1 - view.squared / reach, 0) ** 2, scale)
         covariance = _inverse(problem, normal)
         if covariance is None:
             return None
@@ -197,8 +217,8 @@ def refine(problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, sl
         delta = covariance @ gradient
         center = center + R.T @ delta[:3]
         R = cv2.Rodrigues(delta[3:])[0] @ R
-        view = look(problem, R, center)
-        # What the prior knows need not be taken from the matches: the trace is the parameters that were.
+        view = reproject(problem, R, center)
+        # The trace is the number of parameters that the matches determine; the prior determines the rest.
         freedom = 2 * count - float(np.vdot(covariance, normal))
         variance = _variance_px2(float((problem.weights * inliers) @ view.squared) / freedom, problem)
         inliers, reach = view.squared <= square, max(square, _REACH_SIGMAS**2 * variance)
@@ -207,10 +227,13 @@ def refine(problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, sl
     return Fit(R, center, view, inliers, gain * normal, variance)
 
 
-def _normal_equations(problem: Problem, view: Reprojection, agreement: Array) -> tuple[Array, Array]:
-    """Return J^T W J (6, 6) and -J^T W r (6,) for a step of the centre, in the camera's axes, and of the rotation.
+def _normal_equations(
+    problem: Problem, view: Reprojection, agreement: Array, variance: float
+) -> tuple[Array, Array]:
+    """Return J^T W J (6, 6) and -J^T W r (6,), W over the variance, for a step of the centre and of the rotation.
 
-    With x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel is K x / z.
+    In the camera's axes, with x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel
+    is K x / z.
     """
     u, v, near = view.tangents
     J = np.zeros((6, 2, len(u)))
@@ -222,11 +245,11 @@ def _normal_equations(problem: Problem, view: Reprojection, agreement: Array) ->
     J[5, 0], J[5, 1] = -v, u
     J = problem.K[:2, :2] @ J
     weighted, flat = (J * (problem.weights * agreement)).reshape(6, -1), J.reshape(6, -1)
-    return weighted @ flat.T, weighted @ (problem.pixels - view.projected).ravel()
+    return weighted @ flat.T / variance, weighted @ (problem.pixels - view.projected).ravel() / variance
 
 
 def _inverse(problem: Problem, information: Array) -> Array | None:
-    """Return the covariance (6, 6) of matches and known attitude, or None where they leave the pose open."""
+    """Return the covariance (6, 6) by matches and known attitude, or None where they do not determine the pose."""
     total = information.copy()
     total[3:, 3:] += problem.precision
     found, covariance = cv2.invert(total, flags=cv2.DECOMP_CHOLESKY)
@@ -234,7 +257,7 @@ def _inverse(problem: Problem, information: Array) -> Array | None:
 
 
 def _biweight_factors(u: float) -> tuple[float, float]:
-    """Return what the biweight w = (1 - r^2 / T^2)^2 does to normal noise s, u = T^2 / (2 s^2).
+    """Return the efficiency factors of the biweight w = (1 - r^2 / T^2)^2 for normal noise s, u = T^2 / (2 s^2).
 
     The first factor turns the sum of w J^T J into the derivative that the sum of w J^T r is expected to have, the
     second s^2 into the variance that makes it the inverse covariance (Huber's sandwich): with q = r^2 / (2 s^2),
@@ -247,13 +270,21 @@ def _biweight_factors(u: float) -> tuple[float, float]:
         moments.append(n * moments[-1] - tail)
     g = [moment / u**n for n, moment in enumerate(moments)]
     weight = g[0] - 2 * g[1] + g[2]
-    pull = u * (g[1] - 2 * g[2] + g[3])
+    sensitivity = u * (g[1] - 2 * g[2] + g[3])
     noise = u * (g[1] - 4 * g[2] + 6 * g[3] - 4 * g[4] + g[5])
-    return pull / weight, noise / pull
+    return sensitivity / weight, noise / sensitivity
 
 
 def turn_from_attitude(problem: Problem, R: Array) -> Array:
-    """Return the rotation (3,) in radians from the known attitude to R, about the camera's axes; 0 without one."""
+    """Return the rotation from the known attitude to another.
+
+    Args:
+        problem: With or without a known attitude.
+        R: (3, 3) of cam_from_map.
+
+    Returns:
+        (3,) radians about the camera's axes; 0 without a known attitude.
+    """
     if problem.attitude is None:
         return np.zeros(3)
     turn: Array = cv2.Rodrigues(R @ problem.attitude.T)[0][:, 0]
@@ -261,7 +292,7 @@ def turn_from_attitude(problem: Problem, R: Array) -> Array:
 
 
 def _variance_px2(mean: float, problem: Problem) -> float:
-    """Return the variance s^2 at which distances r, cut off at T, have this mean square per axis.
+    """Return the variance s^2 at which distances r, truncated at T, have this mean square per axis.
 
     E[r^2 | r < T] = 2 s^2 (1 - u / (e^u - 1)),  u = T^2 / (2 s^2).
     """
@@ -275,14 +306,20 @@ def _variance_px2(mean: float, problem: Problem) -> float:
 
 
 def _student(freedom: float) -> float:
-    """Return the variance of Student's t over a normal's: the price of a variance that is itself estimated."""
+    """Return the variance of Student's t over a normal's, since the variance is itself estimated."""
     return 1.0 if math.isinf(freedom) else freedom / max(freedom - 2, 1.0)
 
 
-def covariance_of(problem: Problem, fit: Fit) -> Array | None:
-    """Return the covariance (6, 6) of the centre in the map's axes and of the rotation about the camera's.
+def match_covariance(problem: Problem, fit: Fit) -> Array | None:
+    """Return the covariance of a pose.
 
-    None where the matches leave some direction open.
+    Args:
+        problem: The matches.
+        fit: The refined pose.
+
+    Returns:
+        (6, 6) of the centre in the map's axes (m) and of the rotation about the camera's (rad), or None where some
+        direction is not determined.
     """
     covariance = _inverse(problem, fit.information)
     if covariance is None:

@@ -1,7 +1,7 @@
-"""Camera pose from matched points: options in, statistics out, or None where the matches do not carry a pose.
+"""Camera pose from matched points: options in, statistics out, or None where the matches do not support a pose.
 
-:mod:`engine.pnp` finds the matches that agree and refines on them, and it finds some in any set of wrong matches.
-Here an a-contrario test asks whether chance could have made as many agree.
+:mod:`engine.pnp` finds inliers and refines on them, and it finds some in any set of wrong matches. Here an
+a-contrario test bounds the expected number of poses with as many inliers by chance.
 
 Convention:
     ``cam_from_map``: x_cam = R X_map + t, camera axes x right, y down, z forward; map axes in metres, z up.
@@ -11,7 +11,7 @@ References:
     Moisan and Stival, A probabilistic criterion to detect rigid point matches between two images, IJCV 2004,
     https://doi.org/10.1023/B:VISI.0000013094.38752.54 (a-contrario test).
     Schweighofer and Pinz, Robust pose estimation from a planar target, PAMI 2006,
-    https://doi.org/10.1109/TPAMI.2006.252 (the two poses that a plane allows).
+    https://doi.org/10.1109/TPAMI.2006.252 (the two poses of a planar target).
 """
 
 import math
@@ -25,41 +25,40 @@ from engine.pnp import (
     Fit,
     Problem,
     Reprojection,
-    covariance_of,
-    look,
+    gauss_newton,
+    match_covariance,
     ransac,
-    refine,
     refine_from_attitude,
+    reproject,
     turn_from_attitude,
 )
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_SAMPLE = 3  # matches that fix a pose, up to ...
+_SAMPLE = 3  # matches that determine a pose, up to ...
 _POSES_PER_SAMPLE = 4
-_MIRRORED_STEPS = 4  # of the other pose of a plane: enough to see how well it could fit
-_PAIRED = 300  # projections that are compared with all image points for the chance of agreement
+_MIRRORED_STEPS = 4  # of the other pose of a plane: enough to estimate its cost
+_PAIRED = 300  # projections that are compared with all image points for the probability of a chance inlier
 _SAME_POSE_DEG = 1.5
 _IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseOptions:
-    """What counts as agreement, and how long to search for it.
+    """Inlier tolerance, effort of the search, and thresholds of acceptance.
 
     Attributes:
-        reprojection_px: A match agrees with a pose if it reprojects at most this far off.
-        max_iterations: Samples that RANSAC draws at most.
+        reprojection_px: Largest reprojection distance of an inlier.
+        max_iterations: Upper bound on the samples that RANSAC draws.
         confidence: Probability, in (0, 1), at which RANSAC stops early.
-        min_inliers: Fewest distinct matches that may carry a pose.
-        distinct_px: Matches in one square cell of this side count once: they look at the same pixels, and are
-            right or wrong together.
-        max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses that as
-            many matches support by chance.
-        min_spread_px: Smallest standard deviation of the inliers in the image, in the direction where they
-            spread least; below it they are nearly on a line.
-        min_cost_gap: Chi-square by which the pose must beat the other one that a plane allows.
+        min_inliers: Fewest distinct inliers of a pose.
+        distinct_px: Matches in one square cell of this side count once, since their errors are correlated.
+        max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses with as
+            many inliers by chance.
+        min_spread_px: Smallest standard deviation of the inliers in the image, in the direction where it is
+            smallest; below it they are nearly collinear.
+        min_cost_gap: Chi-square by which the pose must be better than the other pose of a plane.
         noise_floor_px: Lower bound on the standard deviation taken for an image point's x and y.
         seed: Of RANSAC's samples; equal inputs and seeds give equal poses.
     """
@@ -93,12 +92,12 @@ class PoseOptions:
 
 @dataclass(frozen=True, slots=True)
 class AttitudePrior:
-    """Attitude known from elsewhere, such as telemetry.
+    """Prior of the attitude, such as telemetry.
 
     Attributes:
         rotation: (3, 3) of cam_from_map.
         sigma_deg: Standard deviation of the angle about each axis: one number, or (x, y, z).
-        axes: (3, 3) rotation from the camera to the axes that are meant, such as a mount for those of the body;
+        axes: (3, 3) rotation from the camera to the axes of ``sigma_deg``, such as a mount for those of the body;
             the default is the camera's own.
     """
 
@@ -121,17 +120,17 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True)
 class PoseStats:
-    """A pose and how far it can be trusted.
+    """A pose with its uncertainty.
 
     Attributes:
         rotation: (3, 3) R of x_cam = R X_map + t.
         translation: (3,) t in metres.
         center_m: (3,) the camera's centre in the map's axes, -R^T t.
         covariance: (6, 6) of the centre (m) and of a small rotation about the camera's axes (rad).
-        inliers: (N,) bool, the matches that agree.
+        inliers: (N,) bool.
         rms_px: Root mean square of the inliers' reprojection distances.
         sigma_px: Standard deviation estimated for an image point's x and y.
-        log10_nfa: log10 of the number of false alarms; the lower, the surer.
+        log10_nfa: log10 of the number of false alarms; the lower, the more significant.
     """
 
     rotation: Array
@@ -158,48 +157,63 @@ def solve_pose(
     weights: Array | None = None,
     prior: AttitudePrior | None = None,
 ) -> PoseStats | None:
-    """Estimate the pose that most matches agree on.
+    """Estimate the pose with the most inliers.
 
     Args:
-        points_m: (N, 3) map points in metres; they may lie in one plane and far from the origin.
+        points_m: (N, 3) map points in metres; they may be coplanar and far from the origin.
         points_px: (N, 2) undistorted pixels (x, y).
         camera_matrix: (3, 3) pinhole intrinsics.
         options: Thresholds; the defaults suit frames of a few hundred pixels.
         weights: (N,) relative inverse variances of the image points; None is 1 for all.
-        prior: Attitude that the refinement takes into account; at a small field of view it separates a tilt
-            from a displacement.
+        prior: Attitude for the refinement, which separates tilt from displacement at a small field of view.
 
     Returns:
-        The pose, or None where the matches are too few, on a line, repeated, behind the camera, ambiguous
-        between the two poses of a plane, or not more consistent than chance would make them.
+        None where the matches are few, collinear, behind the camera, ambiguous or not significant.
+
+    Raises:
+        ShapeError: An array has another shape.
+        DtypeError: An array is not of real numbers.
     """
     options = options or PoseOptions()
     points_m, points_px, K, weights = _checked(points_m, points_px, camera_matrix, weights)
-    finite = np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0)
-    known = np.flatnonzero(finite)
+    known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0))
     if len(known) < options.min_inliers or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
-    problem = Problem(
-        points=(points_m[known] - origin).T,
-        pixels=points_px[known].T,
+    problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
+    fit = _fit(problem, options)
+    if fit is None or not _supported(problem, fit, options) or _ambiguous(problem, fit, options):
+        return None
+    log10_nfa, covariance = _log10_nfa(problem, fit, options), match_covariance(problem, fit)
+    if log10_nfa > options.max_log10_nfa or covariance is None:
+        return None
+    return _stats(fit, origin, covariance, known, len(points_m), log10_nfa)
+
+
+def _problem(
+    points: Array, pixels: Array, K: Array, weights: Array, options: PoseOptions, prior: AttitudePrior | None
+) -> Problem:
+    """The problem of points (3, N) about their mean and pixels (2, N)."""
+    return Problem(
+        points=points,
+        pixels=pixels,
         K=K,
-        weights=weights[known],
+        weights=weights,
         attitude=None if prior is None else prior.rotation,
         precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
         noise_floor_px=options.noise_floor_px,
         min_inliers=options.min_inliers,
     )
-    fit = _fit(problem, options)
-    if fit is None or not _supported(problem, fit, options) or _ambiguous(problem, fit, options):
-        return None
-    log10_nfa, covariance = _log10_nfa(problem, fit, options), covariance_of(problem, fit)
-    if log10_nfa > options.max_log10_nfa or covariance is None:
-        return None
-    inliers = np.zeros(len(finite), bool)
-    inliers[known[fit.inliers]] = True
+
+
+def _stats(
+    fit: Fit, origin: Array, covariance: Array, known: NDArray[np.intp], count: int, log10_nfa: float
+) -> PoseStats:
+    """The result of a fit of some of the matches, whose metres are about an origin (3,)."""
     center = fit.center + origin
+    inliers = np.zeros(count, bool)
+    inliers[known[fit.inliers]] = True
     return PoseStats(
         rotation=fit.rotation,
         translation=-fit.rotation @ center,
@@ -240,11 +254,11 @@ def _fit(problem: Problem, options: PoseOptions) -> Fit | None:
     if fit is not None:
         return fit
     start = ransac(problem, options.max_iterations, options.confidence, options.seed)
-    return None if start is None else refine(problem, *start)
+    return None if start is None else gauss_newton(problem, *start)
 
 
 def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
-    """Ask for inliers that are not on a line, seen from above."""
+    """Whether there are enough inliers, not collinear, below the camera."""
     if np.count_nonzero(fit.inliers) < options.min_inliers:
         return False
     above = float(fit.center[2] - problem.points[2, fit.inliers].mean())
@@ -258,11 +272,11 @@ def _distinct(pixels: Array, options: PoseOptions) -> int:
 
 
 def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
-    """Return log10 of the expected number of poses that as many of N matches support by chance.
+    """Return log10 of the expected number of poses with as many inliers of N matches by chance.
 
-    NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the distinct inliers. p is the chance that a wrong match agrees:
-    the share of all pairings of a map point with an image point, also of other matches, that agree with the
-    pose. This counts the crowding of the points, which a uniform density would not.
+    NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the distinct inliers (Moisan and Stival). p is the probability
+    that a wrong match is an inlier: the share of all pairs of a map point with an image point, of other matches
+    too, that agree with the pose. This accounts for clustered points, which a uniform density would not.
     """
     total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
     if k < options.min_inliers:
@@ -288,27 +302,27 @@ def _log10_choose(n: int, k: int) -> float:
 
 
 def _ambiguous(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
-    """Ask whether the other of the two poses that a plane allows explains the matches nearly as well."""
+    """Whether the other of the two poses of a plane explains the matches nearly as well."""
     R, center = _mirrored(problem.points[:, fit.inliers], fit)
     if _same(R, fit.rotation):
         return False
     cost = _cost(problem, fit.rotation, fit.view, fit.variance_px2, options)
-    if _cost(problem, R, look(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
-        return False  # too far off for a refinement to make up
-    other = refine(problem, R, center, steps=_MIRRORED_STEPS)
+    if _cost(problem, R, reproject(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
+        return False  # too far off for a refinement to compensate
+    other = gauss_newton(problem, R, center, steps=_MIRRORED_STEPS)
     if other is None or _same(other.rotation, fit.rotation):
         return False
     return _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + options.min_cost_gap
 
 
 def _mirrored(points: Array, fit: Fit) -> tuple[Array, Array]:
-    """Return the pose that shows a plane through the points alike if perspective is weak.
+    """Return the other pose from which a plane through the points looks the same under weak perspective.
 
-    Depth mirrored in the line of sight v, and the plane in itself:  R' = (1 - 2 v v^T) R (1 - 2 n n^T).
+    Depth mirrored along the line of sight v, and the plane in its normal n:  R' = (1 - 2 v v^T) R (1 - 2 n n^T).
     """
     middle = points.mean(axis=1)
-    away = points - middle[:, None]
-    n = np.linalg.eigh(away @ away.T)[1][:, 0]
+    centred = points - middle[:, None]
+    n = np.linalg.eigh(centred @ centred.T)[1][:, 0]
     seen = fit.rotation @ (middle - fit.center)
     v = seen / np.linalg.norm(seen)
     mirror, plane = _IDENTITY - 2 * v[:, None] * v, _IDENTITY - 2 * n[:, None] * n

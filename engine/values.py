@@ -1,6 +1,6 @@
-"""The values that travel through the engine: frames and priors in, fixes or refusals out.
+"""The engine's value types: frames and priors in, fixes or refusals out.
 
-All are frozen and slotted. Names carry their units; a position never travels without its covariance.
+All are frozen and slotted. Names include their units; a position always comes with its covariance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MAX_SIGMA_M = 1e6
-"""Largest uncertainty of a position or of a map: no map is wider."""
+"""Upper bound on the standard deviation of a position or of a map's georeference."""
 
 
 def _check_finite(name: str, value: float | None) -> None:
@@ -30,7 +30,7 @@ def _check_finite(name: str, value: float | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """How the body (forward-right-down) is turned, in aerospace order: yaw, then pitch, then roll.
+    """Attitude of the body (forward-right-down), in aerospace order: yaw, then pitch, then roll.
 
     Convention:
         ``heading_deg`` clockwise from true north in [0, 360); ``pitch_deg`` positive nose up;
@@ -42,21 +42,21 @@ class Attitude:
     heading_deg: float
 
 
-# What is a finite number in every frame, or unknown.
+# Fields of a frame that are finite or None.
 _FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture and what the vehicle knew when it was taken.
+    """One picture with the vehicle's telemetry at its capture.
 
     Attributes:
         image: (H, W) grey or (H, W, 3) RGB, uint8, numpy or torch.
         timestamp_ns: capture time on the vehicle's clock, or None.
         height_agl_m: height above the ground, positive, or None where unknown.
         heading_deg: clockwise from true north, or None where unknown.
-        roll_deg: positive right side down; None is taken as level.
-        pitch_deg: positive nose up; None is taken as level.
+        roll_deg: positive right side down; None is treated as level.
+        pitch_deg: positive nose up; None is treated as level.
         east_velocity_mps: velocity over ground, or None where unknown.
         north_velocity_mps: velocity over ground, or None where unknown.
 
@@ -88,7 +88,7 @@ class Frame:
 
     @property
     def attitude(self) -> Attitude | None:
-        """The attitude with unknown roll and pitch taken as level, or None where the heading is unknown."""
+        """The attitude with unknown roll and pitch as 0, or None where the heading is unknown."""
         if self.heading_deg is None:
             return None
         return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.heading_deg % 360.0 % 360.0)
@@ -126,17 +126,17 @@ class GridPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prior:
-    """Where the vehicle is believed to be when a frame is taken.
+    """Prior of the vehicle's position at the capture of a frame.
 
     Give either ``lat_deg`` and ``lon_deg`` (WGS84) or ``east_m`` and ``north_m`` (about the map's origin).
 
     Attributes:
         sigma_m: one standard deviation of the position, per axis.
-        moved_east_m: how far the vehicle moved since the last frame; eq. 4 and 5 add it to the window.
-        moved_north_m: the same to the north.
+        moved_east_m: movement to the east since the last frame; eq. 4 and 5 add it to the window.
+        moved_north_m: movement to the north since the last frame.
 
     Raises:
-        OptionError: the position is missing, doubled or not finite, or sigma_m is negative.
+        OptionError: the position is missing, given twice or not finite, or sigma_m is negative.
     """
 
     lat_deg: float | None = None
@@ -183,13 +183,13 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """The highest place of a correlation surface.
+    """The maximum of a correlation surface.
 
     Attributes:
-        x: sub-pixel column of the best shift of the template in the window.
+        x: sub-pixel column of the template's top-left pixel in the window.
         y: sub-pixel row of the same.
         score: NCC at the best whole pixel, in [-1, 1].
-        second_score: the highest NCC outside the peak's exclusion zone, or -1 where nothing lies outside.
+        second_score: the highest NCC outside the peak's exclusion zone, or -1 where nothing is outside.
         curvature: (2, 2) second derivatives of the score at the peak, per square pixel (negative definite).
     """
 
@@ -233,7 +233,7 @@ class Timings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """A position with its covariance, for the moment at which the frame was taken.
+    """A position with its covariance, at the capture of the frame.
 
     Attributes:
         timestamp_ns: capture time of the frame, or None where the frame had none.
@@ -243,19 +243,18 @@ class Fix:
         north_m: north of the map's origin.
         up_m: height of the camera in the surface model's datum (above flat ground where there is none);
             None where the method does not measure height.
-        covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None its up entry is that of the height
-            that the frame came with.
-        attitude: what the method measured, or None where it measures none. Where NCC's peak was searched for over
-            headings or heights and not refined, only the heading is; roll and pitch are the frame's, or 0.
-        score: NCC in [-1, 1], or for SIFT the share of matches that agree with the pose.
+        covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
+        attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
+            only the heading is measured; roll and pitch are the frame's, or 0.
+        score: NCC in [-1, 1], or for SIFT the share of inliers.
         method: "ncc" or "sift".
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).
-        stage: how far the budget went: "coarse" at reduced resolution, "fine" at full, "refined" in all of the
-            pose, "verified" by both methods.
-        confidence: probability in (0, 1) that the place is right, as ``docs/integrity.md`` says; None where NCC
-            searched the map, the heading or the height, for which none was fitted.
+        stage: last stage within the budget: "coarse" at reduced resolution, "fine" at full, "refined" in all of
+            the pose, "verified" by both methods.
+        confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None where NCC
+            searched the map, the heading or the height, for which no model was fitted.
     """
 
     timestamp_ns: int | None
@@ -294,14 +293,14 @@ class Fix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoFix:
-    """A refusal: the frame gave no position that can be trusted, and why.
+    """A refusal: the frame gave no reliable position, and the reason.
 
     Attributes:
-        reason: the rule that refused.
+        reason: of the refusal.
         detail: one sentence with the figures behind the reason.
         timestamp_ns: capture time of the frame, or None where the frame had none.
         method: the method that refused, or None where none was tried.
-        score: the score that was reached, or None where matching did not get so far.
+        score: of the best match, or None where there was none.
         window: the crop that was searched, or None.
         timings: milliseconds per stage that ran.
     """
@@ -317,7 +316,7 @@ class NoFix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
-    """Where the vehicle really was at one moment; what is unknown is None.
+    """True pose of the vehicle at one time; unknown fields are None.
 
     Attributes:
         timestamp_ns: on the clock of the frames.
@@ -341,7 +340,7 @@ class Truth:
 
 
 Result = Fix | NoFix
-"""What a frame ends in."""
+"""The answer to a frame."""
 
 
 def check_positive(options: object, *names: str) -> None:

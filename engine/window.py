@@ -1,4 +1,4 @@
-"""The adaptive window: how large a crop of the map a frame is matched against (eq. 4, 5), and on which level."""
+"""The adaptive window: the crop of the map that a frame is matched against (eq. 4, 5), and its pyramid level."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 
 SPREAD_SIGMAS = 3.0
-"""Of the prior: a window holds what is matched at every place this near to the middle."""
+"""Standard deviations of the prior that a window covers to each side."""
 
 
 def window_size_px(
@@ -18,8 +18,8 @@ def window_size_px(
     """Width and height of the window in map pixels: W = 1.3 s T + v tau (eq. 4, 5).
 
     Args:
-        footprint_px: s T, the frame's extent (width, height) once it lies on the map.
-        moved_px: v tau, the movement (x, y) since the last frame; only its size counts.
+        footprint_px: s T, the frame's extent (width, height) on the map.
+        moved_px: v tau, the movement (x, y) since the last frame; signs are ignored.
         margin: the paper's 1.3.
 
     Raises:
@@ -36,10 +36,15 @@ def window_size_px(
 def place_window(
     center_px: tuple[float, float], size_px: tuple[float, float], map_size_px: tuple[int, int]
 ) -> Window | None:
-    """The window in whole pixels about a centre (x, y), clipped at the edge of a map (width, height).
+    """The window in whole pixels about a centre, clipped to the map.
+
+    Args:
+        center_px: (x, y).
+        size_px: width and height before it is clipped.
+        map_size_px: width and height of the map.
 
     Returns:
-        Window | None: None where the window and the map have nothing in common.
+        Window | None: None where the window is outside the map.
     """
     spans = []
     for center, size, limit in zip(center_px, size_px, map_size_px, strict=True):
@@ -59,7 +64,7 @@ def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) 
         window: in full-resolution pixels, inside the map.
         level: of the pyramid.
         step_px: width and height are rounded up to a multiple of this where the level is large enough, so that
-            a flight meets few different sizes and nothing is planned anew in flight.
+            a flight meets few different sizes and nothing is planned again in flight.
     """
     rows, columns = site.level_shape(level)
     spans = []
@@ -71,5 +76,5 @@ def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) 
 
 
 def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int) -> int:
-    """The pyramid level whose pixels are nearest to the wanted size without being much coarser."""
+    """The pyramid level whose pixels are nearest to the requested size without being much coarser."""
     return min(max(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + 0.25), 0), levels - 1)

@@ -8,7 +8,7 @@ from engine.adapters.ros import RosBridge, Topics
 from engine.adapters.ros_out import RosOptions
 from engine.device import set_threads
 
-set_threads(1)  # two wait for each other where other work shares the processor
+set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from engine import Fix
-from engine.sim import paper_flight
+from engine.sim import plan_flight
 from tests.support import towns
 from tests.support.ground import CAMERA, Ground
 from tests.support.paths import NO_SHARED, SHARED
@@ -70,7 +70,7 @@ def shared():
 @pytest.fixture(scope="session")
 def sim_flight():
     """The first 24 frames of the paper's flight over a simulated town."""
-    return paper_flight(1, town=drawn_town(1), frames=24)
+    return plan_flight(1, town=drawn_town(1), frames=24).draw()
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import pytest
 from typer.main import get_command
 
 import engine
+from docs.draw_architecture import drawn, members, picture
 from docs.site_roles import on_page_content
 from engine.cli.app import app
 from engine.formats.track import COLUMNS
@@ -90,6 +91,10 @@ def headings(page):
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
+def test_the_readme_is_short():
+    assert len(read("README.md").split()) <= 700
+
+
 def test_every_page_is_reached_from_the_readme():
     linked = {(ROOT / link).resolve() for link in LINK.findall(read("README.md")) if "://" not in link}
     assert {page.resolve() for page in PAGES} - {ROOT / "README.md"} <= linked
@@ -109,29 +114,48 @@ def test_pages_fit_the_line():
         assert not long, f"{page.name}: {long}"
 
 
+def test_pages_use_the_words_of_the_field():
+    private = r"laid|bank|rungs?|ladder|priced?|told|surer|leans|boastful|watchman|believe[sd]?|beliefs?"
+    for page in PAGES:
+        prose = re.sub(r"`[^`]*`", "", CODE.sub("", page.read_text(encoding="utf-8")))
+        assert re.findall(rf"\b(?:{private})\b", prose, re.IGNORECASE) == [], page.name
+
+
 # ------------------------------------------------------------------------------------------- architecture
 
 
-def rows(name, heading):
-    """Cells of the table below a heading, without its head."""
-    section = read(name).split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+PATH = re.compile(r"`(engine/[\w/]+(?:\.\w+)?)`")
 
 
-def test_floors_are_those_that_import_linter_keeps():
-    contract = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"][0]
-    kept = [{part.strip().removeprefix("engine.") for part in layer.split("|")} for layer in contract["layers"]]
-    told = [set(re.findall(r"`([a-z_0-9]+)`", cells[0])) for cells in rows("docs/architecture.md", "Floors")]
-    assert told == kept
+def test_architecture_is_drawn_from_the_code():
+    """``python docs/draw_architecture.py`` draws it anew."""
+    page = read("docs/architecture.md")
+    assert page == drawn(page)
+    assert read("docs/img/architecture.svg") == picture()
 
 
-def test_every_file_has_its_line_and_every_line_its_file():
-    files = {path.relative_to(ROOT / "engine").as_posix() for path in (ROOT / "engine").rglob("*.py")}
-    files -= {file for file in files if file.endswith("__init__.py") and file != "__init__.py"}
-    told = [cells[0].strip("`") for cells in rows("docs/architecture.md", "Files")]
-    assert sorted(set(told)) == sorted(told)
-    assert set(told) == files
+def test_floors_on_the_page_are_those_that_import_linter_keeps():
+    contracts = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    kept = [{part.strip() for part in re.split(r"[|:]", layer)} for layer in layers]
+    shown = {}
+    for floor, name in re.findall(r"^\| (\d+) \| `(\w+)/?` \|", read("docs/architecture.md"), re.MULTILINE):
+        shown.setdefault(int(floor), set()).add(f"engine.{name}")
+    assert [shown[floor] for floor in sorted(shown, reverse=True)] == kept
+    assert sorted(name for names in kept for name in names) == sorted(f"engine.{name}" for name in members())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_files_that_a_page_names_are_there(page):
+    named = PATH.findall(page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name).exists()] == []
+    assert named or page.name != "architecture.md"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_benchmarks_that_a_page_names_are_there(page):
+    named = re.findall(r"python\s+-m\s+(bench(?:\.\w+)+)", page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name.replace(".", "/")).with_suffix(".py").is_file()] == []
 
 
 # ------------------------------------------------------------------------------------------ lists and values

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine.peaks import best_places, fit_summit
+from engine.peaks import best_positions, fit_summit
 
 
 def greedy(values, separation, count):
@@ -32,7 +32,7 @@ def greedy(values, separation, count):
 def test_best_places_are_taken_one_by_one(seed, size, separation, count):
     values = np.random.default_rng(seed).uniform(-0.9, 0.9, size).astype(np.float32)
     before = values.copy()
-    assert best_places(torch.from_numpy(values), separation, count) == greedy(values, separation, count)
+    assert best_positions(torch.from_numpy(values), separation, count) == greedy(values, separation, count)
     np.testing.assert_array_equal(values, before)
 
 
@@ -45,7 +45,7 @@ def test_best_places_of_a_large_surface_are_those_of_lone_summits(size):
     apart = [p for k, p in enumerate(places) if all(abs(p - q).max() > 40 for q in places[:k])]
     for rank, (y, x) in enumerate(apart):
         values[y, x] = 0.95 - 0.01 * rank
-    found = best_places(torch.from_numpy(values), 5, min(6, len(apart)))
+    found = best_positions(torch.from_numpy(values), 5, min(6, len(apart)))
     assert found == greedy(values, 5, min(6, len(apart)))
     assert [place[:2] for place in found] == [(x, y) for y, x in apart[:6]]
 
@@ -54,7 +54,7 @@ def test_the_highest_place_of_a_large_surface_is_always_the_first():
     for seed in range(5):
         values = np.random.default_rng(seed).uniform(-1.0, 1.0, (520, 517)).astype(np.float32)
         y, x = np.unravel_index(values.argmax(), values.shape)
-        places = best_places(torch.from_numpy(values), 3, 5)
+        places = best_positions(torch.from_numpy(values), 3, 5)
         assert places[0] == (x, y, float(values.max()))
         for k, (u, v, score) in enumerate(places):
             assert score == values[v, u]
@@ -63,7 +63,7 @@ def test_the_highest_place_of_a_large_surface_is_always_the_first():
 
 @pytest.mark.parametrize("size", [(7, 9), (600, 600)])
 def test_places_that_do_not_count_are_no_places(size):
-    assert best_places(torch.full(size, -1.0), 2, 3) == []
+    assert best_positions(torch.full(size, -1.0), 2, 3) == []
 
 
 # Summits

@@ -25,6 +25,7 @@ PUBLIC = [
     "Frame",
     "MapError",
     "MatcherOptions",
+    "MissingExtraError",
     "Navigator",
     "NavigatorOptions",
     "NavigatorState",

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.audit [--quick] [--fit] [--page FILE]
 
-Rewrites what follows the heading "Measured" of docs/audit.md. ``--fit`` fits the rule on grounds of its own, which
+Rewrites docs/audit-measured.md below its marker. ``--fit`` fits the rule on grounds of its own, which
 are not reported on, prints its weights, and writes nothing.
 """
 
@@ -27,7 +27,7 @@ from bench.inputs.scenes import mosaic
 from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.align import view_of
-from engine.audit.availability import Audit, audit_map, features
+from engine.audit.availability import Audit, audit_map, regressors
 from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.sim import build_town
@@ -36,8 +36,8 @@ from engine.values import Attitude, Truth, Window
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-PAGE = DOCS / "audit.md"
-MEASURED = "## Measured\n"
+PAGE = DOCS / "audit-measured.md"
+MEASURED = "<!-- bench.accuracy.audit -->\n"
 WRONG_M = 10.0
 START_SIGMA_M = 15.0
 CAMERA = Camera.from_fov(300, 300, 60.0)
@@ -188,8 +188,8 @@ def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator
     site = ground.site
     found = audit_map(site, CAMERA, height_m, other=ground.other)
     matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
-    evidence = found.evidence
-    at_places = features(evidence.texture, evidence.score, evidence.lead)
+    statistics = found.statistics
+    at_places = regressors(statistics.texture, statistics.score, statistics.lead)
     out: list[Trial] = []
     edge = np.hypot(*found.plan.view.footprint_px) * 2.0**found.plan.level / 2.0 + 2.0
     low, high = np.full(2, edge), np.array([site.width_px, site.height_px]) - edge
@@ -341,15 +341,15 @@ def section(
         "**Places.** Frames of 300 x 300 px and 60 degrees are drawn from the map at random places and headings, "
         f"from {heights} m, and changed: shadows, things that moved, exposure, haze, blur, noise, telemetry a "
         f"little off. NCC matches each with a prior off by {PRIOR_SIGMA_M:g} m (one sigma). A place is right if "
-        f"there is a fix within {WRONG_M:g} m. AUC: how often a place that is right was held in higher esteem "
-        "than one that is not. The rule was fitted on other towns and patchworks by the same generator, and on "
-        "the other half of the farmland in other years."
+        f"there is a fix within {WRONG_M:g} m. AUC: how often a right place was rated higher than a wrong "
+        "one. The rule was fitted on other towns and patchworks by the same generator, and on the other half of "
+        "the farmland in other years."
     )
     columns = ["ground", "frames", "predicted", "measured", "wrong fixes", "AUC", "AUC by height"]
     lines += table(columns, places)
     lines += paragraph(
-        "**Another date.** The farmland again, its frames from years after the map's: next to nothing matches, "
-        "and what an audit of one year predicts is far too much. Of so few right ones the AUC says little."
+        "**Another date.** The farmland again, its frames from years after the map's: almost nothing matches, and "
+        "an audit of one year predicts far too much. With so few right ones the AUC is not significant."
     )
     lines += table(columns, others)
     lines += paragraph(

@@ -161,13 +161,13 @@ def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
     told = f"`height_factor={factor['height_factor']:g}`" if factor else "default options"
     unknown = {"heading_deg": None, "height_agl_m": None}
     return [
-        ("as told", {}, SiftOptions()),
-        ("attitude told, not used", {}, SiftOptions(use_attitude=False)),
+        ("as recorded", {}, SiftOptions()),
+        ("attitude known, not used", {}, SiftOptions(use_attitude=False)),
         ("roll and pitch unknown", {"roll_deg": None, "pitch_deg": None}, SiftOptions()),
         ("heading unknown", {"heading_deg": None}, SiftOptions()),
         ("height unknown", {"height_agl_m": None}, SiftOptions()),
-        (f"height told as half, {told}", {"height_agl_m": 0.5}, wrong),
-        (f"height told as double, {told}", {"height_agl_m": 2.0}, wrong),
+        (f"height given as half, {told}", {"height_agl_m": 0.5}, wrong),
+        (f"height given as double, {told}", {"height_agl_m": 2.0}, wrong),
         ("heading and height unknown", unknown, SiftOptions()),
         ("nothing known but the start", {**unknown, "roll_deg": None, "pitch_deg": None}, SiftOptions()),
     ]

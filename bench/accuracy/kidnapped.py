@@ -28,7 +28,7 @@ from engine.formats.truth import interpolate_truth, read_truth
 from engine.methods.options import NccOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import Motion, SensorNoise, build_town, plan_flight
-from engine.sim.vehicle import measure
+from engine.sim.vehicle import simulate_telemetry
 
 Array = NDArray[np.float64]
 
@@ -57,16 +57,20 @@ def town_site(seed: int) -> OrthoMap:
     return build_town(seed).site()
 
 
-def simulated(seed: int, starts: int, light: str = "noon") -> Flight:
+def simulated(seed: int, starts: int, condition: str = "noon") -> Flight:
     """Runs over a town: any place, heading and height from which the map holds most of the frame."""
-    plan, site, rng = plan_flight(seed, frames=1, light=light), town_site(seed), np.random.default_rng(seed)
+    plan, site, rng = (
+        plan_flight(seed, frames=1, condition=condition),
+        town_site(seed),
+        np.random.default_rng(seed),
+    )
     motion = wander(site, starts, rng)
     stamps = tuple((START_NS + np.rint(motion.time_s * 1e9).astype(np.int64)).tolist())
-    told = measure(motion, SensorNoise(), rng)
+    told = simulate_telemetry(motion, SensorNoise(), rng)
     frames = [blind(f) for f in replace(plan, truth=motion, telemetry=told, timestamps_ns=stamps).iter_frames()]
     seen = list(zip(frames, motion.position_m[:, :2], strict=True))
     return Flight(
-        f"town {seed}, {light}", site, plan.camera, [seen[k : k + FRAMES] for k in range(0, len(seen), FRAMES)]
+        f"town {seed}, {condition}", site, plan.camera, [seen[k : k + FRAMES] for k in range(0, len(seen), FRAMES)]
     )
 
 

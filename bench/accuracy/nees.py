@@ -4,7 +4,7 @@
 
 Frames are matched one by one, each with a prior that is 4 m off per axis and says 8 m. What maps and truths are
 known to be off is stated (:data:`RECORDED`) and not fitted to the NEES; the simulated worlds are exact. Writes the
-table into docs/integrity.md and its chart beside it.
+table into docs/integrity-measured.md and its chart beside it.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Sample:
 
 def town(seed: int, light: str = "noon") -> Flight:
     """A flight over a simulated town, whose map is of noon and says that it is exact."""
-    plan = plan_flight(seed, rate_hz=0.45, light=light)
+    plan = plan_flight(seed, rate_hz=0.45, condition=light)
     site = plan.town.site()
     frames, truth = list(plan.iter_frames()), plan.truth_rows()
     places = [site.frame.enu_from_geodetic(t.lat_deg, t.lon_deg) for t in truth]
@@ -299,7 +299,7 @@ def main() -> None:
     rows = measure(options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())])
     if options.flights is not None:
         return
-    page = options.docs / "integrity.md"
+    page = options.docs / "integrity-measured.md"
     before, rest = page.read_text(encoding="utf-8").split(BEGIN)
     page.write_text(before + section(rows) + rest.split(END)[1], encoding="utf-8")
     chart(rows).savefig(options.docs / "img" / "integrity-nees.png", dpi=130, facecolor="white")

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.relief [--quick] [--docs DIR]
 
-Writes the table of docs/simulator.md, section "Hills", between its markers.
+Writes the table of docs/simulator-measured.md, section "Hills", between its markers.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def lines(runs: list[Run]) -> list[str]:
 
 def write(docs: Path, runs: list[Run]) -> None:
     """Put the table between the page's markers."""
-    page = docs / "simulator.md"
+    page = docs / "simulator-measured.md"
     head, rest = page.read_text(encoding="utf-8").split(BEGIN)
     tail = rest.split(END)[1]
     body = [BEGIN, "", *lines(runs), f"Measured with {machine()}.", "", END]

@@ -79,7 +79,7 @@ class Trial:
 
 def simulated(light: str) -> Iterator[Flight]:
     for seed in SEEDS:
-        plan = plan_flight(seed, rate_hz=0.28, light=light)
+        plan = plan_flight(seed, rate_hz=0.28, condition=light)
         site = plan.town.site()
         places = [(row.lat_deg, row.lon_deg) for row in plan.truth_rows()]
         yield Flight(f"{seed}", site, plan.camera, list(zip(plan.iter_frames(), places, strict=True)))
@@ -238,27 +238,27 @@ def measure(data: Path) -> list[list[str]]:
 
 PAGE = f"""# Scores: what is correlated
 
-`NccOptions.score` says what goes into the zero-mean NCC. `engine.align.enhance` computes it from the grey levels,
-once for the map and once for each frame, alike; matching itself does not change, and nodata takes no part.
+`NccOptions.score` selects the input of the zero-mean NCC. `engine.align.enhance` computes it from the grey levels,
+in the same way for the map and for each frame; matching itself does not change, and nodata is left out.
 
 | score | what it is | when |
 |---|---|---|
 | `"grey"` | the grey levels, smoothed by 1-2-1 | map and frames of the same day and light |
-| `"local"` | less their neighbourhood's mean, over its deviation | the default: light, haze, sensors differ |
-| `"gradient"` | the same of the gradient's magnitude | another season turns tones round; wants sharp pictures |
+| `"local"` | minus their neighbourhood's mean, over its deviation | the default: light, haze, sensors differ |
+| `"gradient"` | the same of the gradient's magnitude | another season inverts tones; needs sharp pictures |
 | `"mixed"` | the sum of local and gradient | fields and crops of another season or year; takes the time of both |
 
-`NccOptions.enhance_radius_px` is the neighbourhood of the last three. Plain NCC, without means taken off, is
+`NccOptions.enhance_radius_px` is the neighbourhood of the last three. NCC without mean subtraction is
 equation 1 of the paper: `ncc(search, templates, zero_mean=False)` and `profile="paper"`.
 
 ## Measured
 
 One thread, every place of the window scored; height, heading and tilt from the telemetry, the prior up to
 {PRIOR_OFF_M:.0f} m off per axis. Lead is the median distance of the peak from its rival in sigmas of the score
-([integrity](integrity.md)), negative where the peak is at a wrong place.
+([integrity](integrity.md)), negative where the peak is at a wrong position.
 
 - Flights (frames): **fixes, wrong ones** by more than {WRONG_M:.0f} m, **RMS of the others, lead**.
-- Map of another town (frames): **places believed**, all wrong; the **lead that 95 % of the peaks stay below**.
+- Map of another town (frames): **positions accepted**, all wrong; the **95th percentile of the lead**.
 - Years of farmland (patches), one year on the map of another, {SEASON_PX} x {SEASON_PX} px of 5 m, searched
   {SEASON_REACH_PX} px to each side: **found within {SEASON_WITHIN_PX:.0f} px, the same of the worst pair, lead**.
 - Rows that say "fitted on" chose the scores and their settings; the others only judge them.

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.simulated [--quick] [--sheet] [--docs DIR]
 
-Writes the tables of docs/simulator.md, between its markers; --sheet draws docs/img/sim-conditions.png instead.
+Writes the tables of docs/simulator-measured.md; --sheet draws docs/img/sim-conditions.png instead.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def lines(runs: list[Run], ways: tuple[tuple[str, str], ...]) -> list[str]:
 
 def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
     """Put the tables between the page's markers."""
-    page = docs / "simulator.md"
+    page = docs / "simulator-measured.md"
     head, rest = page.read_text(encoding="utf-8").split(BEGIN)
     tail = rest.split(END)[1]
     body = [BEGIN, "", *lines(runs, WAYS)]

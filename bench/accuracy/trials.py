@@ -138,7 +138,7 @@ def ground(name: int | str, *, map_only: bool = False) -> Ground:
 
 
 def _town(seed: int, map_only: bool) -> Ground:
-    lights = {light: plan_flight(seed, rate_hz=0.56, light=light) for light in ("noon", "evening")}
+    lights = {light: plan_flight(seed, rate_hz=0.56, condition=light) for light in ("noon", "evening")}
     plan = lights["noon"]
     site = plan.town.site()
     noon, evening = (

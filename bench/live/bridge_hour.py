@@ -28,15 +28,15 @@ from engine.adapters.vehicle import Origin
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 
-PAGE = DOCS / "mavlink.md"
+PAGE = DOCS / "mavlink-measured.md"
 BEGIN, END = "<!-- written by bench.live.bridge_hour -->", "<!-- end of what bench.live.bridge_hour writes -->"
 HOUR = (
     "`python -m bench.live.bridge_hour` flies the bridge beside a stand-in autopilot (pymavlink, UDP on loopback, "
     "a link that takes 4 to 25 ms). The hour is on a virtual clock that waits for the bridge, and its matcher "
     "is a script that knows the truth and takes no time; link, threads, decoder, telemetry, gates and "
-    "messages are the real ones. The script has the vehicle start again with its clock at nought and without "
-    "an origin, fall silent twice and come back once from another port; it floods the port, makes a navigator "
-    "crash, covers the camera, makes fixes too uncertain, and refuses every 50th frame."
+    "messages are the real ones. The script restarts the vehicle with its clock at zero and without "
+    "an origin, silences it twice and moves it once to another port; it floods the port, crashes a navigator, "
+    "covers the camera, makes fixes too uncertain, and refuses every 50th frame."
 )
 PLACE = LocalFrame(33.64, 72.99)
 CAMERA_MS = (45.0, 95.0)  # from exposure to the answer: the scripted matcher takes no time of its own
@@ -317,7 +317,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of the hour at speed")
     parser.add_argument("--real-minutes", type=float, default=3.0)
     parser.add_argument("--method", default="auto")
-    parser.add_argument("--write", action="store_true", help="into docs/mavlink.md")
+    parser.add_argument("--write", action="store_true", help="into docs/mavlink-measured.md")
     told = parser.parse_args()
     flown = hour(told.minutes)
     print(

@@ -28,10 +28,10 @@ INTRO = (
     "flown, as the headings say, so that predictions reach further than in a real flight."
 )
 METHODS = (
-    "`scenematch SIFT` weighs the telemetry's heading, roll and pitch in its pose, where they are there; the "
-    "second row does not. `OpenCV features, scenematch pose` takes keypoints, descriptors and the brute-force "
+    "`scenematch SIFT` uses the telemetry's heading, roll and pitch in its pose, where present; the second row "
+    "does not. `OpenCV features, scenematch pose` takes keypoints, descriptors and the brute-force "
     "matcher of OpenCV in the windows of equations 4 and 5, and the same PnP; both describe the map once. "
-    "`paper's SIFT` is the paper's recipe taken literally; it refuses next to nothing."
+    "`paper's SIFT` is the paper's recipe taken literally; it refuses almost nothing."
 )
 FIGURES = (
     "RMS and median are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **false** those "
@@ -41,9 +41,9 @@ FIGURES = (
     "scored."
 )
 VARIANTS = (
-    "The built-in flight once more, by `scenematch SIFT`, told less or told wrong. The attitude's error is the "
-    "angle of the whole rotation. A frame without height takes that of the last fix; without one, the whole map "
-    "is searched."
+    "The built-in flight once more, by `scenematch SIFT`, with telemetry that is incomplete or wrong. The "
+    "attitude's error is the angle of the whole rotation. A frame without height takes that of the last fix; "
+    "without one, the whole map is searched."
 )
 
 
@@ -82,7 +82,7 @@ def write(docs: Path, runs: list[Run], variants: list[Run]) -> None:
         lines += [f"## {TITLES.get(flight, flight)} ({own[0].summary['frames']} frames, {every})", ""]
         lines += _table(own, "who")
     lines += [
-        "## Built-in flight, told less or told wrong",
+        "## Built-in flight, telemetry incomplete or wrong",
         "",
         *paragraph(VARIANTS),
         *_table(variants, "telemetry"),

@@ -1,4 +1,4 @@
-"""Tables and charts of the benchmark of integrity, written into docs/integrity.md."""
+"""Tables and charts of the benchmark of integrity, written into docs/integrity-measured.md."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 
 def write(rows: list[Row], docs: Path) -> None:
     """The section between the markers, and its pictures."""
-    page = docs / "integrity.md"
+    page = docs / "integrity-measured.md"
     text = page.read_text(encoding="utf-8")
     begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     page.write_text(f"{text[:begin]}\n\n{section(rows)}\n{text[end:]}", encoding="utf-8")
@@ -42,15 +42,15 @@ def section(rows: list[Row]) -> str:
         f"{len(rows):,} matches over {', '.join(grounds)}; half of them have an answer; no constant was fitted "
         f"on these grounds. **{wrong} wrong fixes**: more than {WRONG_M:g} m and {FALSE_SIGMAS:g} sigmas off; on "
         "another map and of a mirrored frame every fix is wrong. Availability is the share of the answerable "
-        "matches that got a right fix; heading or height off by five times what is assumed of them is no suitable "
-        "match and listed apart, but its wrong fixes count. NEES (2 is honest, less is cautious) and the share "
-        "inside the 95 % ellipse are of the suitable fixes that are right."
+        "matches that got a right fix; heading or height off by five times their assumed error is no suitable "
+        "match and listed apart, but its wrong fixes count. NEES (2 is consistent, less is cautious) and the "
+        "share inside the 95 % ellipse are of the suitable fixes that are right."
     )
     lines += table(["method", "matches", "availability", "wrong", "NEES", "in 95 %", "ECE"], _by_method(rows))
     lines += paragraph(
-        "What another threshold would have let through of these fixes, by the probability that each states; each "
-        "cell: availability, wrong fixes. SIFT's own threshold stays. Refusals are not matched again: where "
-        "`auto` would have lost NCC's fix it is counted as lost, though SIFT might have had one."
+        "What other thresholds of the stated probability would have accepted of these fixes; each cell: "
+        "availability, wrong fixes. SIFT's own threshold stays. Refusals are not matched again: where `auto` "
+        "would have lost NCC's fix it is counted as lost, though SIFT might have had one."
     )
     lines += table(["`confidence` of at least", *METHODS, "all wrong"], _by_threshold(rows))
     lines += paragraph("By kind; each cell: matches, share that got a fix, wrong fixes.")
@@ -58,10 +58,10 @@ def section(rows: list[Row]) -> str:
     lines += paragraph("By ground; each cell: availability, wrong fixes of all matches, NEES, inside the ellipse.")
     lines += table(["ground", *METHODS], _crossed(rows, grounds, lambda row: row.ground, _honest))
     lines += paragraph(
-        "One score alone against the probability; where a peak was held against its patch upside down, that rival "
-        "is in the second peak too. Which share of the wrong places that were found it lets through "
-        f"where its threshold keeps {100 * TPR:g} % of the right ones, and how many wrong ones it believes in "
-        f"100,000 matches where it believes {100 * COVERAGE:g} % of the suitable ones."
+        "One score alone compared with the probability. Where a peak was tested against its null-hypothesis "
+        "template, that rival is in the second peak too. FPR: the share of wrong positions accepted where the "
+        f"threshold keeps {100 * TPR:g} % of the right ones. The last column: wrong ones accepted in 100,000 "
+        f"matches where {100 * COVERAGE:g} % of the suitable ones are accepted."
     )
     lines += table(
         ["method", "score", "right, wrong found", "FPR at 95 % TPR", "AUC", "wrong in 100,000 at 75 %"],

@@ -25,8 +25,8 @@ INTRO = (
 )
 BUDGETS = (
     f"**On time** is the share of frames answered, by a fix or a refusal, within the budget and {GRACE_MS:g} ms."
-    " A miss is put down to what it would have to be without to be on time: *preempted* and *held or waiting*, "
-    "the thread was off its core for so long (with and without the kernel counting that another took it); "
+    " A miss is attributed to the cause without which the frame would have been on time: *preempted* and *held or "
+    "waiting*, the thread was off its core for that long (with and without a preemption counted by the kernel); "
     "*garbage collector*; else the *stage* that ran when the budget ended. **Fixed** is the share with a fix, "
     "**false** are fixes more than 10 m and 3 of their own sigmas off, **stale** those that carry another "
     "frame's stamp. Stages are those that the fixes came from."
@@ -34,10 +34,9 @@ BUDGETS = (
 HOGS = "Beside processes that burn a core each."
 SLOW = (
     "The process is warmed up at full speed and then stopped and continued by signals, 50 times a second: it "
-    "becomes four and ten times slower in flight, and what it learned of its costs is wrong. Nothing answers "
-    "while it is stopped, so that a stop is time that no planning can save; **but for a stop** allows for one, "
-    "and **on core** counts the thread's own time against the budget. *Share got* is what it really had of a "
-    "core."
+    "becomes four and ten times slower in flight, and the costs that it learned are wrong. Nothing answers while "
+    "it is stopped, which no scheduling can avoid; **but for a stop** allows for one stop, and **on core** counts "
+    "the thread's own time against the budget. *Share got* is the measured share of a core."
 )
 QUEUE = (
     "`Live`, auto, deadline {deadline:g} ms, fed at so many times the rate that it takes ({frame:.1f} ms a "
@@ -47,7 +46,7 @@ QUEUE = (
 SOAK = (
     "`ncc` and `sift` with a budget of 40 ms; `auto` is all of its frames above, its times those at 121 ms. "
     "Growth of the resident memory is the slope of a line through all samples after the first tenth; open files"
-    " and threads are those at the first and at the last frame. One-off work is what is planned, compiled or "
+    " and threads are those at the first and at the last frame. Cache growth is what is planned, compiled or "
     "prepared for the first time: after the warm-up there should be none."
 )
 CURVE = "Every budget flies the same frames. What RMS leaves out, refused frames, is in the middle picture."
@@ -186,7 +185,7 @@ def _queue(rows: list[Row]) -> list[str]:
 
 def _soak_table(rows: list[Row]) -> list[str]:
     columns = ["method", "frames", "window sizes", "growth MB per 10,000 frames", "open files", "threads"]
-    columns += ["one-off work", "p99 ms, first tenth", "last tenth", "max ms", "fixed", "false"]
+    columns += ["cache growth", "p99 ms, first tenth", "last tenth", "max ms", "fixed", "false"]
     cells = [
         [
             row["who"],

@@ -35,8 +35,8 @@ CONDITIONS = (
     "All have the same pictures, at most 300 keypoints (OpenCV and COLMAP count each orientation as one), and "
     "their own defaults otherwise. With contrast 0.02 OpenCV keeps weak keypoints, as `scenematch` does. Its "
     "positions have a bias of 0.25 px, which a turn turns into an error. COLMAP keeps its coarsest keypoints, "
-    "OpenCV and `scenematch` those of highest contrast. `upright` is told the turn between the pictures, as a "
-    "heading tells it. Ground that roofs hide from a frame counts as common."
+    "OpenCV and `scenematch` those of highest contrast. `upright` gets the rotation between the pictures, as from "
+    "a heading. Ground that roofs hide from a frame counts as common."
 )
 STEP = (
     "The paper's case on the built-in flight: half scale, the window of equations 4 and 5, a prior a few metres "

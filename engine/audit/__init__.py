@@ -1,1 +1,1 @@
-"""Audit of a map: where on it, and along a route, matching can be trusted."""
+"""Audit of a map: where on it, and along a route, fixes are available."""

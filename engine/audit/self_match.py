@@ -1,7 +1,7 @@
-"""Self-match: what the map itself says of places on it, by correlating it with its own changed patches.
+"""Self-match: statistics of a map by correlating it with patches of its own that were changed.
 
-At places all over the map the patch that the camera would see is cut out, changed by noise, other ground and small
-errors of the telemetry, and correlated with the window that a prior allows.
+At every audited cell the patch that the camera would see is changed by noise, other ground and small errors of the
+telemetry, and correlated with the window that a prior allows.
 """
 
 from __future__ import annotations
@@ -30,28 +30,31 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Pictures = NDArray[np.float32]
 
-# The change that a patch goes through, the same at every place.
+# The change of a patch, the same at every cell.
 _DRAWS = 2
-_TURN_DEG, _GROWTH, _SHIFT_PX = 1.0, 1.01, 0.4  # what telemetry and level leave over
+_TURN_DEG, _SCALE, _SHIFT_PX = 1.0, 1.01, 0.4  # residual errors of telemetry and level
 _NOISE_SD = 3.0  # grey levels, of the sensor
-_CHANGE, _CHANGE_PX = 1.0, 2.0  # other ground: deviations of the enhanced picture, and its size
-_SHAKE_PX, _SHAKE_BLUR_PX = 2.0, 1.0  # how far the edges move, and a blur: a change that only fine texture minds
-_NEAR_PX = 3  # the changed patch is at its place if it is within so many pixels
+_CHANGE, _CHANGE_PX = 1.0, 2.0  # other ground: standard deviations of the enhanced picture, and grain
+_SHAKE_PX, _SHAKE_BLUR_PX = (
+    2.0,
+    1.0,
+)  # shift at the edges, and a blur: a change that only fine texture is sensitive to
+_NEAR_PX = 3  # largest shift at which a changed patch counts as matched at its own position
 
 
 @dataclass(frozen=True, slots=True)
 class SelfMatchStatistics:
-    """What is measured at places (...,); NaN where the map has no data for it.
+    """Statistics of cells (...,); NaN where the map has no data.
 
     Attributes:
         texture: deviation of the grey levels from their neighbourhood's mean.
-        rival: highest NCC of the unchanged patch elsewhere in its window.
-        stability: NCC of the patch with itself, blurred, turned and grown a little.
+        rival: highest NCC of the unchanged patch outside its exclusion zone.
+        stability: NCC of the patch with itself, blurred, rotated and scaled a little.
         sharpness: curvature of the unchanged peak along its flattest direction, per square pixel.
-        score: NCC of the changed patch at its own place, in sigmas.
-        lead: how far that is above its best rival, in sigmas.
-        other_score: the same of a patch of another date's map, unchanged; NaN without one.
-        other_lead: the same.
+        score: NCC of the changed patch at its own position, in sigmas.
+        lead: that less its best rival, in sigmas.
+        other_score: ``score`` of a patch of another date's map, unchanged; NaN without one.
+        other_lead: ``lead`` of the same.
     """
 
     texture: Array
@@ -67,14 +70,14 @@ class SelfMatchStatistics:
 # ------------------------------------------------------------------------------------------------- measuring
 
 
-def measure(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
-    """The evidence at each place that is looked at, row by row; the map is read as the places need it."""
+def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
+    """Yield the statistics of each audited cell, row by row; the map is read on demand."""
     options = plan.options.ncc
     prepared = PreparedMap(plan.site, torch.device("cpu"), options.enhance_radius_px, options.score)
     noise = _noise(plan.shape)
     with torch.inference_mode():
-        for place in plan.places_px[plan.looked]:
-            yield _measure(plan, prepared, noise, place)
+        for center_px in plan.centers_px[plan.audited]:
+            yield _measure(plan, prepared, noise, center_px)
 
 
 def _noise(shape: tuple[int, int]) -> Pictures:
@@ -87,19 +90,19 @@ def _noise(shape: tuple[int, int]) -> Pictures:
     return noise
 
 
-def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, place_px: Array) -> SelfMatchStatistics:
+def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px: Array) -> SelfMatchStatistics:
     site, level, (height, width) = plan.site, plan.level, plan.shape
-    middle = site.level_from_full(place_px, level)
-    x0, y0 = plan.corner_px(place_px)
+    middle = site.level_from_full(center_px, level)
+    x0, y0 = plan.corner_px(center_px)
     nothing = SelfMatchStatistics(*[np.array(np.nan)] * len(fields(SelfMatchStatistics)))
-    if not plan.holds(place_px):
+    if not plan.contains(center_px):
         return nothing
-    lies = Window(x0, y0, width, height)
-    if not site.fully_valid and site.valid(lies, level).mean() < plan.options.ncc.min_valid_share:
+    extent = Window(x0, y0, width, height)
+    if not site.fully_valid and site.valid(extent, level).mean() < plan.options.ncc.min_valid_share:
         return nothing
-    gray = site.gray(lies, level)
-    other = None if plan.other is None else _seen_on(plan.other, plan, lies)
-    # Nodata is 0 once enhanced: rivals there are weak, as they are to the masked NCC that a flight uses.
+    gray = site.gray(extent, level)
+    other = None if plan.other is None else _seen_on(plan.other, plan, extent)
+    # Nodata is 0 once enhanced: rivals there are weak, as with the masked NCC that a flight uses.
     region = prepared.cut(_window(plan, middle), level)
     templates = torch.from_numpy(_templates(gray, noise, plan.options.ncc, other))
     scores = surface(region.search, templates).numpy()
@@ -121,14 +124,14 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, place_px: 
 
 
 def _window(plan: AuditPlan, middle_px: Array) -> Window:
-    """The adaptive window about a place (eq. 4, 5) with the slack that the prior asks for; pixels of the level."""
+    """The adaptive window (eq. 4, 5) with the slack of the prior, in pixels of the level."""
     site, level, (height, width) = plan.site, plan.level, plan.shape
     rows, columns = site.level_shape(level)
     slack = 2.0 * SPREAD_SIGMAS * plan.options.prior_sigma_m / (site.gsd_m_per_px * 2.0**level)
     size = window_size_px(plan.view.footprint_px, (0.0, 0.0), margin=plan.options.ncc.margin)
     size = (max(size[0], width + 4 + slack), max(size[1], height + 4 + slack))
     window = place_window((float(middle_px[0]), float(middle_px[1])), size, (columns, rows))
-    assert window is not None  # the place is on the map
+    assert window is not None  # the cell is on the map
     return window
 
 
@@ -139,10 +142,10 @@ def _templates(gray: Gray, noise: Pictures, options: NccOptions, other: Gray | N
         return enhance(picture, radius_px=options.enhance_radius_px, score=options.score)
 
     part = _SHAKE_PX / (max(gray.shape) / 2.0)
-    shaken = cv2.GaussianBlur(_turned(gray, math.degrees(part), 1.0 + part, 0.0), (0, 0), _SHAKE_BLUR_PX)
+    shaken = cv2.GaussianBlur(_perturbed(gray, math.degrees(part), 1.0 + part, 0.0), (0, 0), _SHAKE_BLUR_PX)
     templates = [enhanced(gray), enhanced(np.asarray(shaken, np.uint8))]
     for sign, (sensor, ground) in zip((1.0, -1.0), noise, strict=True):
-        turned = _turned(gray, sign * _TURN_DEG, _GROWTH**sign, sign * _SHIFT_PX)
+        turned = _perturbed(gray, sign * _TURN_DEG, _SCALE**sign, sign * _SHIFT_PX)
         seen = np.clip(turned + sensor, 0.0, 255.0).astype(np.uint8)
         templates.append(enhanced(seen) + _CHANGE * ground)
     if other is not None:
@@ -150,10 +153,10 @@ def _templates(gray: Gray, noise: Pictures, options: NccOptions, other: Gray | N
     return np.stack(templates)
 
 
-def _turned(gray: Gray, angle_deg: float, growth: float, shift_px: float) -> Gray:
-    """The picture turned and grown about its middle, and moved along its diagonal."""
+def _perturbed(gray: Gray, angle_deg: float, scale: float, shift_px: float) -> Gray:
+    """The picture rotated and scaled about its middle, and moved along its diagonal."""
     height, width = gray.shape
-    matrix = cv2.getRotationMatrix2D(((width - 1) / 2.0, (height - 1) / 2.0), angle_deg, growth)
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2.0, (height - 1) / 2.0), angle_deg, scale)
     matrix[:, 2] += shift_px
     return np.asarray(cv2.warpAffine(gray, matrix, (width, height), borderMode=cv2.BORDER_REFLECT_101), np.uint8)
 
@@ -164,7 +167,7 @@ def _texture(gray: Gray) -> float:
 
 
 def _own_and_rivals(scores: Pictures, x: int, y: int, exclusion_px: float) -> tuple[Array, Array]:
-    """The highest score (T,) at a place, and outside its exclusion zone (-1 where nothing lies outside)."""
+    """The highest score (T,) at a position, and outside its exclusion zone (-1 where nothing is outside)."""
     near = scores[:, max(0, y - _NEAR_PX) : y + _NEAR_PX + 1, max(0, x - _NEAR_PX) : x + _NEAR_PX + 1]
     down, across = np.ogrid[-y : scores.shape[1] - y, -x : scores.shape[2] - x]
     outside = down * down + across * across > max(exclusion_px, _NEAR_PX) ** 2
@@ -173,7 +176,7 @@ def _own_and_rivals(scores: Pictures, x: int, y: int, exclusion_px: float) -> tu
 
 
 def _sharpness(scores: Pictures, x: int, y: int) -> float:
-    """How fast the score falls along the flattest direction; 0 at the edge of the surface."""
+    """Curvature of the score along the flattest direction, negated; 0 at the edge of the surface."""
     r = min(2, x, y, scores.shape[1] - 1 - x, scores.shape[0] - 1 - y)
     if r <= 0:
         return 0.0
@@ -181,11 +184,11 @@ def _sharpness(scores: Pictures, x: int, y: int) -> float:
     return max(0.0, float(-np.linalg.eigvalsh(curvature)[-1]))
 
 
-def _seen_on(other: OrthoMap, plan: AuditPlan, lies: Window) -> Gray | None:
-    """The same ground (h, w) on another map, or None where that has none of it."""
+def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:
+    """The same ground (h, w) on another map, or None where that does not cover it."""
     (height, width), scale = plan.shape, 2.0**plan.level
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
-    full = plan.site.full_from_level(corners + np.array([lies.x0, lies.y0]), plan.level)
+    full = plan.site.full_from_level(corners + np.array([extent.x0, extent.y0]), plan.level)
     there = other.pixel_from_geodetic(*plan.site.geodetic_from_pixel(full))
     level = level_for(other.gsd_m_per_px, plan.site.gsd_m_per_px * scale, other.levels)
     there = other.level_from_full(there, level)

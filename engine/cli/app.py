@@ -99,7 +99,7 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        print(version("scenematch"))
+        print(version("scenematch-engine"))
         raise typer.Exit
 
 

@@ -1,7 +1,7 @@
-"""Arrays kept in a file for the next time, under a name that stands for what they were made of.
+"""Cache of named arrays on disk, one file per key; the key is a hash of what the arrays were computed from.
 
-They are never believed unseen: a file that cannot be read, was made of something else, or holds other arrays than
-are asked for counts as missing. A folder that cannot be written is no error; everything is then made anew.
+Files are validated: one that cannot be read, has another key, or holds other arrays than requested counts as
+missing. A folder that cannot be written is no error; the arrays are then computed again.
 """
 
 from __future__ import annotations
@@ -19,13 +19,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Arrays = dict[str, NDArray[Any]]
+NamedArrays = dict[str, NDArray[Any]]
 Kinds = Mapping[str, tuple[type[Any], tuple[int, ...]]]
 """Element type of each array, and the shape of one of its N elements."""
 
 
 def cache_key(settings: object, content: Iterable[NDArray[Any]]) -> str:
-    """SHA-256 of settings (by their ``repr``) and of arrays with their shapes and element types."""
+    """SHA-256 of settings and arrays.
+
+    Args:
+        settings: hashed by their ``repr``.
+        content: arrays of any shape, hashed with their shapes and element types.
+
+    Returns:
+        str: 64 hexadecimal digits.
+    """
     digest = hashlib.sha256(repr(settings).encode())
     for array in content:
         digest.update(f"{array.shape} {array.dtype}".encode())
@@ -34,13 +42,21 @@ def cache_key(settings: object, content: Iterable[NDArray[Any]]) -> str:
 
 
 def cache_path(key: str) -> Path:
-    """Where arrays of this key are kept: ``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``."""
+    """The cache file of a key, in ``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``."""
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(folder) / "scenematch" / f"{key}.npz"
 
 
-def load_arrays(key: str, kinds: Kinds) -> Arrays | None:
-    """The arrays of a key, each (N, ...) with one N and finite, or None where there are none to be believed."""
+def load_arrays(key: str, kinds: Kinds) -> NamedArrays | None:
+    """The cached arrays of a key.
+
+    Args:
+        key: from :func:`cache_key`.
+        kinds: names, element types and shapes that are expected.
+
+    Returns:
+        Arrays (N, ...) with a common N and finite values; None where the file is missing or not valid.
+    """
     try:
         with cache_path(key).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             if str(file["key"]) != key:
@@ -56,8 +72,13 @@ def load_arrays(key: str, kinds: Kinds) -> Arrays | None:
     return arrays
 
 
-def save_arrays(key: str, arrays: Arrays) -> None:
-    """Keep arrays: written beside their place and moved there in one step. Where that fails, nothing is kept."""
+def save_arrays(key: str, arrays: NamedArrays) -> None:
+    """Cache arrays; the file is written under a temporary name and renamed. A failure to write is ignored.
+
+    Args:
+        key: from :func:`cache_key`.
+        arrays: (N, ...) each, by name.
+    """
     path = cache_path(key)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""The map's features, found once: places in 3D with their descriptors, looked up by window.
+"""The map's features, detected once: 3D points with their descriptors, looked up by window.
 
-A level of the map is described tile by tile as the flight touches it, or all at once before the flight
-(:meth:`LandmarkMap.prepare`), and then kept in a file for the next one. A tile is described with the neighbourhood
-that the map has beyond it, so that tiles join as if the level had been described in one piece.
+A level of the map is described tile by tile as the flight reaches it, or all at once before the flight
+(:meth:`LandmarkMap.prepare`), and then cached in a file. A tile is described with the neighbourhood beyond its
+edges, so that the tiles together equal the level described in one piece.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ import torch
 from numpy.typing import NDArray
 
 from engine.features import Features, sift
-from engine.indexes.landmark_cache import Arrays, Kinds, cache_key, load_arrays, save_arrays
+from engine.indexes.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.orthomap import OrthoMap
 from engine.values import Window
 
 Array = NDArray[np.float64]
 
 DETECTOR_VERSION = 2
-"""Part of the key of stored landmarks; to be raised with every change of what is detected and how described."""
+"""Part of the key of cached landmarks; to be raised with every change of detector or descriptor."""
 TILE_PX = 256
 """Tiles begin on multiples of this in every level."""
 HALO_PX = 64
-"""How far beyond its edges a tile is seen; the descriptor of nearly every keypoint ends there."""
+"""Margin around a tile that is read for detection; the descriptor of nearly every keypoint ends within it."""
 CELL_PX = 64
 """Landmarks are ranked by strength within square cells of the level."""
 MAX_PER_CELL = 96
 PREPARED_PX = 16 << 20
-"""Levels are prepared at once, and searched as a whole, up to this many pixels."""
+"""Largest number of pixels of the levels that are prepared at once, and of a level that is searched as a whole."""
 MAX_LANDMARKS = 1 << 19
-"""Landmarks kept in memory, besides those of the window that was asked for last; one takes 300 bytes.
+"""Landmarks cached in memory, besides those of the last window; one takes 300 bytes.
 
-Where more were prepared before the flight as many as that are kept, up to 236 MB of them.
+Where more were prepared before the flight the limit is raised to their number, up to 236 MB.
 """
 _SLOTS = 8192  # more than the detector finds in a tile
 _STORED: Kinds = {
@@ -53,8 +53,8 @@ class Landmarks:
     """Features of a part of the map.
 
     Attributes:
-        features: (1, N) in pixels of the level, on the device.
-        points_m: (N, 3) east, north and the height of the surface there.
+        features: batch of one, N slots, in pixels of the level, on the device.
+        points_m: (N, 3) east, north and height of the surface.
     """
 
     features: Features
@@ -65,17 +65,17 @@ _Key = tuple[int, bool, int, int]  # level, upright, row and column of the tile
 
 
 class LandmarkMap:
-    """The landmarks of one map.
+    """Cache of the landmarks of one map.
 
     Args:
         site: the map.
-        device: where features are found and handed out; kept they are in the processor's memory.
+        device: of detection and of the returned features; the cache is in the CPU's memory.
     """
 
     def __init__(self, site: OrthoMap, device: torch.device) -> None:
         self._site, self._device = site, device
-        self._tiles: dict[_Key, Arrays] = {}  # the one used last comes last
-        self._most = MAX_LANDMARKS
+        self._tiles: dict[_Key, NamedArrays] = {}  # the most recently used is last
+        self._max_landmarks = MAX_LANDMARKS
         self.created = 0
         """Tiles described so far."""
 
@@ -86,26 +86,29 @@ class LandmarkMap:
             window: in pixels of the level, inside it.
             level: of the map's pyramid.
             upright: every angle is 0, along the map's x axis, instead of the dominant gradient's.
-            per_px: landmarks per pixel at most, in each cell the strongest.
+            per_px: upper bound on landmarks per pixel; each cell keeps its strongest.
+
+        Returns:
+            Landmarks: those whose keypoint is inside the window.
         """
         keys = _keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
         self._evict(keep=len(keys))
         low = np.array([window.x0, window.y0]) - 0.5
         high = low + np.array([window.width_px, window.height_px])
-        most = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
+        max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         parts = []
         for tile in tiles:
             xy = tile["xy_px"]
-            inside = ((xy >= low) & (xy < high)).all(axis=1) & (tile["rank"] < most)
+            inside = ((xy >= low) & (xy < high)).all(axis=1) & (tile["rank"] < max_rank)
             parts.append({name: values[inside] for name, values in tile.items()})
-        return self._handed_out(_joined(parts))
+        return self._to_landmarks(_concatenated(parts))
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
-        """Describe whole levels, upright and not, and keep them in a file where the map comes from one.
+        """Describe whole levels, upright and not, and cache them in a file where the map comes from one.
 
         Args:
-            levels: which, in this order, as far as :data:`PREPARED_PX` goes; None takes all, the coarsest first.
+            levels: in order of preference, up to :data:`PREPARED_PX` in all; None takes all, the coarsest first.
         """
         pixels = 0
         for level in reversed(range(self._site.levels)) if levels is None else levels:
@@ -114,8 +117,8 @@ class LandmarkMap:
                 break
             for upright in (True, False):
                 self._prepare(level, upright)
-        # Memory for what is there, and no more: a large map, of which little is prepared, keeps to its bound.
-        self._most = max(self._most, sum(len(tile["rank"]) for tile in self._tiles.values()))
+        # No more than what is prepared now: a large map, of which little is prepared, keeps the usual limit.
+        self._max_landmarks = max(self._max_landmarks, sum(len(tile["rank"]) for tile in self._tiles.values()))
 
     def _prepare(self, level: int, upright: bool) -> None:
         rows, columns = self._site.level_shape(level)
@@ -131,36 +134,36 @@ class LandmarkMap:
         name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
         stored = load_arrays(name, _STORED)
         if stored is None:
-            found = _joined([self._tile(key) for key in keys])
+            found = _concatenated([self._tile(key) for key in keys])
             save_arrays(name, {field: found[field] for field in _STORED})
             return
         at = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX
         for key in keys:
             own = (at == (key[3], key[2])).all(axis=1)
-            self._tiles[key] = self._lifted({field: values[own] for field, values in stored.items()}, level)
+            self._tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
 
-    def _tile(self, key: _Key) -> Arrays:
-        """A tile, now the one that was used last."""
+    def _tile(self, key: _Key) -> NamedArrays:
+        """A tile, which becomes the most recently used."""
         tile = self._tiles.pop(key, None)
         if tile is None:
             level, upright, row, column = key
             self.created += 1
-            tile = self._lifted(self._detected(level, upright, row, column), level)
+            tile = self._with_points(self._detect(level, upright, row, column), level)
         self._tiles[key] = tile
         return tile
 
     def _evict(self, keep: int) -> None:
-        """Give up the tiles that were used least recently, but not the last ones."""
+        """Evict the least recently used tiles down to the limit, but not the last ``keep``."""
         tiles = list(self._tiles.items())
         used = sum(len(tile["rank"]) for _, tile in tiles)
         for key, tile in tiles[: len(tiles) - keep]:
-            if used <= self._most:
+            if used <= self._max_landmarks:
                 break
             used -= len(tile["rank"])
             self._tiles.pop(key, None)
 
-    def _detected(self, level: int, upright: bool, row: int, column: int) -> Arrays:
-        """Every keypoint that lies on a tile, as it would be found in the whole level."""
+    def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
+        """Every keypoint on a tile, as it would be detected in the whole level."""
         rows, columns = self._site.level_shape(level)
         x0, y0 = column * TILE_PX, row * TILE_PX
         x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
@@ -187,13 +190,13 @@ class LandmarkMap:
         arrays = (xy[kept], scale, angle, rank[kept], descriptors)
         return {name: a.astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
 
-    def _lifted(self, tile: Arrays, level: int) -> Arrays:
+    def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
         map_px = self._site.full_from_level(tile["xy_px"], level)
         return tile | {
             "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
         }
 
-    def _handed_out(self, found: Arrays) -> Landmarks:
+    def _to_landmarks(self, found: NamedArrays) -> Landmarks:
         def tensor(name: str) -> torch.Tensor:
             return torch.from_numpy(found[name]).to(self._device)[None]
 
@@ -204,7 +207,15 @@ class LandmarkMap:
 
 
 def as_picture(gray: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-    """Grey levels (H, W) as (1, 1, H, W) in [0, 1] on a device."""
+    """Grey levels as a batch of one picture for :func:`engine.features.sift`.
+
+    Args:
+        gray: (H, W).
+        device: of the result.
+
+    Returns:
+        (1, 1, H, W) float32 in [0, 1].
+    """
     return torch.from_numpy(np.ascontiguousarray(gray)).to(device)[None, None].float() / 255.0
 
 
@@ -216,12 +227,12 @@ def _keys(window: Window, level: int, upright: bool) -> list[_Key]:
     return [(level, upright, row, column) for row in rows for column in columns]
 
 
-def _joined(parts: list[Arrays]) -> Arrays:
+def _concatenated(parts: list[NamedArrays]) -> NamedArrays:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _rank_in_cells(xy_px: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(N,) how many before it lie in the same cell."""
+    """(N,) how many before each are in the same cell."""
     column, row = (np.rint(xy_px).astype(np.int64) // CELL_PX).T
     _, cell, counts = np.unique(np.stack([row, column]), axis=1, return_inverse=True, return_counts=True)
     order = np.argsort(cell.ravel(), kind="stable")

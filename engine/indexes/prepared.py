@@ -1,7 +1,7 @@
 """The map as the NCC method searches it, prepared once: enhanced, with running sums and half-resolution levels.
 
-A small level of the map is prepared as a whole; of a large one, regions on a fixed grid as the flight touches
-them, of which the least recently used are given up.
+A small level of the map is prepared as a whole; of a large one, regions on a fixed grid as the flight reaches
+them, of which the least recently used are evicted.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 
 CELL_PX = 256
-"""Regions begin and end on multiples of this, and at least half of it beyond what is asked for: the windows that a
-flight asks for next lie within the same one."""
+"""Regions begin and end on multiples of this, and at least half of it beyond the requested window, so that the
+next windows of a flight fall in the same region."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
 MAX_REGION_PX = 6 << 20
@@ -34,9 +34,9 @@ class Region:
     """A prepared part of one pyramid level.
 
     Attributes:
-        window: where it lies, in pixels of the level.
-        search: what is matched against.
-        valid: (H, W) False on nodata; None where all of it is map.
+        window: its extent, in pixels of the level.
+        search: prepared pixels that templates are matched against.
+        valid: (H, W) bool, False on nodata; None where all pixels are valid.
     """
 
     window: Window
@@ -49,21 +49,21 @@ class PreparedMap:
 
     Args:
         site: the map.
-        device: where the regions live.
+        device: of the regions' tensors.
         radius_px: of the local normalisation, see :func:`engine.align.enhance`.
-        score: what frames are enhanced by, see there.
+        score: see :func:`engine.align.enhance`.
     """
 
     def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
-        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the one used last comes last
-        # Of the regions, not of their preparation: a thread that hangs in there must not stop the next one.
+        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the most recently used is last
+        # Guards the regions, not their preparation: a thread that hangs there must not block the next one.
         self._lock = threading.Lock()
         self.created = 0
         """Regions prepared so far."""
 
     def cut(self, window: Window, level: int) -> Region:
-        """The prepared part of a level that holds a window, cut to it.
+        """The prepared part of a level that contains a window, cropped to it.
 
         Args:
             window: in pixels of the level, inside it.
@@ -73,44 +73,44 @@ class PreparedMap:
             Region: begins up to 7 pixels before the window and ends with it.
         """
         x0, y0 = window.x0 & -_HALVING_PX, window.y0 & -_HALVING_PX
-        grown = Window(x0, y0, window.x0 + window.width_px - x0, window.y0 + window.height_px - y0)
-        region = self._region(grown, level)
-        i, j = grown.x0 - region.window.x0, grown.y0 - region.window.y0
-        search = region.search.crop(i, j, grown.width_px, grown.height_px)
+        aligned = Window(x0, y0, window.x0 + window.width_px - x0, window.y0 + window.height_px - y0)
+        region = self._region(aligned, level)
+        i, j = aligned.x0 - region.window.x0, aligned.y0 - region.window.y0
+        search = region.search.crop(i, j, aligned.width_px, aligned.height_px)
         valid = None
         if region.valid is not None:
-            valid = region.valid[j : j + grown.height_px, i : i + grown.width_px]
+            valid = region.valid[j : j + aligned.height_px, i : i + aligned.width_px]
             if bool(valid.all()):
                 valid = None
-        return Region(grown, search, valid)
+        return Region(aligned, search, valid)
 
     def _region(self, window: Window, level: int) -> Region:
         with self._lock:
-            region = self._held(window, level)
+            region = self._cached(window, level)
         if region is not None:
             return region
         rows, columns = self._site.level_shape(level)
         if rows * columns <= WHOLE_LEVEL_PX:
-            wanted = Window(0, 0, columns, rows)
+            target = Window(0, 0, columns, rows)
         else:
-            wanted = _on_grid(window, columns, rows)
-        region = self._prepare(wanted, level)
+            target = _on_grid(window, columns, rows)
+        region = self._prepare(target, level)
         with self._lock:
             self.created += 1
-            self._regions[level, wanted] = region
+            self._regions[level, target] = region
             self._evict()
         return region
 
-    def _held(self, window: Window, level: int) -> Region | None:
-        """A region that holds a window, the one used last first; from now on it is that one itself."""
+    def _cached(self, window: Window, level: int) -> Region | None:
+        """The most recently used region that contains a window, which becomes the most recent; or None."""
         for key in reversed(self._regions):
-            if key[0] == level and _holds(key[1], window):
+            if key[0] == level and _contains(key[1], window):
                 self._regions.move_to_end(key)
                 return self._regions[key]
         return None
 
     def _evict(self) -> None:
-        """Give up the regions that were used least recently; the newest and whole levels stay."""
+        """Evict the least recently used regions down to the limit; the newest and whole levels stay."""
         parts = [
             key for key in self._regions if (key[1].height_px, key[1].width_px) != self._site.level_shape(key[0])
         ]
@@ -122,9 +122,9 @@ class PreparedMap:
             del self._regions[key]
 
     def _prepare(self, window: Window, level: int) -> Region:
-        """Enhance with the neighbourhood that the map has beyond the region, so that regions join seamlessly."""
+        """Enhance with the neighbourhood beyond the region, so that regions join seamlessly."""
         rows, columns = self._site.level_shape(level)
-        margin = self._radius_px + 2  # the box, the difference of neighbours, the smoothing
+        margin = self._radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing
         x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
         x1 = min(columns, window.x0 + window.width_px + margin)
         y1 = min(rows, window.y0 + window.height_px + margin)
@@ -145,14 +145,14 @@ class PreparedMap:
         return Region(window, prepare(image), valid)
 
 
-def _holds(region: Window, window: Window) -> bool:
+def _contains(region: Window, window: Window) -> bool:
     right, bottom = window.x0 + window.width_px, window.y0 + window.height_px
     across = region.x0 <= window.x0 and right <= region.x0 + region.width_px
     return across and region.y0 <= window.y0 and bottom <= region.y0 + region.height_px
 
 
 def _on_grid(window: Window, columns: int, rows: int) -> Window:
-    """The window grown by half a cell to each side, then to whole cells, and cut off where the level ends."""
+    """The window extended by half a cell to each side, then to whole cells, and clipped at the level's edge."""
     ahead = CELL_PX // 2
     x0, y0 = (max(0, low - ahead) // CELL_PX * CELL_PX for low in (window.x0, window.y0))
     x1 = min(columns, -(-(window.x0 + window.width_px + ahead) // CELL_PX) * CELL_PX)

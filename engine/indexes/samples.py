@@ -1,4 +1,4 @@
-"""Samples of the map for dense refinement: its steepest pixels with their places in space, taken once."""
+"""Samples of the map for dense refinement: its steepest pixels with their 3D positions, taken once."""
 
 from __future__ import annotations
 
@@ -21,28 +21,33 @@ CELL_PX = 256
 """Of a large level samples are taken cell by cell, on the cells of the prepared map."""
 MAX_CELLS = 256
 MAX_SAMPLES = 2000
-_ROUGH_REACH_PX = 1.5  # of the level: this far off a sample
+_ROUGH_REACH_PX = 1.5  # pixels of the level from a sample at which roughness is measured
 
 
 class SampleMap:
-    """Samples of one map for dense refinement, taken once.
+    """Cache of samples of one map for dense refinement.
 
     Args:
         site: the map.
-        prepared: the same, enhanced.
+        prepared: the same map, enhanced.
     """
 
     def __init__(self, site: OrthoMap, prepared: PreparedMap) -> None:
         self._site, self._prepared = site, prepared
         self._cells: OrderedDict[tuple[int, Window], tuple[Samples, tuple[int, int]]] = OrderedDict()
-        self._lock = threading.Lock()  # of the cells alone, as in the prepared map
+        self._lock = threading.Lock()  # guards the cells, not their sampling, as in PreparedMap
         self.created = 0
         """Cells sampled so far."""
 
     def find(self, window: Window, level: int) -> Samples:
-        """At most about :data:`MAX_SAMPLES` samples of a window in pixels of a level, inside it.
+        """At most about :data:`MAX_SAMPLES` samples of a window.
 
-        The window is at least a block wide and high.
+        Args:
+            window: in pixels of the level, inside it, at least :data:`BLOCK_PX` wide and high.
+            level: of the map's pyramid.
+
+        Returns:
+            Samples: in metres east, north and up.
         """
         step = math.ceil(window.area_px / BLOCK_PX**2 / MAX_SAMPLES)
         parts = []
@@ -55,8 +60,8 @@ class SampleMap:
                     (window.x0, window.width_px, cell.x0),
                 )
             )
-            taken = np.arange(shape[0])[rows, None] * shape[1] + np.arange(shape[1])[columns]
-            index = taken.ravel()[::step]
+            inside = np.arange(shape[0])[rows, None] * shape[1] + np.arange(shape[1])[columns]
+            index = inside.ravel()[::step]
             arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
             parts.append([array[index] for array in arrays])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
@@ -70,11 +75,11 @@ class SampleMap:
             for y in range(window.y0 // CELL_PX * CELL_PX, window.y0 + window.height_px, CELL_PX)
             for x in range(window.x0 // CELL_PX * CELL_PX, window.x0 + window.width_px, CELL_PX)
         ]
-        # What a level has beyond its last whole cell may be narrower than a block: no sample is taken there.
+        # The remainder beyond a level's last whole cell may be narrower than a block: no sample is taken there.
         return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
-        """Samples of a cell, row by row, and how many rows and columns of them there are."""
+        """Samples of a cell, row by row, and the number of their rows and columns."""
         with self._lock:
             found = self._cells.pop((level, cell), None)
             if found is not None:
@@ -103,7 +108,7 @@ class SampleMap:
         weights *= self._site.roughness_weight_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
         points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
         per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
-        metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # alike all over a cell
+        metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # nearly constant over a cell
         gradients = per_px @ np.linalg.inv(metres_per_px)
         return Samples(points, picture[rows, columns].astype(np.float64), gradients, weights), shape
 

@@ -1,4 +1,4 @@
-"""The loops of dense refinement, compiled by numba: a few thousand samples, each a few sums.
+"""The loops of dense refinement over a few thousand samples, compiled by numba.
 
 Arrays of samples are (3, N), (2, N) or (N,) float64 as in :mod:`engine.dense`.
 """
@@ -9,99 +9,142 @@ import numpy as np
 
 from engine.kernels.jit import compiled
 
-_BIWEIGHT = 4.685  # of the residuals' deviation: where Tukey's biweight gives a sample no weight
-_MAD = 1.4826  # deviation of normal noise over its median absolute value
-_THINNED = 3  # every so many differences tell their median
+_BIWEIGHT = 4.685  # standard deviations at which the weight of Tukey's biweight reaches 0
+_MAD = 1.4826  # standard deviation of normal noise over its median absolute value
+_MEDIAN_STEP = 3  # the median is taken over every third difference
 
 
 @compiled
-def seen(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradients, known, edge_px, cells):
-    """What a pose sees of the samples.
+def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradients, known, edge_px, cells):
+    """Project samples into the picture by a pose, and read levels and gradients there.
 
     Args:
         picture: (H, W) float32 levels.
         matrix: (3, 3) pinhole.
         rotation: (3, 3) of cam_from_map.
         center_m: (3,) of the camera.
-        slope: (2,) of the ground besides the samples' heights.
+        slope: (2,) of the ground in addition to the samples' heights.
         offset_m: (3, N) of the samples from the slope's pivot.
         pivot_m: (3,) of the slope.
         gradients: (N, 2) of the map, per metre to the east and to the north.
         known: (N,) weights.
-        edge_px: along the picture's edge, at least 2, nothing is seen.
-        cells: that many cells along each side of the picture.
+        edge_px: border of the picture that is not sampled, at least 2.
+        cells: along each side of the picture.
 
     Returns:
-        levels (N,) that the picture shows; places (3, N) of the samples in the camera; shown (3, N) derivatives of
-        the levels by the places, by the picture's central differences; expected (3, N) the same by the map's
-        gradients, up to the gain; weights (N,), 0 where a sample is not seen; cell (N,) of the picture; how many
-        were seen.
+        levels (N,); points (3, N) in the camera; derivatives (3, N) of the levels by the points, from the
+        picture's differences; the same from the map's gradients, up to the gain; weights (N,), 0 where not
+        visible; cell (N,) of the picture; number of visible samples.
     """
-    samples, (height, width) = known.size, picture.shape
+    samples, (height, width), shift = known.size, picture.shape, pivot_m - center_m
     levels, weights, cell = np.zeros(samples), np.zeros(samples), np.zeros(samples, np.int64)
-    places, shown, expected = np.zeros((3, samples)), np.zeros((3, samples)), np.zeros((3, samples))
+    points, shown, expected = np.zeros((3, samples)), np.zeros((3, samples)), np.zeros((3, samples))
     right, bottom, count = width - 1.0 - edge_px, height - 1.0 - edge_px, 0
-    shift = pivot_m - center_m
     for n in range(samples):
-        e, north = offset_m[0, n] + shift[0], offset_m[1, n] + shift[1]
-        up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
-        x = rotation[0, 0] * e + rotation[0, 1] * north + rotation[0, 2] * up
-        y = rotation[1, 0] * e + rotation[1, 1] * north + rotation[1, 2] * up
-        z = rotation[2, 0] * e + rotation[2, 1] * north + rotation[2, 2] * up
-        places[0, n], places[1, n], places[2, n] = x, y, z
+        e, north, up = _from_camera(offset_m, n, shift, slope)
+        points[0, n], points[1, n], points[2, n] = x, y, z = _rotated(rotation, e, north, up)
         if known[n] <= 0.0 or z <= 1e-6:
             continue
         across, down = x / z, y / z
-        u = matrix[0, 0] * across + matrix[0, 1] * down + matrix[0, 2]
-        v = matrix[1, 0] * across + matrix[1, 1] * down + matrix[1, 2]
+        u, v = _pixel(matrix, across, down)
         if not (edge_px < u < right and edge_px < v < bottom):
             continue
-        column, row = int(u), int(v)
-        fu, fv = u - column, v - row
-        one, two, three, four = (1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv
-        nw, ne = picture[row, column], picture[row, column + 1]
-        sw, se = picture[row + 1, column], picture[row + 1, column + 1]
-        levels[n] = one * nw + two * ne + three * sw + four * se
-        by_u = one * (ne - picture[row, column - 1]) + two * (picture[row, column + 2] - nw)
-        by_u += three * (se - picture[row + 1, column - 1]) + four * (picture[row + 1, column + 2] - sw)
-        by_v = one * (sw - picture[row - 1, column]) + two * (se - picture[row - 1, column + 1])
-        by_v += three * (picture[row + 2, column] - nw) + four * (picture[row + 2, column + 1] - ne)
-        by_u, by_v = 0.5 * by_u, 0.5 * by_v
-        shown[0, n] = (matrix[0, 0] * by_u + matrix[1, 0] * by_v) / z
-        shown[1, n] = (matrix[0, 1] * by_u + matrix[1, 1] * by_v) / z
-        shown[2, n] = -(shown[0, n] * across + shown[1, n] * down)
-        by_e, by_n = gradients[n, 0], gradients[n, 1]
-        by_up = -(by_e * e + by_n * north) / min(up, -1e-6)  # along the ray nothing changes
-        for k in range(3):
-            expected[k, n] = rotation[k, 0] * by_e + rotation[k, 1] * by_n + rotation[k, 2] * by_up
-        weights[n] = known[n]
+        levels[n], by_u, by_v = _bilinear(picture, u, v)
+        shown[0, n], shown[1, n], shown[2, n] = _by_point(matrix, by_u, by_v, across, down, z)
+        _from_map(expected, rotation, gradients, n, e, north, up)
         cell[n] = int(v / bottom * cells) * cells + int(u / right * cells)
-        count += 1
-    return levels, places, shown, expected, weights, cell, count
+        weights[n], count = known[n], count + 1
+    return levels, points, shown, expected, weights, cell, count
 
 
 @compiled
-def compare(levels, values, weights):
+def _from_camera(offset_m, n, shift, slope):
+    """East, north and up from the camera to a sample on the sloped ground."""
+    up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
+    return offset_m[0, n] + shift[0], offset_m[1, n] + shift[1], up
+
+
+@compiled
+def _from_map(expected, rotation, gradients, n, e, north, up):
+    """Write the derivatives by a point in the camera, from the map's gradient; they are 0 along the ray."""
+    by_e, by_n = gradients[n, 0], gradients[n, 1]
+    by_up = -(by_e * e + by_n * north) / min(up, -1e-6)
+    for k in range(3):
+        expected[k, n] = rotation[k, 0] * by_e + rotation[k, 1] * by_n + rotation[k, 2] * by_up
+
+
+@compiled
+def _rotated(rotation, a, b, c):
+    x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
+    y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
+    return x, y, rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
+
+
+@compiled
+def _pixel(matrix, across, down):
+    u = matrix[0, 0] * across + matrix[0, 1] * down + matrix[0, 2]
+    return u, matrix[1, 0] * across + matrix[1, 1] * down + matrix[1, 2]
+
+
+@compiled
+def _by_point(matrix, by_u, by_v, across, down, z):
+    """Derivatives by a point in the camera, from those by its pixel."""
+    by_x = (matrix[0, 0] * by_u + matrix[1, 0] * by_v) / z
+    by_y = (matrix[0, 1] * by_u + matrix[1, 1] * by_v) / z
+    return by_x, by_y, -(by_x * across + by_y * down)
+
+
+@compiled
+def _bilinear(picture, u, v):
+    """Level of the picture at (u, v), and its derivatives by central differences, all bilinear."""
+    column, row = int(u), int(v)
+    fu, fv = u - column, v - row
+    one, two, three, four = (1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv
+    nw, ne = picture[row, column], picture[row, column + 1]
+    sw, se = picture[row + 1, column], picture[row + 1, column + 1]
+    level = one * nw + two * ne + three * sw + four * se
+    by_u = one * (ne - picture[row, column - 1]) + two * (picture[row, column + 2] - nw)
+    by_u += three * (se - picture[row + 1, column - 1]) + four * (picture[row + 1, column + 2] - sw)
+    by_v = one * (sw - picture[row - 1, column]) + two * (se - picture[row - 1, column + 1])
+    by_v += three * (picture[row + 2, column] - nw) + four * (picture[row + 2, column + 1] - ne)
+    return level, 0.5 * by_u, 0.5 * by_v
+
+
+@compiled
+def compare_levels(levels, values, weights):
     """Differences of picture and map up to gain and bias, robust weights, the correlation and the gain.
 
     Args:
         levels: (N,) of the picture.
         values: (N,) of the map.
         weights: (N,) of the samples, some of them above 0.
+
+    Returns:
+        Differences (N,), weights (N,) times the biweight, correlation in [-1, 1], and gain.
     """
     differences, correlation, _ = _up_to_gain(levels, values, weights)
     agreement = _biweight(differences, weights)
-    differences, _, gain = _up_to_gain(levels, values, agreement)  # what does not belong there sets no gain
+    differences, _, gain = _up_to_gain(levels, values, agreement)  # outliers do not affect the gain
     return differences, _biweight(differences, weights), correlation, gain
 
 
 @compiled
-def derivatives(by_places, places, offset_m, rotation):
-    """(8, N) of the differences by the pose's parameters, from those by the places (3, N)."""
-    out = np.empty((8, by_places.shape[1]))
-    for n in range(by_places.shape[1]):
-        a, b, c = by_places[0, n], by_places[1, n], by_places[2, n]
-        x, y, z = places[0, n], places[1, n], places[2, n]
+def derivatives(by_points, points, offset_m, rotation):
+    """Derivatives of the differences by the pose's parameters.
+
+    Args:
+        by_points: (3, N) derivatives by the points in the camera.
+        points: (3, N) in the camera.
+        offset_m: (2, N) of the samples from the slope's pivot.
+        rotation: (3, 3) of cam_from_map.
+
+    Returns:
+        (8, N) in the order of the parameters of :mod:`engine.dense`.
+    """
+    out = np.empty((8, by_points.shape[1]))
+    for n in range(by_points.shape[1]):
+        a, b, c = by_points[0, n], by_points[1, n], by_points[2, n]
+        x, y, z = points[0, n], points[1, n], points[2, n]
         for k in range(3):
             out[k, n] = -(rotation[0, k] * a + rotation[1, k] * b + rotation[2, k] * c)
         out[3, n], out[4, n], out[5, n] = y * c - z * b, z * a - x * c, x * b - y * a
@@ -136,10 +179,10 @@ def _biweight(differences, weights):
     sizes, index = np.empty(weights.size), 0
     for n in range(weights.size):
         if weights[n] > 0.0:
-            if index % _THINNED == 0:
-                sizes[index // _THINNED] = abs(differences[n])
+            if index % _MEDIAN_STEP == 0:
+                sizes[index // _MEDIAN_STEP] = abs(differences[n])
             index += 1
-    typical = np.median(sizes[: (index + _THINNED - 1) // _THINNED])
+    typical = np.median(sizes[: (index + _MEDIAN_STEP - 1) // _MEDIAN_STEP])
     far = _BIWEIGHT * _MAD * max(typical, 1e-6)
     out = np.empty(weights.size)
     for n in range(weights.size):

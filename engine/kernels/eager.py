@@ -1,7 +1,7 @@
-"""NCC by the FFT in plain torch: one forward transform a picture, one inverse a template.
+"""NCC by the FFT in plain torch: one forward transform per picture, one inverse per template.
 
-The numerator of equation 1 is a circular correlation; a period of the window's own size is enough, since the
-shifts that wrap around are never returned. The denominator comes from running sums in float64.
+The numerator of equation 1 is a circular correlation; a period of the window's size suffices, since the shifts
+that wrap around are never returned. The denominator comes from running sums in float64.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# A float32 transform leaves an error of about 1e-7 of the window's norm in every numerator. It is divided by the
-# norm of a patch: where a patch is this many times weaker than the window, the transform runs in float64.
+# A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
+# norm of a patch: where a patch's norm is smaller than the window's by this factor, the transform is in float64.
 _FLOAT32_NORM_RATIO = 16.0
-# A patch is flat where its sum of squares is below this share of the window's: there is only rounding in it.
+# A patch is flat where its sum of squares is below this share of the window's, which is rounding.
 _FLAT_SHARE = 1e-12
-# Windows of more pixels than this are cut into blocks where the templates are small against them.
-_WORTH_BLOCKS_PX = 1 << 21
-# Blocks of windows that are larger than the templates have at least this side.
+# Windows of more pixels than this are processed in blocks where the templates are much smaller.
+_MIN_BLOCKED_PX = 1 << 21
+# Least side of these blocks.
 _MIN_BLOCK_PX = 256
 _SMALL_PX = 1 << 16
-# The norm of a template of zeros, which scores 0.
+# Lower bound on a template's norm; a template of zeros scores 0.
 _TINY = 1e-12
-# Templates are transformed in groups whose product spectra hold at most this many numbers, to bound the memory.
+# Upper bound on the numbers in the product spectra of a group of templates, which bounds the memory.
 _CHUNK_NUMBERS = 1 << 24
 
 
 @lru_cache(maxsize=4096)
 def fast_length(n: int) -> int:
-    """The smallest length of at least ``n`` that has no prime factor above 5, which FFTs do fast."""
+    """The smallest length of at least ``n`` without prime factors above 5, for which FFTs are fast."""
     best = 1 << (n - 1).bit_length()
     five = 1
     while five < best:
@@ -45,11 +45,20 @@ def fast_length(n: int) -> int:
 
 
 def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
-    """Equation 1 of the paper, (B, H, W) and (B, T, h, w) to (B, T, H-h+1, W-w+1) in the input's dtype."""
-    if zero_mean:  # NCC does not see the window's mean, but the squares below stay small without it
+    """NCC by equation 1.
+
+    Args:
+        search: (B, H, W) float32 or float64.
+        templates: (B, T, h, w) of the same dtype.
+        zero_mean: subtract the means first.
+
+    Returns:
+        (B, T, H-h+1, W-w+1) of the same dtype, in [-1, 1]; 0 where patch or template is flat.
+    """
+    if zero_mean:  # NCC is invariant to the window's mean, but without it the squares below stay small
         search = (search - search.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)).to(search.dtype)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)
-        templates = templates - templates.mean(dim=(-2, -1), keepdim=True)  # what rounding left of a flat one
+        templates = templates - templates.mean(dim=(-2, -1), keepdim=True)  # the rounding residue of a flat one
     scores = [_one_surface(picture, group, zero_mean) for picture, group in zip(search, templates, strict=True)]
     return torch.stack(scores).to(search.dtype)
 
@@ -69,31 +78,60 @@ def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
 
 
 def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
-    """Zero-mean NCC of zero-mean float32 templates (T, h, w) with a picture (H, W) of small mean.
+    """Zero-mean NCC with a picture whose patches' norms are known.
 
     Args:
-        image: (H, W) float32.
+        image: (H, W) float32, its mean small against its standard deviation.
         inverse_norms: (H-h+1, W-w+1) from :func:`inverse_norm`.
         templates: (T, h, w) float32 of zero mean.
+
+    Returns:
+        (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
     return products(image, templates).mul_(inverse_norms).clamp_(-1.0, 1.0)
 
 
 def products(image: Tensor, templates: Tensor) -> Tensor:
-    """Numerators of the same (T, H-h+1, W-w+1), the templates scaled to a norm of 1."""
+    """Numerators of :func:`prepared_surface`.
+
+    Args:
+        image: (H, W) float32.
+        templates: (T, h, w) float32 of zero mean, scaled to a norm of 1 here.
+
+    Returns:
+        (T, H-h+1, W-w+1) float32.
+    """
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True).clamp_min_(_TINY)
     return correlate(image, templates / norm)
 
 
 def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
-    """Best score (T,) of every template and its flat place (T,), the lowest of equals."""
+    """Maximum of every template's surface.
+
+    Args:
+        products: (T, H', W') float32 numerators.
+        inverse_norms: (H', W') float32.
+
+    Returns:
+        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
+    """
     scores = _scores(products, inverse_norms).flatten(1)
-    places = scores.argmax(dim=1, keepdim=True)
-    return scores.gather(1, places)[:, 0], places[:, 0]
+    index = scores.argmax(dim=1, keepdim=True)
+    return scores.gather(1, index)[:, 0], index[:, 0]
 
 
 def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
-    """Best score (T,) of every template further than a radius from a flat place; -1 where nothing is."""
+    """Maximum of every template's surface outside a disc.
+
+    Args:
+        products: (T, H', W') float32 numerators.
+        inverse_norms: (H', W') float32.
+        winner: one int64, the flat index of the disc's centre.
+        radius_squared: positions of at most this squared distance are inside, in squared pixels.
+
+    Returns:
+        (T,) float32; -1 where nothing is outside.
+    """
     height, width = inverse_norms.shape
     dy = torch.arange(height, device=winner.device)[:, None] - winner // width
     dx = torch.arange(width, device=winner.device) - winner % width
@@ -106,14 +144,17 @@ def _scores(products: Tensor, inverse_norms: Tensor) -> Tensor:
 
 
 def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
-    """One over the norm of every h x w patch about its mean, float32; 0 where the patch is flat.
+    """Reciprocal norm about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) running sums of a picture, or a crop of those of a larger one.
+        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
+
+    Returns:
+        (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    # On small surfaces on the CPU a call of torch's costs more than its work.
+    # On small surfaces on the CPU the overhead of a torch call exceeds its work.
     if sums.device.type == "cpu" and sums[0].numel() <= _SMALL_PX:
         s = sums.numpy()
         boxes = s[:, h:, w:] - s[:, :-h, w:]
@@ -131,14 +172,21 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
 
 
 def correlate(search: Tensor, templates: Tensor) -> Tensor:
-    """Sums of products (T, H-h+1, W-w+1) of (T, h, w) at every place of (H, W), by the correlation theorem.
+    """Cross-correlation by the correlation theorem.
 
-    A window much larger than the templates is cut into overlapping blocks (overlap-save), whose transforms are
-    small enough to stay in the cache.
+    A window much larger than the templates is processed in overlapping blocks (overlap-save), whose transforms fit
+    into the cache.
+
+    Args:
+        search: (H, W) floating point.
+        templates: (T, h, w) of the same dtype.
+
+    Returns:
+        (T, H-h+1, W-w+1) sums of products.
     """
     (H, W), (h, w) = search.shape, templates.shape[-2:]
     block = fast_length(max(_MIN_BLOCK_PX, 3 * max(h, w)))
-    if max(_WORTH_BLOCKS_PX, 2 * block * block) < H * W:
+    if max(_MIN_BLOCKED_PX, 2 * block * block) < H * W:
         return _correlate_blocks(search, templates, min(block, fast_length(H)), min(block, fast_length(W)))
     rows, columns = fast_length(H), fast_length(W)
     spectrum = torch.fft.rfft2(search, s=(rows, columns))
@@ -151,7 +199,7 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
 
 
 def _correlate_blocks(search: Tensor, templates: Tensor, rows: int, columns: int) -> Tensor:
-    """The same by blocks of rows x columns, each of which yields rows-h+1 x columns-w+1 places."""
+    """The same by blocks of rows x columns, each of which gives rows-h+1 x columns-w+1 sums."""
     (H, W), (T, h, w) = search.shape, templates.shape
     step_y, step_x = rows - h + 1, columns - w + 1
     ny, nx = -(-(H - h + 1) // step_y), -(-(W - w + 1) // step_x)
@@ -165,21 +213,28 @@ def _correlate_blocks(search: Tensor, templates: Tensor, rows: int, columns: int
         spectra = torch.fft.rfft2(blocks[j])
         for first in range(0, T, count):
             product = spectra * models[first : first + count, None]
-            places = _inverse(product, step_y, step_x, columns)  # (t, nx, step_y, step_x)
-            line = places.permute(0, 2, 1, 3).reshape(places.shape[0], step_y, nx * step_x)
+            sums = _inverse(product, step_y, step_x, columns)  # (t, nx, step_y, step_x)
+            line = sums.permute(0, 2, 1, 3).reshape(sums.shape[0], step_y, nx * step_x)
             out[first : first + count, j * step_y : (j + 1) * step_y] = line
     return out[:, : H - h + 1, : W - w + 1]
 
 
 def _inverse(spectrum: Tensor, height: int, width: int, columns: int) -> Tensor:
-    """The top-left (height, width) of irfft2, that does not transform the rows that nobody asks for."""
+    """The top-left (height, width) of irfft2, without the transform of the other rows."""
     rows = torch.fft.ifft(spectrum, dim=-2)[..., :height, :]
     picture: Tensor = torch.fft.irfft(rows, n=columns)
     return picture[..., :width]
 
 
 def integrals(image: Tensor) -> Tensor:
-    """Running sums (2, H+1, W+1) of (H, W) and of its square, in float64."""
+    """Integral images of a picture and of its square.
+
+    Args:
+        image: (H, W) floating point.
+
+    Returns:
+        (2, H+1, W+1) float64 running sums; the first row and column are 0.
+    """
     if image.device.type == "cpu":
         both = np.empty((2, image.shape[0] + 1, image.shape[1] + 1))
         cv2.integral2(image.contiguous().numpy(), both[0], both[1], sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
@@ -189,7 +244,14 @@ def integrals(image: Tensor) -> Tensor:
 
 
 def halved(image: Tensor) -> Tensor:
-    """Means of 2 x 2 pixels of (H, W) float32; an odd last row or column is left out."""
+    """Means of 2 x 2 pixels.
+
+    Args:
+        image: (H, W) float32; an odd last row or column is left out.
+
+    Returns:
+        (H // 2, W // 2) float32.
+    """
     height, width = image.shape[0] & ~1, image.shape[1] & ~1
     even = image[:height, :width]
     if image.device.type == "cpu":
@@ -199,12 +261,30 @@ def halved(image: Tensor) -> Tensor:
 
 
 def box_sum(total: Tensor, h: int, w: int) -> Tensor:
-    """Sums over every h x w patch, from running sums (..., H+1, W+1) or a crop of them."""
+    """Sums over every patch.
+
+    Args:
+        total: (..., H+1, W+1) running sums, or a crop of a larger picture's.
+        h: rows of a patch.
+        w: columns of a patch.
+
+    Returns:
+        (..., H-h+1, W-w+1).
+    """
     return (total[..., h:, w:] - total[..., :-h, w:]).sub_(total[..., h:, :-w]).add_(total[..., :-h, :-w])
 
 
 def box_energy(sums: Tensor, h: int, w: int) -> Tensor:
-    """Sum of squares about its own mean of every h x w patch, from both running sums (2, H+1, W+1)."""
+    """Sum of squares about the mean of every patch.
+
+    Args:
+        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        h: rows of a patch.
+        w: columns of a patch.
+
+    Returns:
+        (H-h+1, W-w+1) float64.
+    """
     total, square = box_sum(sums, h, w)
     energy: Tensor = square.addcmul_(total, total, value=-1.0 / (h * w))
     return energy

@@ -1,4 +1,4 @@
-"""How loops are compiled: at their first call, kept on disk, and free of Python's lock."""
+"""Compilation of loops by numba: at their first call, cached on disk, and without Python's global lock."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Any
 
 from numba import njit
 
-_FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by nothing
+_FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by zero
 _loops: list[Any] = []
 
 
 def compiled(function):
-    """Compile at the first call; the machine code is kept on disk where there is a folder for it."""
+    """Compile at the first call; the machine code is cached on disk where a folder for it is writable."""
     try:
         loop = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)(function)
     except RuntimeError:
@@ -21,5 +21,5 @@ def compiled(function):
 
 
 def count() -> int:
-    """How many versions of loops were compiled, or loaded from where they are kept, so far."""
+    """Number of specialisations that were compiled, or loaded from the cache, so far."""
     return sum(len(loop.signatures) for loop in _loops)

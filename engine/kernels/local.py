@@ -1,7 +1,7 @@
-"""NCC at a handful of neighbouring places on the CPU: one BLAS dot product a place.
+"""NCC at a few neighbouring positions on the CPU: one BLAS dot product per position.
 
-A patch and a template that are laid out with the same row length, the template's rows padded with zeros, turn a
-two-dimensional sum of products into one dot product of contiguous memory; the next place is the next offset.
+With patch and template stored at the same row length, the template's rows padded with zeros, a two-dimensional sum
+of products is one dot product of contiguous memory, and the next position is the next offset.
 """
 
 from __future__ import annotations
@@ -9,24 +9,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 Sums = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
 class LocalScores:
-    """Scores of one template at places of one picture that are near each other.
+    """Scores of one template at positions in one picture that are near each other.
 
     Args:
-        image: (H, W) float32 of small mean.
-        sums: (2, H+1, W+1) running sums of it and of its square.
+        image: (H, W) float32, its mean small against its standard deviation.
+        sums: (2, H+1, W+1) float64 running sums of it and of its square.
         template: (h, w) float32 of zero mean.
-        middle: (y, x); places that are asked for lie within ``REACH`` of it.
+        middle: (y, x); scores can be computed within ``REACH`` of it.
     """
 
     REACH = 5
 
-    def __init__(self, image: Image, sums: Sums, template: Image, middle: tuple[int, int]) -> None:
+    def __init__(self, image: FloatImage, sums: Sums, template: FloatImage, middle: tuple[int, int]) -> None:
         h, w = template.shape
         self.limits = (image.shape[0] - h, image.shape[1] - w)
         """The last row and column at which the template fits."""
@@ -37,14 +37,22 @@ class LocalScores:
         padded = np.zeros((h, self._row), np.float32)
         padded[:, :w] = template
         self._template = padded.ravel()[: (h - 1) * self._row + w]
-        # The patches' sums of squares about their means, at every place within reach.
+        # The patches' sums of squares about their means, at every position within reach.
         s = sums[:, y0 : y1 + h + 1, x0 : x1 + w + 1]
         total, square = s[:, h:, w:] - s[:, :-h, w:] - s[:, h:, :-w] + s[:, :-h, :-w]
         energy = np.maximum(square - total * total / (h * w), 0.0) * float(np.dot(self._template, self._template))
         self._inverse_norm = np.divide(1.0, np.sqrt(energy), out=np.zeros_like(energy), where=energy > 0)
 
     def at(self, y: Index, x: Index) -> Sums:
-        """Scores (N,) at rows ``y`` and columns ``x``, all of them places at which the template fits."""
+        """Scores at positions at which the template fits.
+
+        Args:
+            y: (N,) rows of the template's top-left pixel.
+            x: (N,) columns.
+
+        Returns:
+            (N,) float64 in [-1, 1].
+        """
         j, i = y - self._corner[0], x - self._corner[1]
         template, patch, size = self._template, self._patch, self._template.size
         products = [np.dot(patch[k : k + size], template) for k in (j * self._row + i).tolist()]

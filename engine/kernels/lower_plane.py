@@ -1,4 +1,4 @@
-"""The plane with most of some heights above it, compiled by numba: a dozen rounds over two hundred heights."""
+"""Quantile regression of a plane through heights, compiled by numba: a few rounds over two hundred heights."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from engine.kernels.jit import compiled
 
 @compiled
 def lower_plane(offsets, heights_m, share, on_plane_m, rounds):
-    """Level and rise per offset (3,) of the plane with a share of the heights (N,) at offsets (N, 2) below it.
+    """The plane with a given share of the heights below it.
 
-    Quantile regression (Koenker and Bassett, Econometrica 1978) by reweighted least squares.
+    Quantile regression (Koenker and Bassett, doi:10.2307/1913643) by iteratively reweighted least squares.
 
     Args:
-        offsets: (N, 2) places.
+        offsets: (N, 2) positions.
         heights_m: (N,) there.
-        share: 0 to 1 of the heights that is below.
-        on_plane_m: heights closer to a plane than this lie on it.
+        share: of the heights below the plane, 0 to 1.
+        on_plane_m: residuals below this have equal weight.
         rounds: of reweighting.
+
+    Returns:
+        (3,) level at offset 0, and rise per unit of both offsets.
     """
     plane, weights = np.zeros(3), np.ones(len(heights_m))
     for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""Masked NCC by the FFT: pixels that are invalid in either picture take part in no sum.
+"""Masked NCC by the FFT: pixels that are invalid in either picture are left out of all sums.
 
 Padfield, Masked object registration in the Fourier domain, IEEE TIP 2012, doi:10.1109/TIP.2011.2181402. Every
 sum of the correlation coefficient is itself a correlation, of a picture, its square or its mask with another's;
@@ -19,40 +19,45 @@ _FLAT_SHARE = 1e-10
 def ncc_surface(
     search: Tensor, search_valid: Tensor, templates: Tensor, templates_valid: Tensor, *, min_overlap: float
 ) -> Tensor:
-    """Zero-mean NCC over common pixels, (B, H, W) and (B, T, h, w) to (B, T, H-h+1, W-w+1), float64.
+    """Zero-mean NCC over the pixels that are valid in both.
 
     Args:
         search: (B, H, W).
         search_valid: (B, H, W) bool.
         templates: (B, T, h, w).
         templates_valid: (B, T, h, w) bool.
-        min_overlap: places where less than this share of the template's valid pixels is common score -1.
+        min_overlap: positions with a smaller share of the template's valid pixels in common score -1.
+
+    Returns:
+        (B, T, H-h+1, W-w+1) float64 in [-1, 1].
     """
     (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
     size = (fast_length(H), fast_length(W))
-
-    def spectra(picture: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        mask = valid.double()
-        count = mask.sum(dim=(-2, -1), keepdim=True).clamp_min(1.0)
-        centred = (picture.double() * mask).sum(dim=(-2, -1), keepdim=True) / count
-        shown = (picture.double() - centred) * mask
-        one, two, three = (torch.fft.rfft2(p, s=size) for p in (mask, shown, shown.square()))
-        return one, two, three
 
     def sums(a: Tensor, b: Tensor) -> Tensor:
         product: Tensor = torch.fft.irfft2(a * b.conj(), s=size)
         return product[..., : H - h + 1, : W - w + 1]
 
-    m, i, ii = (s[:, None] for s in spectra(search, search_valid))
-    n, t, tt = spectra(templates, templates_valid)
+    m, i, ii = (s[:, None] for s in _spectra(search, search_valid, size))
+    n, t, tt = _spectra(templates, templates_valid, size)
     common = sums(m, n).round_()  # a count of pixels
     safe = common.clamp_min(1.0)
     sum_i, sum_t = sums(i, n), sums(m, t)
     energy_i, energy_t = sums(ii, n), sums(m, tt)
     numerator = sums(i, t) - sum_i * sum_t / safe
     spread_i, spread_t = energy_i - sum_i.square() / safe, energy_t - sum_t.square() / safe
-    alive = (spread_i > _FLAT_SHARE * ii[..., :1, :1].real) & (spread_t > _FLAT_SHARE * tt[..., :1, :1].real)
+    textured = (spread_i > _FLAT_SHARE * ii[..., :1, :1].real) & (spread_t > _FLAT_SHARE * tt[..., :1, :1].real)
     scores = numerator / (spread_i.clamp_min(0.0) * spread_t.clamp_min(0.0)).sqrt().clamp_min(1e-300)
-    scores = torch.where(alive, scores, 0.0).clamp_(-1.0, 1.0)
+    scores = torch.where(textured, scores, 0.0).clamp_(-1.0, 1.0)
     enough = common >= min_overlap * templates_valid.sum(dim=(-2, -1))[..., None, None].clamp_min(1)
     return torch.where(enough, scores, -1.0)
+
+
+def _spectra(picture: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Transforms of the mask, of the picture less its mean, and of its square, all 0 where not valid."""
+    mask = valid.double()
+    count = mask.sum(dim=(-2, -1), keepdim=True).clamp_min(1.0)
+    mean = (picture.double() * mask).sum(dim=(-2, -1), keepdim=True) / count
+    masked = (picture.double() - mean) * mask
+    one, two, three = (torch.fft.rfft2(p, s=size) for p in (mask, masked, masked.square()))
+    return one, two, three

@@ -1,4 +1,4 @@
-"""NCC as the equation is written, in float64: the truth that every other kernel is tested against."""
+"""NCC as the equation is written, in float64: the reference of the other kernels' tests."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def ncc_surface(search: ArrayLike, template: ArrayLike, *, zero_mean: bool) -> NDArray[np.float64]:
-    """Equation 1 of the paper for one window (H, W) and one template (h, w), to (H-h+1, W-w+1).
+    """Equation 1 of the paper: R(x, y) = sum T I / sqrt(sum T^2 * sum I^2) over the template's pixels.
 
-    R(x, y) = sum T I / sqrt(sum T^2 * sum I^2) over the template's pixels; with ``zero_mean`` the mean of the
-    template and that of each patch are taken off first. A flat patch or template scores 0.
+    Args:
+        search: (H, W).
+        template: (h, w) with h <= H and w <= W.
+        zero_mean: subtract the mean of the template and that of each patch first.
+
+    Returns:
+        (H-h+1, W-w+1) in [-1, 1]; 0 where patch or template is flat.
     """
     window, model = np.asarray(search, np.float64), np.asarray(template, np.float64)
     scores = np.zeros((window.shape[0] - model.shape[0] + 1, window.shape[1] - model.shape[1] + 1))
     if zero_mean:
-        window = window - window.mean()  # NCC does not see it; the squares below stay small
+        window = window - window.mean()  # NCC is invariant to it; the squares below stay small
         model = model - model.mean()
     patches = sliding_window_view(window, model.shape)
     for y in range(scores.shape[0]):

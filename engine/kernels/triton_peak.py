@@ -1,7 +1,7 @@
 """Normalise and find the peak in one pass by Triton: the normalised surface is never written.
 
-Every program reduces one block of one surface to its best score and place; torch reduces what the blocks left. The
-plain torch twins of the same names are in :mod:`engine.kernels.eager`, and agree bit for bit.
+Every program reduces one block of one surface to its best score and index; torch reduces over the blocks. The
+plain torch versions of the same names are in :mod:`engine.kernels.eager`, and agree bit for bit.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 _BLOCK = 2048
-# Sizes, strides and where views begin change with the window; specialising on them would compile in flight.
+# Sizes, strides and offsets of views change with the window; specialising on them would compile in flight.
 _SIZES = ("count", "width", "template_stride", "row_stride", "norm_stride", "radius_squared")
 _VIEWS = ("products", "inverse_norms", "winner")
 
@@ -21,9 +21,9 @@ _VIEWS = ("products", "inverse_norms", "winner")
 def _block_peaks(
     products,
     inverse_norms,
-    winner,  # or None: no disc is left out
+    winner,  # or None: no disc is excluded
     best,
-    places,
+    indices,
     count: tl.int64,
     width: tl.int32,
     template_stride: tl.int64,
@@ -32,7 +32,7 @@ def _block_peaks(
     radius_squared: tl.int64,
     BLOCK: tl.constexpr,
 ):
-    """Best score of ``BLOCK`` places of one template's surface, and the lowest place that has it."""
+    """Best score in ``BLOCK`` positions of one template's surface, and the lowest index that has it."""
     block, template = tl.program_id(0), tl.program_id(1).to(tl.int64)
     lanes = tl.arange(0, BLOCK)
     first = block.to(tl.int64) * BLOCK
@@ -47,33 +47,39 @@ def _block_peaks(
         middle = tl.load(winner)
         dy, dx = y - middle // width, x - middle % width
         score = tl.where(dy * dy + dx * dx > radius_squared, score, -1.0)
-    score = tl.where(inside, score, -2.0)  # below every place that there is
+    score = tl.where(inside, score, -2.0)  # below every score
     top, lane = tl.max(score, axis=0, return_indices=True)
     out = template * tl.num_programs(0) + block
     tl.store(best + out, top)
-    tl.store(places + out, first + lane)
+    tl.store(indices + out, first + lane)
 
 
 def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
-    """Best score (T,) of every template and its flat place (T,) int64, the lowest of equals.
+    """Maximum of every template's surface.
 
     Args:
         products: (T, H', W') float32 numerators.
         inverse_norms: (H', W') float32.
+
+    Returns:
+        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
     """
-    best, places = _launch(products, inverse_norms, None, 0)
-    block = best.argmax(dim=1, keepdim=True)  # the first of equals, and blocks are in the order of places
-    return best.gather(1, block)[:, 0], places.gather(1, block)[:, 0]
+    best, indices = _launch(products, inverse_norms, None, 0)
+    block = best.argmax(dim=1, keepdim=True)  # the first of equal ones; blocks are in the order of indices
+    return best.gather(1, block)[:, 0], indices.gather(1, block)[:, 0]
 
 
 def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
-    """Best score (T,) of every template outside a disc about a flat place; -1 where nothing lies outside.
+    """Maximum of every template's surface outside a disc.
 
     Args:
         products: (T, H', W') float32 numerators.
         inverse_norms: (H', W') float32.
-        winner: int64, one number, which stays on the device.
-        radius_squared: places of at most this squared distance lie inside.
+        winner: one int64, the flat index of the disc's centre, on the device.
+        radius_squared: positions of at most this squared distance are inside, in squared pixels.
+
+    Returns:
+        (T,) float32; -1 where nothing is outside.
     """
     return _launch(products, inverse_norms, winner, radius_squared)[0].amax(dim=1)
 
@@ -81,19 +87,19 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
 def _launch(
     products: Tensor, inverse_norms: Tensor, winner: Tensor | None, radius_squared: int
 ) -> tuple[Tensor, Tensor]:
-    """Best scores and their flat places, (T, blocks) each."""
+    """Best scores and their flat indices by block, (T, blocks) each."""
     templates, height, width = products.shape
     count = height * width
     products, inverse_norms = _with_dense_rows(products), _with_dense_rows(inverse_norms)
     blocks = triton.cdiv(count, _BLOCK)
     best = torch.empty((templates, blocks), dtype=torch.float32, device=products.device)
-    places = torch.empty((templates, blocks), dtype=torch.int64, device=products.device)
+    indices = torch.empty((templates, blocks), dtype=torch.int64, device=products.device)
     _block_peaks[(blocks, templates)](
         products,
         inverse_norms,
         winner,
         best,
-        places,
+        indices,
         count,
         width,
         products.stride(0),
@@ -103,7 +109,7 @@ def _launch(
         BLOCK=_BLOCK,
         enable_fp_fusion=False,  # every rounding is torch's own
     )
-    return best, places
+    return best, indices
 
 
 def _with_dense_rows(tensor: Tensor) -> Tensor:

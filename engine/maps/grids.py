@@ -1,4 +1,4 @@
-"""Where pixels lie on the Earth: coordinate systems, affine transforms, grids and the smooth maps between them.
+"""Georeferencing of pixels: coordinate systems, affine transforms, grids and polynomial transforms between them.
 
 Convention:
     ``pixel_to_crs`` is a (2, 3) affine matrix that takes pixels (x, y), centres at integers, to coordinates
@@ -24,21 +24,26 @@ Array = NDArray[np.float64]
 Function = Callable[[Array], Array]
 
 WARP_MARGIN = 0.5
-"""Fast transforms reach this share of the map's longer side beyond its edges; further out they are exact."""
+"""Polynomial transforms cover this share of the map's longer side beyond its edges; beyond they are exact."""
 
 
 class Warp:
-    """A smooth map of the plane by polynomials that were checked against the exact function.
+    """A transform of the plane by polynomials that were checked against the exact function.
 
-    PROJ and the way from the tangent plane to the ellipsoid take a fraction of a millisecond a call. Over one
-    map both are so smooth that polynomials of degree 5 follow them to micrometres. Where one point of a call lies
-    outside ``box``, and everywhere if the fit misses ``tolerance``, all points take the exact function.
+    PROJ, and the conversion from the tangent plane to the ellipsoid, take a fraction of a millisecond a call. Over
+    one map both are so smooth that polynomials of degree 5 follow them to micrometres. Where one point of a call
+    is outside ``box``, and everywhere if the fit misses ``tolerance``, all points take the exact function.
+
+    Args:
+        exact: function of points (..., 2) to points (..., 2).
+        box: (2, 2) low and high corner of where the polynomials hold.
+        tolerance: largest error of a coordinate, in the units of the result.
     """
 
     def __init__(self, exact: Function, box: Array, tolerance: float) -> None:
         self._exact = exact
         self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
-        nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev's keep the error even
+        nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev nodes spread the error evenly
         terms = (_powers(nodes[:, 0])[:, :, None] * _powers(nodes[:, 1])[:, None, :]).reshape(len(nodes), 36)
         values = exact(self._centre + self._half * nodes)
         self._coefficients: Array = np.zeros((6, 12))
@@ -54,14 +59,29 @@ class Warp:
         return np.asarray((over_y * _powers(unit[..., 1])[..., None]).sum(axis=-2))
 
     def __call__(self, points: Array) -> Array:
-        """The images (..., 2) of points (..., 2)."""
+        """Transform points.
+
+        Args:
+            points: (..., 2).
+
+        Returns:
+            (..., 2).
+        """
         unit = (points - self._centre) / self._half
         if self.fitted and (np.abs(unit) <= 1.0).all():
             return self._polynomial(unit)
         return self._exact(points)
 
     def on_grid(self, x: Array, y: Array) -> Array:
-        """The images (len(y), len(x), 2) of all pairs of columns and rows."""
+        """Transform all pairs of columns and rows.
+
+        Args:
+            x: (W,) columns, inside the box.
+            y: (H,) rows, inside the box.
+
+        Returns:
+            (H, W, 2).
+        """
         if not self.fitted:
             return self._exact(np.stack(np.meshgrid(x, y), axis=-1))
         in_x, in_y = (_powers((v - c) / h) for v, c, h in zip((x, y), self._centre, self._half, strict=True))
@@ -81,21 +101,40 @@ def _lattice(x: Array) -> Array:
 
 
 def apply_affine(matrix: Array, points: Array) -> Array:
-    """M (2, 3) on points (..., 2)."""
+    """Apply an affine transform.
+
+    Args:
+        matrix: (2, 3).
+        points: (..., 2).
+
+    Returns:
+        (..., 2).
+    """
     return np.asarray(points @ matrix[:, :2].T + matrix[:, 2])
 
 
 def invert_affine(matrix: Array) -> Array:
-    """The (2, 3) matrix that undoes another."""
+    """Invert an affine transform.
+
+    Args:
+        matrix: (2, 3), its linear part invertible.
+
+    Returns:
+        (2, 3).
+    """
     linear = np.linalg.inv(matrix[:, :2])
     return np.column_stack([linear, -linear @ matrix[:, 2]])
 
 
 def earth_crs(value: Any, argument: str) -> CRS:
-    """The horizontal part of whatever pyproj takes for a coordinate reference system of the Earth.
+    """The horizontal part of a coordinate reference system of the Earth.
+
+    Args:
+        value: anything that pyproj takes.
+        argument: its name in messages.
 
     Raises:
-        MapError: it is none, or is not tied to the Earth.
+        MapError: it is no such system.
     """
     from pyproj import CRS, Transformer
     from pyproj.exceptions import ProjError
@@ -122,13 +161,13 @@ def wgs84() -> CRS:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Pixels and where they lie.
+    """A raster grid with its georeference.
 
     Attributes:
         width_px: columns.
         height_px: rows.
         pixel_to_crs: (2, 3), integer pixels are centres.
-        crs: what the coordinates mean.
+        crs: of these coordinates.
     """
 
     width_px: int
@@ -138,11 +177,11 @@ class Grid:
 
     @property
     def centre_px(self) -> Array:
-        """Middle of the picture."""
+        """(2,) middle of the picture."""
         return np.array([(self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0])
 
     def pixels_of(self, other: CRS) -> tuple[Function, Function]:
-        """Exact functions: coordinates (x, y) of another CRS from pixels, and pixels from those coordinates."""
+        """Exact functions (..., 2) to (..., 2): coordinates of another CRS from pixels, and pixels from these."""
         from pyproj import Transformer
 
         forward = Transformer.from_crs(self.crs, other, always_xy=True)
@@ -163,19 +202,33 @@ class Grid:
         return there, back
 
     def box(self, margin: float = 0.0) -> Array:
-        """Corners (2, 2), low and high, of the outer edges widened by a share of the longer side."""
+        """Bounding box of the outer edges.
+
+        Args:
+            margin: by which it is widened, as a share of the longer side.
+
+        Returns:
+            (2, 2) low and high corner in pixels.
+        """
         grow = 0.5 + margin * max(self.width_px, self.height_px)
         return np.array([[-grow, -grow], [self.width_px - 1 + grow, self.height_px - 1 + grow]])
 
     def lattice(self, count: int = 33) -> Array:
-        """Points (count ** 2, 2) spread over the picture, its outer edges included."""
+        """Points spread evenly over the picture, its outer edges included.
+
+        Args:
+            count: along each side.
+
+        Returns:
+            (count ** 2, 2) pixels.
+        """
         low, high = self.box()
         unit = _lattice(np.linspace(-1.0, 1.0, count))
         return np.asarray((low + high) / 2.0 + (high - low) / 2.0 * unit)
 
     @property
     def is_metric(self) -> bool:
-        """Whether it can serve as a map as it is: projected, rows to the north, square on the ground to 1 %."""
+        """Whether it can be matched against as it is: projected, north-up, square on the ground to 1 %."""
         linear = self.pixel_to_crs[:, :2]
         step = np.abs(linear).max()
         upright = linear[0, 0] > 0 and linear[1, 1] < 0 and abs(linear[[0, 1], [1, 0]]).max() < 1e-3 * step
@@ -190,14 +243,22 @@ class Grid:
 
 
 def warp_between(grid: Grid, other: Grid) -> Warp:
-    """Pixels of another grid from pixels of a grid, to a hundredth of a pixel."""
+    """The transform from pixels of a grid to pixels of another, to a hundredth of a pixel."""
     to_crs = grid.pixels_of(other.crs)[0]
     to_pixel = invert_affine(other.pixel_to_crs)
     return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
 
 
 def overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First pixel (x, y), and the one past the last, of another grid under a grid, widened by two."""
+    """The part of another grid that a grid covers, widened by two pixels.
+
+    Args:
+        grid: that covers.
+        other: whose part is returned.
+
+    Returns:
+        (2,) first pixel (x, y) of ``other``, and (2,) the one past the last; equal where they do not overlap.
+    """
     points = warp_between(grid, other)(grid.lattice())
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:

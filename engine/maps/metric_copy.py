@@ -1,8 +1,8 @@
-"""The copy of a map that can be matched against: north-up on a metric grid, made once and kept in a cache.
+"""The metric copy of a map, which is matched against: north-up in UTM, created once and cached on disk.
 
-A map in degrees, a rotated or oblong one is resampled for it; a large one without overviews gets those. A large
-copy is a folder of tiles, each written and moved to its place in one step with a line in a list that says what its
-content is, so that a copy that was interrupted is carried on, and a tile that was damaged is made anew.
+A map in degrees, a rotated one or one of oblong pixels is resampled for it; a large one without overviews gets
+those. A large copy is a folder of tiles. Each is written and renamed in one step, with a line in a list that has
+the hash of its content, so that an interrupted copy is continued and a damaged tile is created again.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,16 +28,16 @@ from engine.values import Window
 
 MAX_SIDE_PX = 1_000_000
 GRID_VERSION = 1
-"""Part of the key of cached grids; to be raised with every change of how they are made."""
+"""Part of the key of cached copies; to be raised with every change of how they are created."""
 TILE_PX = 8192
 """Side of the tiles of a large copy; each has overviews down to a thirty-second."""
 COARSEST_PX = 16384
 """A large file whose smallest overview has a longer side than this is copied."""
 LIST = "tiles.txt"
-"""In the folder of a large copy: a line a tile with its name, and its SHA-256 or "-" where it holds no map."""
+"""In the folder of a large copy: a line per tile, its name and its SHA-256, or "-" where it has no valid pixel."""
 ProgressCallback = Callable[[int, int], None]
-"""Told while a copy is made: how many pixels of it are there, and how many it will have."""
-_REMEMBERED_BYTES = 1 << 22  # of larger files the hash is remembered with their size and time
+"""Called while a copy is created, with the number of pixels done and in all."""
+_CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
 _FACTORS = [2, 4, 8, 16, 32]
 
 
@@ -51,7 +52,9 @@ def _metric_grid(source: Grid) -> Grid:
     near = to_utm(source.centre_px + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
     outline = to_utm(source.lattice())
     low, high = outline.min(axis=0), outline.max(axis=0)
-    with np.errstate(invalid="ignore"):  # places that UTM cannot show are infinite; the check below refuses them
+    with np.errstate(
+        invalid="ignore"
+    ):  # outside UTM's range coordinates are infinite; the check below refuses them
         step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
         size = (high - low) / step
     if not (np.isfinite(size).all() and size.max() <= MAX_SIDE_PX):
@@ -61,12 +64,12 @@ def _metric_grid(source: Grid) -> Grid:
 
 
 def is_large(grid: Grid) -> bool:
-    """Whether a map of this grid is read part by part, instead of being held in memory."""
+    """Whether a map of this grid is read window by window, instead of being held in memory."""
     return grid.width_px * grid.height_px > MEMORY_LIMIT_PX
 
 
 def needs_copy(source: Source) -> bool:
-    """Whether a map cannot be used as it is: its grid is no metric one, or it is large without overviews."""
+    """Whether a map cannot be used as it is: its grid is not metric, or it is large without overviews."""
     grid = source.grid
     if not grid.is_metric:
         return True
@@ -118,47 +121,47 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> It
         yield window, block
 
 
-class _Tally:
-    """Adds up what is there of a copy, and tells it."""
+class _Progress:
+    """Counts the pixels of a copy that are done, and reports them."""
 
-    def __init__(self, grid: Grid, tell: ProgressCallback | None) -> None:
-        self._there_px, self._all_px, self._tell = 0, grid.width_px * grid.height_px, tell
+    def __init__(self, grid: Grid, on_progress: ProgressCallback | None) -> None:
+        self._done_px, self._all_px, self._on_progress = 0, grid.width_px * grid.height_px, on_progress
 
     def add(self, count_px: int, *, quietly: bool = False) -> None:
-        self._there_px += count_px
-        if self._tell is not None and not quietly:
-            self._tell(self._there_px, self._all_px)
+        self._done_px += count_px
+        if self._on_progress is not None and not quietly:
+            self._on_progress(self._done_px, self._all_px)
 
 
 def open_metric_copy(
     source: Source,
     reader: GrayReader | None,
     cache_dir: str | os.PathLike[str] | None,
-    tell: ProgressCallback | None = None,
+    on_progress: ProgressCallback | None = None,
 ) -> Source:
-    """The source on its metric grid, from the cache where it was made before.
+    """The source on its metric grid, from the cache where there is a copy.
 
     The key is the SHA-256 of the content of the file and of the files beside it that GDAL uses, of the
-    georeference, and of the version of this format. A cached file that does not fit or cannot be read is made
-    anew; where the cache cannot be written, the copy lives in the temporary directory as long as the map.
+    georeference, and of the version of this format. A cached file that does not fit or cannot be read is created
+    again; where the cache cannot be written, the copy stays in the temporary directory as long as the map is open.
 
     Args:
         source: the map.
-        reader: of its pixels, None to make one if it is needed.
-        cache_dir: where copies are kept; None for the user's cache.
-        tell: called while a copy is made, and not where there is one already.
+        reader: of its pixels, None to create one if it is needed.
+        cache_dir: folder of the copies; None for the user's cache.
+        on_progress: called while a copy is created, and not where there is one already.
     """
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
     default = os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenematch")
     cache = Path(cache_dir if cache_dir is not None else default)
     name = _key(source, cache)
-    make, name = (_tiled, name) if is_large(grid) else (_single, f"{name}.tif")
+    build, name = (_tiled, name) if is_large(grid) else (_single, f"{name}.tif")
     try:
-        return make(cache / name, source, reader, grid, tell)
+        return build(cache / name, source, reader, grid, on_progress)
     except OSError:
         folder = tempfile.mkdtemp(prefix="scenematch-")
     with map_errors("map", source.path):
-        copy = make(Path(folder) / name, source, reader, grid, tell)
+        copy = build(Path(folder) / name, source, reader, grid, on_progress)
     weakref.finalize(copy, shutil.rmtree, folder, ignore_errors=True)
     return copy
 
@@ -166,26 +169,26 @@ def open_metric_copy(
 def _key(source: Source, cache: Path) -> str:
     digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
     digest.update(source.grid.pixel_to_crs.tobytes())
-    if isinstance(source.dataset, TileCache):  # too many files to read them all only to name the copy
+    if isinstance(source.dataset, TileCache):  # reading all files only for the key would take too long
         digest.update(source.dataset.fingerprint())
         return digest.hexdigest()
     if source.dataset.driver == "VRT":
-        digest.update(source.dataset.name.encode())  # its text: which tile lies where
+        digest.update(source.dataset.name.encode())  # its XML: the positions of the tiles
     for name in source.dataset.files:
         digest.update(bytes.fromhex(_file_hash(Path(name), cache)))
     return digest.hexdigest()
 
 
 def _file_hash(path: Path, cache: Path) -> str:
-    """SHA-256 of a file's content; that of a large one is remembered while its size and time stay the same."""
+    """SHA-256 of a file's content; that of a large one is cached while its size and time stay the same."""
     found = path.stat()
-    told = hashlib.sha256(f"{path.absolute()} {found.st_size} {found.st_mtime_ns} {found.st_ino}".encode())
-    note = cache / "hashes" / told.hexdigest()
-    if found.st_size > _REMEMBERED_BYTES and note.is_file() and note.stat().st_size == 64:
+    identity = hashlib.sha256(f"{path.absolute()} {found.st_size} {found.st_mtime_ns} {found.st_ino}".encode())
+    note = cache / "hashes" / identity.hexdigest()
+    if found.st_size > _CACHED_HASH_BYTES and note.is_file() and note.stat().st_size == 64:
         return note.read_text(encoding="ascii")
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    if found.st_size > _REMEMBERED_BYTES:
+    if found.st_size > _CACHED_HASH_BYTES:
         with contextlib.suppress(OSError):
             note.parent.mkdir(parents=True, exist_ok=True)
             note.write_text(digest, encoding="ascii")
@@ -193,7 +196,7 @@ def _file_hash(path: Path, cache: Path) -> str:
 
 
 def _single(
-    target: Path, source: Source, reader: GrayReader | None, grid: Grid, tell: ProgressCallback | None
+    target: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
 ) -> Source:
     """A copy in one file.
 
@@ -204,8 +207,8 @@ def _single(
     if cached is not None:
         return cached
     target.parent.mkdir(parents=True, exist_ok=True)
-    whole, tally = Window(0, 0, grid.width_px, grid.height_px), _Tally(grid, tell)
-    _write(target, reader or GrayReader(source), source.grid, grid, whole, tally)
+    whole, progress = Window(0, 0, grid.width_px, grid.height_px), _Progress(grid, on_progress)
+    _write(target, reader or GrayReader(source), source.grid, grid, whole, progress)
     copy = _cached(target, grid)
     if copy is None:
         raise OSError(f"{target} could not be read back")
@@ -213,34 +216,34 @@ def _single(
 
 
 def _tiled(
-    folder: Path, source: Source, reader: GrayReader | None, grid: Grid, tell: ProgressCallback | None
+    folder: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
 ) -> Source:
-    """A large copy: the tiles that are missing or not what the list says are made, the others stay.
+    """A large copy: tiles that are missing or differ from the list are created, the others stay.
 
     Raises:
         OSError: a tile cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    listed, tally = _read_list(folder / LIST), _Tally(grid, tell)
+    listed, progress = _read_list(folder / LIST), _Progress(grid, on_progress)
     tiles = list(_blocks(Window(0, 0, grid.width_px, grid.height_px), TILE_PX))
     for tile in tiles:
         target = folder / f"{tile.y0 // TILE_PX:04d}-{tile.x0 // TILE_PX:04d}.tif"
-        told = listed.get(target.name)
-        if told == ("-" if not target.exists() else _file_hash(target, folder.parent)):
-            tally.add(tile.area_px, quietly=True)
+        recorded = listed.get(target.name)
+        if recorded == ("-" if not target.exists() else _file_hash(target, folder.parent)):
+            progress.add(tile.area_px, quietly=True)
             continue
-        tally.add(0)  # what comes next may take a while before it has made anything
+        progress.add(0)  # reports that work goes on before the first block is done
         reader = reader or GrayReader(source)
-        corner = tile in (tiles[0], tiles[-1])  # the grid ends where they do
-        holds_map = _write(target, reader, source.grid, grid, tile, tally, even_empty=corner)
-        told = _file_hash(target, folder.parent) if holds_map else "-"
+        corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
+        holds_map = _write(target, reader, source.grid, grid, tile, progress, even_empty=corner)
+        recorded = _file_hash(target, folder.parent) if holds_map else "-"
         with (folder / LIST).open("a", encoding="ascii") as stream:
-            stream.write(f"{target.name} {told}\n")
+            stream.write(f"{target.name} {recorded}\n")
     return open_source(folder)
 
 
 def _read_list(path: Path) -> dict[str, str]:
-    """What a list says of each tile; the last line counts, and one that was cut off does not."""
+    """The recorded hash of each tile; of several lines the last counts, and a truncated one does not."""
     if not path.is_file():
         return {}
     lines = (line.split() for line in path.read_text(encoding="ascii", errors="replace").splitlines())
@@ -263,17 +266,28 @@ def _cached(path: Path, grid: Grid) -> Source | None:
     return source
 
 
+def _profile(grid: Grid, part: Window) -> dict[str, Any]:
+    """Options of rasterio for the GeoTIFF of a part of the copy."""
+    from rasterio import Affine
+
+    (a, _, c), (_, e, f) = grid.pixel_to_crs
+    x, y = c + a * (part.x0 - 0.5), f + e * (part.y0 - 0.5)
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 2, "crs": grid.crs.to_wkt(), "bigtiff": "if_safer"}
+    profile |= {"tiled": True, "compress": "deflate", "width": part.width_px, "height": part.height_px}
+    return profile | {"transform": Affine(a, 0.0, x, 0.0, e, y)}
+
+
 def _write(
     target: Path,
     reader: GrayReader,
     source: Grid,
     grid: Grid,
     part: Window,
-    tally: _Tally,
+    progress: _Progress,
     *,
     even_empty: bool = True,
 ) -> bool:
-    """Write a part of the copy beside its place and move it there in one step; whether it holds any map.
+    """Write a part of the copy under a temporary name and rename it; return whether it has any valid pixel.
 
     Raises:
         OSError: it cannot be written.
@@ -282,23 +296,18 @@ def _write(
     from rasterio.enums import ColorInterp, Resampling
     from rasterio.windows import Window as RasterWindow
 
-    (a, _, c), (_, e, f) = grid.pixel_to_crs
-    x, y = c + a * (part.x0 - 0.5), f + e * (part.y0 - 0.5)
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 2, "crs": grid.crs.to_wkt(), "bigtiff": "if_safer"}
-    profile |= {"tiled": True, "compress": "deflate", "width": part.width_px, "height": part.height_px}
-    profile["transform"] = rasterio.Affine(a, 0.0, x, 0.0, e, y)
     is_tile = (part.width_px, part.height_px) != (grid.width_px, grid.height_px)
     handle, name = tempfile.mkstemp(suffix=".part", dir=target.parent)
     os.close(handle)
     holds_map = False
     try:
-        with rasterio.open(name, "w", **profile) as dataset:
+        with rasterio.open(name, "w", **_profile(grid, part)) as dataset:
             dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
             for window, block in _copied(reader, source, grid, part):
-                place = (window.x0 - part.x0, window.y0 - part.y0)
-                dataset.write(block, window=RasterWindow(*place, window.width_px, window.height_px))
+                corner = (window.x0 - part.x0, window.y0 - part.y0)
+                dataset.write(block, window=RasterWindow(*corner, window.width_px, window.height_px))
                 holds_map = holds_map or bool(block[1].any())
-                tally.add(window.area_px)
+                progress.add(window.area_px)
             if is_tile:
                 dataset.build_overviews(_FACTORS, Resampling.average)
         if holds_map or even_empty:

@@ -18,11 +18,11 @@ MIN_LEVEL_PX = 16
 
 
 class Reader(Protocol):
-    """Where pixels come from: a file, or arrays.
+    """Source of pixels: a file, or arrays.
 
     Attributes:
-        levels: that can be read, in rising order, 0 among them.
-        all_valid: whether no pixel can be nodata, whichever is read.
+        levels: that can be read, ascending, 0 among them.
+        all_valid: whether no pixel can be nodata.
     """
 
     @property
@@ -32,12 +32,27 @@ class Reader(Protocol):
     def all_valid(self) -> bool: ...  # noqa: D102
 
     def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
-        """Grey and validity (h, w) of a window in pixels of one of the levels."""
+        """Read a window.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: one of :attr:`levels`.
+
+        Returns:
+            (h, w) uint8 grey and (h, w) bool validity.
+        """
 
 
 @dataclass(frozen=True)
-class Arrays:
-    """A reader of arrays (H, W)."""
+class ArrayReader:
+    """A reader of arrays in memory.
+
+    Attributes:
+        gray: (H, W) uint8.
+        valid: (H, W) bool.
+        levels: 0 alone.
+        all_valid: False, since nodata is looked up in ``valid``.
+    """
 
     gray: Gray
     valid: Mask
@@ -45,18 +60,26 @@ class Arrays:
     all_valid: bool = False
 
     def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
-        """Grey and validity (h, w) of a window."""
+        """Read a window.
+
+        Args:
+            window: inside the arrays.
+            level: 0.
+
+        Returns:
+            (h, w) uint8 grey and (h, w) bool validity, without a copy.
+        """
         part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
         return self.gray[part], self.valid[part]
 
 
 class Pyramid:
-    """Grey and validity at every level: a small map in memory; of a large one the coarse levels, the others read.
+    """Grey and validity at every level; a large map's fine levels are read from the file, all others in memory.
 
     Args:
         width_px: of level 0.
         height_px: of level 0.
-        reader: of the pixels. What lies between its levels is halved from the next finer one.
+        reader: of the pixels. Levels that it lacks are averaged from the next finer one.
     """
 
     def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
@@ -68,10 +91,10 @@ class Pyramid:
         limit_px = min(MEMORY_LIMIT_PX, COARSE_LIMIT_PX)
         while self.is_large and self._base < self.levels - 1 and math.prod(self.shape(self._base)) > limit_px:
             self._base += 1
-        self._kept: dict[int, tuple[Gray, Mask]] = {}
+        self._cached: dict[int, tuple[Gray, Mask]] = {}
         self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
         if self._base == 0:
-            self._kept[0] = self._streamed(0)
+            self._cached[0] = self._streamed(0)
 
     def shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""
@@ -80,7 +103,7 @@ class Pyramid:
         return self._size[0] >> level, self._size[1] >> level
 
     def _streamed(self, level: int) -> tuple[Gray, Mask]:
-        """A whole level, read in strips so that colour and masks of the file never lie in memory at once."""
+        """A whole level, read in strips so that colour and masks of the file are never in memory at once."""
         height, width = self.shape(level)
         gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
         rows = max(1, 1024 >> (level - self._stored(level)))
@@ -90,7 +113,7 @@ class Pyramid:
         return gray, valid
 
     def _stored(self, level: int) -> int:
-        """The level that is read for another."""
+        """The level that is read to compute another."""
         return max(stored for stored in self._reader.levels if stored <= level)
 
     def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
@@ -101,13 +124,24 @@ class Pyramid:
         return both
 
     def _level(self, level: int) -> tuple[Gray, Mask]:
-        if level not in self._kept:
+        if level not in self._cached:
             at_base = level == self._base
-            self._kept[level] = self._streamed(level) if at_base else _halved(*self._level(level - 1))
-        return self._kept[level]
+            self._cached[level] = self._streamed(level) if at_base else _halved(*self._level(level - 1))
+        return self._cached[level]
 
     def crop(self, window: Window, level: int) -> tuple[Gray, Mask]:
-        """Grey and validity (h, w) of a window in pixels of a level."""
+        """Grey and validity of a window.
+
+        Args:
+            window: in pixels of the level.
+            level: of the pyramid.
+
+        Returns:
+            (h, w) uint8 grey and (h, w) bool validity; views where the level is in memory.
+
+        Raises:
+            OptionError: the window is empty or not inside, or there is no such level.
+        """
         height, width = self.shape(level)
         x1, y1 = window.x0 + window.width_px, window.y0 + window.height_px
         if not (0 <= window.x0 < x1 <= width and 0 <= window.y0 < y1 <= height):
@@ -116,13 +150,13 @@ class Pyramid:
             gray, valid = self._level(level)
             return gray[window.y0 : y1, window.x0 : x1], valid[window.y0 : y1, window.x0 : x1]
         last = self._last
-        if last is None or last[0] != (window, level):  # grey and validity are often asked in turn
+        if last is None or last[0] != (window, level):  # grey and validity are often read in turn
             last = self._last = ((window, level), self._from_file(window, level))
         return last[1]
 
     @property
     def fully_valid(self) -> bool:
-        """Whether no pixel is nodata; of a large map only where its file has no way to say that one is."""
+        """Whether no pixel is nodata; of a large map only where its file format cannot mark nodata."""
         return self._reader.all_valid if self.is_large else self.nodata_share == 0.0
 
     @cached_property
@@ -131,13 +165,24 @@ class Pyramid:
         return 1.0 - float(self._level(self._base)[1].mean())
 
     def valid_at(self, xy_px: Array) -> Mask:
-        """Validity (...,) at places (..., 2) of level 0, cut to whole pixels of the finest level in memory."""
+        """Validity at the nearest pixels of the finest level in memory.
+
+        Args:
+            xy_px: (..., 2) pixels of level 0, not negative.
+
+        Returns:
+            (...,) bool.
+        """
         height, width = self.shape(self._base)
         x, y = np.moveaxis(xy_px.astype(np.intp) >> self._base, -1, 0)
         return np.asarray(self._level(self._base)[1][np.minimum(y, height - 1), np.minimum(x, width - 1)])
 
     def innermost_px(self) -> Array:
-        """The pixel (2,) of level 0 that is farthest from any that is not valid."""
+        """The valid pixel that is farthest from any nodata.
+
+        Returns:
+            (2,) pixels of level 0.
+        """
         import cv2
 
         valid = np.pad(self._level(self._base)[1].astype(np.uint8), 1)

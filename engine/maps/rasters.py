@@ -1,12 +1,12 @@
-"""Raster files: what may be opened, where it lies on the Earth, its grey values or its heights.
+"""Raster files: opening, georeference and grey values.
 
 Convention:
-    GDAL's origin, the outer corner of the first pixel, is left behind in :func:`_centred`; a :class:`Source` has
-    the pixels of :mod:`engine.maps.grids`, centres at integers.
+    GDAL's origin, the outer corner of the first pixel, is converted in :func:`_centred`; a :class:`Source` has the
+    pixels of :mod:`engine.maps.grids`, centres at integers.
 
-Nodata is what the file says (tag, mask, alpha, NaN). A file that says nothing may still have a collar: pixels
-whose bands are all exactly 0, or all exactly the largest value, that hang together with the border of the
-picture and jointly cover more than :data:`COLLAR_SHARE` of it, count as nodata. Dark pixels inside do not.
+Nodata is what the file marks (tag, mask, alpha, NaN). A file without such marks may still have a collar: pixels
+whose bands are all exactly 0, or all exactly the largest value, that are connected to the border of the picture
+and together cover more than :data:`COLLAR_SHARE` of it, count as nodata. Dark pixels inside do not.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
-from engine.maps.grids import Array, Grid, apply_affine, earth_crs, overlap, wgs84
+from engine.maps.grids import Array, Grid, earth_crs, wgs84
 from engine.maps.tiles import local_path, openable
-from engine.maps.xyz_tiles import TileCache, is_tile_cache, open_tile_cache
+from engine.maps.xyz_tiles import is_tile_cache, open_tile_cache
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -42,18 +42,14 @@ STRETCH_PERCENT = (2.0, 98.0)
 OVERVIEW_PX = 4096
 """Stretch and collar are found on a copy of at most this many pixels a side."""
 GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
-"""Metadata item of a GeoTIFF: one standard deviation of where it lies, in metres per axis."""
+"""Metadata item of a GeoTIFF: its georeferencing accuracy, one standard deviation in metres per axis."""
 SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
-"""The same of a surface model: of how far the ground under a frame leans against it, in degrees."""
+"""Metadata item of a surface model: its slope accuracy, one standard deviation in degrees."""
 _GDAL_CACHE_BYTES = 128 * 2**20  # GDAL's own cache is a twentieth of the machine's memory
 MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
 COARSE_LIMIT_PX = 16 * 2**20
 """Of those the first level of up to this many pixels, and the coarser ones, are held in memory."""
-SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // 4
-"""The same of heights, which take four times the memory."""
-HEIGHT_RANGE_M = (-1000.0, 20000.0)
-"""Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +62,17 @@ class Source:
 
 
 def stated_sigma(given: float | None, source: Source | None, tag: str, argument: str) -> float | None:
-    """The accuracy that was given, else the one that a file says of itself, else None.
+    """The accuracy that was given, else the one in a file's metadata, else None.
+
+    Args:
+        given: by the user.
+        source: file whose metadata is read.
+        tag: metadata item.
+        argument: name of ``given`` in messages.
 
     Raises:
-        OptionError: what was given is not a number above 0, or wider than any map.
-        MapError: what the file says is not one.
+        OptionError: ``given`` is not above 0, or larger than any map.
+        MapError: the metadata item is not such a number.
     """
     text = None if source is None else source.dataset.tags().get(tag)
     if given is not None:
@@ -92,7 +94,7 @@ def stated_sigma(given: float | None, source: Source | None, tag: str, argument:
 
 @contextmanager
 def map_errors(argument: str, path: Path) -> Iterator[None]:
-    """Turn what rasterio raises into one line, and keep GDAL's cache of blocks small while it reads."""
+    """Turn rasterio's errors into one line, and keep GDAL's block cache small while it reads."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
@@ -113,12 +115,12 @@ def open_source(
     bounds_deg: tuple[float, float, float, float] | None = None,
     crs: Any = None,
 ) -> Source:
-    """Open a local raster and find where it lies.
+    """Open a local raster with its georeference.
 
     Args:
         path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a VRT, a folder of georeferenced
             tiles, or one of tiles by their names, z/x/y.png.
-        argument: what a message calls the file.
+        argument: name of the file in messages.
         bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
             and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).
         crs: coordinate reference system of a file that names none; else that of a ``.prj`` beside it.
@@ -126,31 +128,35 @@ def open_source(
     Raises:
         MapError: the file is missing, is no raster that may be opened, or cannot be placed on the Earth.
     """
-    import rasterio
-
     file = local_path(path, argument)
     with map_errors(argument, file):
-        if file.is_dir() and is_tile_cache(file):
-            dataset: Any = open_tile_cache(file, argument)
-        else:
-            what, driver = openable(file, argument)
-            dataset = rasterio.open(what, driver=driver)
+        dataset = _open_dataset(file, argument)
         transform, own_crs = dataset.transform, dataset.crs
-    width, height = dataset.width, dataset.height
+    size = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
     if bounds_deg is not None:
         if own is not None:
             raise MapError(f"bounds_deg: expected none for a file with a georeference of its own, {file}")
         found = earth_crs(crs if crs is not None else "EPSG:4326", "crs")
-        matrix = _from_bounds(bounds_deg, found, width, height)
+        own = _from_bounds(bounds_deg, found, *size)
     elif own is not None:
-        found, matrix = _crs_of(file, argument, own_crs, crs), own
+        found = _crs_of(file, argument, own_crs, crs)
     else:
         raise MapError(
             f"{argument}: {file} is a picture without georeference; give bounds_deg=(west, south, east, "
             "north), or a world file and its CRS (control points and RPCs are not used: gdalwarp them first)"
         )
-    return Source(file, dataset, _checked(Grid(width, height, matrix, found), argument, file))
+    return Source(file, dataset, _checked(Grid(*size, own, found), argument, file))
+
+
+def _open_dataset(file: Path, argument: str) -> Any:
+    """The rasterio dataset of a file or folder, or a tile cache."""
+    import rasterio
+
+    if file.is_dir() and is_tile_cache(file):
+        return open_tile_cache(file, argument)
+    what, driver = openable(file, argument)
+    return rasterio.open(what, driver=driver)
 
 
 def _checked(grid: Grid, argument: str, file: Path) -> Grid:
@@ -165,7 +171,7 @@ def _checked(grid: Grid, argument: str, file: Path) -> Grid:
 
 
 def _centred(transform: Any) -> Array:
-    """The one place where GDAL's origin, the outer corner of the first pixel, moves to that pixel's centre."""
+    """The only conversion of GDAL's origin, the outer corner of the first pixel, to that pixel's centre."""
     a, b, c, d, e, f = list(transform)[:6]
     return np.array([[a, b, c + (a + b) / 2.0], [d, e, f + (d + e) / 2.0]])
 
@@ -213,7 +219,7 @@ class GrayReader:
         levels: of the map's pyramid that the file holds: 0, and those of its overviews.
 
     Raises:
-        MapError: an element type that is no picture, pixels that cannot be read, or none that is valid.
+        MapError: an unsupported element type, pixels that cannot be read, or none that is valid.
     """
 
     def __init__(self, source: Source, *, find_collar: bool = True) -> None:
@@ -240,18 +246,18 @@ class GrayReader:
 
     @property
     def all_valid(self) -> bool:
-        """Whether no pixel can be nodata, whichever is read."""
+        """Whether no pixel can be nodata."""
         flags = self._source.dataset.mask_flag_enums
         never = all("all_valid" in {flag.name for flag in of_band} for of_band in flags)
         return never and not self._collars and np.dtype(self.dtype).kind != "f"
 
     def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
-        """Bands and validity of a window in pixels of the file, as so many (rows, columns)."""
+        """Bands and validity of a window in pixels of the file, resampled to ``size`` (rows, columns)."""
         from rasterio.enums import Resampling
         from rasterio.windows import Window as RasterWindow
 
         crop = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
-        # GDAL reads the overview that fits; its pixels lie between the level's where the size is no multiple.
+        # GDAL reads the overview that fits; its pixels are offset from the level's where the size is no multiple.
         how = Resampling.average if smooth and self._palette is None else Resampling.nearest
         shape = (len(self._bands), *size)
         with self._lock, map_errors("map", self._source.path):  # a GDAL dataset serves one thread at a time
@@ -263,7 +269,18 @@ class GrayReader:
         return data, valid & np.isfinite(data).all(axis=0) if data.dtype.kind == "f" else valid
 
     def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
-        """Grey values and validity (h, w) of a window that lies inside, in pixels of one of :attr:`levels`."""
+        """Read a window.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: one of :attr:`levels`.
+
+        Returns:
+            (h, w) uint8 grey and (h, w) bool validity.
+
+        Raises:
+            MapError: the file cannot be read.
+        """
         full = scaled_window(window, level)
         data, valid = self._read(full, (window.height_px, window.width_px), smooth=level > 0)
         for value, area in self._collars.items():
@@ -281,7 +298,7 @@ class GrayReader:
 
 
 def scaled_window(window: Window, levels: int) -> Window:
-    """A window in pixels of a level so many levels finer."""
+    """The same window in pixels of a level ``levels`` finer."""
     return Window(*(v << levels for v in (window.x0, window.y0, window.width_px, window.height_px)))
 
 
@@ -312,9 +329,9 @@ def _luma(data: NDArray[Any]) -> NDArray[Any]:
 
 
 def _collars(data: NDArray[Any]) -> dict[float, Mask]:
-    """For pure black and pure white: the area that hangs together with the border.
+    """For pure black and pure white: the area that is connected to the border, by value.
 
-    It is widened by a pixel, because the border of a collar falls between the pixels of a thinned copy.
+    It is dilated by a pixel, because the border of a collar falls between the pixels of a decimated copy.
     """
     import cv2
 
@@ -328,68 +345,3 @@ def _collars(data: NDArray[Any]) -> dict[float, Mask]:
         if area.mean() > COLLAR_SHARE:
             found[float(value)] = cv2.dilate(area.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return found
-
-
-def read_surface(source: Source, grid: Grid, limit_px: int = SURFACE_LIMIT_PX) -> tuple[NDArray[np.float32], Grid]:
-    """Heights (NaN where unknown) and grid of the part of a surface model that lies under a map.
-
-    It is thinned by averages where it has more pixels than the limit.
-
-    Raises:
-        MapError: it cannot be read, or lies elsewhere.
-    """
-    part = surface_part(source, grid)
-    thin = max(1.0, math.sqrt(float(part.area_px) / limit_px))
-    shape = (math.ceil(part.height_px / thin), math.ceil(part.width_px / thin))
-    return read_heights(source, part, shape), part_grid(source.grid, part, shape)
-
-
-def surface_part(source: Source, grid: Grid) -> Window:
-    """The part of a surface model that lies under a map, in the model's pixels.
-
-    Raises:
-        MapError: it holds no heights, or lies elsewhere.
-    """
-    dtype = source.dataset.dtypes[0]
-    if isinstance(source.dataset, TileCache):
-        raise MapError(f"surface: expected heights, got a folder of pictures, {source.path}")
-    if np.dtype(dtype).kind not in "iuf":
-        raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
-    low, high = overlap(grid, source.grid)
-    if not (high > low).all():
-        raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
-    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-
-
-def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Heights of a window of a surface model as so many (rows, columns), NaN where unknown.
-
-    Raises:
-        MapError: it cannot be read.
-    """
-    from rasterio.enums import Resampling
-    from rasterio.windows import Window as RasterWindow
-
-    whole = shape == (part.height_px, part.width_px)
-    with map_errors("surface", source.path):
-        data = source.dataset.read(
-            1,
-            window=RasterWindow(part.x0, part.y0, part.width_px, part.height_px),
-            out_shape=shape,
-            masked=True,
-            resampling=Resampling.nearest if whole else Resampling.average,
-        )
-    heights = data.astype(np.float32).filled(np.nan) * source.dataset.scales[0] + source.dataset.offsets[0]
-    heights[~((heights > HEIGHT_RANGE_M[0]) & (heights < HEIGHT_RANGE_M[1]))] = np.nan
-    return np.asarray(heights, np.float32)
-
-
-def part_grid(own: Grid, part: Window, shape: tuple[int, int]) -> Grid:
-    """The grid of a window of another, thinned to so many (rows, columns)."""
-    low, size = np.array([part.x0, part.y0]), np.array([part.width_px, part.height_px])
-    scale = size / np.array(shape[::-1])
-    # Pixel x of the thinned copy covers the file's pixels around low + (x + 0.5) * scale - 0.5.
-    crop_to_file = np.column_stack([np.diag(scale), low + 0.5 * scale - 0.5])
-    linear = own.pixel_to_crs[:, :2] @ crop_to_file[:, :2]
-    origin = apply_affine(own.pixel_to_crs, crop_to_file[:, 2])
-    return Grid(shape[1], shape[0], np.column_stack([linear, origin]), own.crs)

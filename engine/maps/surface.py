@@ -9,49 +9,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.maps.grids import Array, Grid, Warp, warp_between
-from engine.maps.rasters import (
-    COARSE_LIMIT_PX,
-    SURFACE_LIMIT_PX,
-    Source,
-    part_grid,
-    read_heights,
-    read_surface,
-    surface_part,
-)
+from engine.maps.heights import SURFACE_LIMIT_PX, part_grid, read_heights, read_surface, surface_part
+from engine.maps.rasters import COARSE_LIMIT_PX, Source
 from engine.values import Window
 
 Heights = NDArray[np.float32]
 
 GROUND_PERCENT = 20.0
-"""Percentile of the surface that is taken as the level of the ground."""
+"""Percentile of the surface that is used as the level of the ground."""
 TILE_PX = 256
-"""What is read of a large surface begins and ends on multiples of this."""
+"""Patches of a large surface begin and end on multiples of this."""
 MAX_SPAN = 6
-"""Places that lie within so many tiles a side are looked up in one patch."""
+"""Lookups that span fewer tiles than this per side are read as one patch."""
 MAX_PATCHES = 16
-"""So many patches are kept, of at most 9 MiB."""
+"""Number of patches that are cached, of at most 9 MiB each."""
 _Patch = tuple[int, int, int, int]  # first row and column of tiles, and the last ones
 _LATTICE = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 15)] * 2), axis=-1).reshape(-1, 2)
-"""Where heights are looked at to find a plane, as shares of the way to the sides of the square."""
+"""Sample positions of a plane fit, relative to half the side of the square."""
 _ROUNDS = 8
-_ON_PLANE_M = 0.3  # heights closer to a plane than this lie on it
+_ON_PLANE_M = 0.3  # residual below which a height counts as on the plane
 
 
 class HeightTiles:
-    """Heights of a large surface model, looked up like an array (H, W) and read where they are looked up.
+    """Heights of a large surface model, indexed like an array (H, W) and read from the file on demand.
 
     Args:
         source: the model.
-        part: of it, in its pixels: what is looked up.
+        part: window of it, in its pixels, that is indexed.
     """
 
     def __init__(self, source: Source, part: Window) -> None:
         self._source, self._part, self._lock = source, part, threading.Lock()
-        self._patches: OrderedDict[_Patch, Heights] = OrderedDict()  # the one used last comes last
+        self._patches: OrderedDict[_Patch, Heights] = OrderedDict()  # the most recently used is last
         self.shape = (part.height_px, part.width_px)
 
-    def __getitem__(self, place: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
-        rows, columns = place
+    def __getitem__(self, index: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
+        rows, columns = index
         if rows.size == 0:
             return np.empty(rows.shape, np.float32)
         y0, x0, y1, x1 = (int(v) // TILE_PX for v in (rows.min(), columns.min(), rows.max(), columns.max()))
@@ -87,21 +80,35 @@ class SurfaceModel:
 
     Args:
         heights_m: (H, W), NaN where unknown.
-        from_map: to its pixels from those of the map.
-        thinned: the same surface with fewer pixels, where it is too large to be looked at as a whole.
+        from_map: from pixels of the map to those of the heights.
+        decimated: the same surface with fewer pixels, where it is too large to be sampled as a whole.
     """
 
     def __init__(
-        self, heights_m: Heights | HeightTiles, from_map: Warp, thinned: SurfaceModel | None = None
+        self, heights_m: Heights | HeightTiles, from_map: Warp, decimated: SurfaceModel | None = None
     ) -> None:
-        self._heights_m, self._from_map, self._thinned = heights_m, from_map, thinned
+        self._heights_m, self._from_map, self._decimated = heights_m, from_map, decimated
 
     def overview(self, map_xy: Array) -> Array:
-        """As :meth:`sample`, for places all over the map: of the thinned surface where there is one."""
-        return (self._thinned or self).sample(map_xy)
+        """Heights for samples spread over the whole map: of the decimated surface where there is one.
+
+        Args:
+            map_xy: (..., 2) pixels of the map.
+
+        Returns:
+            (...,) metres, as :meth:`sample`.
+        """
+        return (self._decimated or self).sample(map_xy)
 
     def sample(self, map_xy: Array) -> Array:
-        """Bilinear heights (...,) of map pixels (..., 2), NaN outside and next to nodata."""
+        """Bilinear heights.
+
+        Args:
+            map_xy: (..., 2) pixels of the map.
+
+        Returns:
+            (...,) metres, NaN outside and next to nodata.
+        """
         height, width = self._heights_m.shape
         last = np.array([width - 1.0, height - 1.0])
         at = self._from_map(map_xy)
@@ -119,7 +126,7 @@ class SurfaceModel:
         """The plane with a fifth of the surface below it in a square about one map pixel (2,).
 
         Args:
-            map_xy: the square's middle.
+            map_xy: (2,) the square's middle.
             reach_px: half its side.
 
         Returns:
@@ -139,26 +146,26 @@ class SurfaceModel:
     def range_m(self) -> tuple[float, float]:
         """Lowest and highest known height; of a large surface those of its averages."""
         if not isinstance(self._heights_m, np.ndarray):
-            assert self._thinned is not None  # what is read in tiles comes with it
-            return self._thinned.range_m
+            assert self._decimated is not None  # what is read in tiles comes with it
+            return self._decimated.range_m
         return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
 
 
 def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
-    """The surface under a map, and the grid of what is used of it: in memory, or where it is large tile by tile.
+    """The surface under a map and its grid: in memory, or read tile by tile where it is large.
 
     Args:
         source: the model.
         grid: of the map.
 
     Raises:
-        MapError: it cannot be read, or lies elsewhere.
+        MapError: it cannot be read, or does not overlap the map.
     """
     part = surface_part(source, grid)
     large = part.area_px > SURFACE_LIMIT_PX
-    heights, lies = read_surface(source, grid, COARSE_LIMIT_PX if large else SURFACE_LIMIT_PX)
-    surface = SurfaceModel(heights, warp_between(grid, lies))
+    heights, surface_grid = read_surface(source, grid, COARSE_LIMIT_PX if large else SURFACE_LIMIT_PX)
+    surface = SurfaceModel(heights, warp_between(grid, surface_grid))
     if large:
         tiles = HeightTiles(source, part)
         surface = SurfaceModel(tiles, warp_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
-    return surface, lies
+    return surface, surface_grid

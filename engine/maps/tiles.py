@@ -1,7 +1,7 @@
-"""What may be opened as a raster: a local file by its first bytes, a folder of tiles or a VRT as one picture.
+"""Raster files that may be opened: a local file by its first bytes, a folder of tiles or a VRT as one picture.
 
-A folder of tiles becomes the text of a VRT, GDAL's list of what lies where. One that a user brings is read too,
-once it is seen to name nothing but local raster files.
+A folder of tiles becomes the text of a VRT, GDAL's mosaic format. A user's VRT is read too, after a check that it
+names nothing but local raster files.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ SIGNATURES = (
     ("WEBP", (b"RIFF",)),
     ("MBTiles", (b"SQLite format 3\0",)),
 )
-"""GDAL drivers that may open a file, and how its content must begin; the ending of its name does not count."""
+"""GDAL drivers and the signatures of their files; the ending of a file's name does not count."""
 NO_TILES = (".ovr", ".msk", ".aux", ".part")
-"""Endings of rasters that belong to another, or are being written: a folder's tiles are the others."""
+"""Endings of side files and partial files, which are not tiles of a folder."""
 OWN_TAGS = "SCENEMATCH_"
-"""What the metadata items begin with that a map says of itself; a folder says what all its tiles say."""
+"""Prefix of this project's metadata items; a folder of tiles has those that all its tiles share."""
 OFF_GRID_PX = 0.05
-"""So far from whole pixels of the first tile's grid another may begin; beyond it would have to be resampled."""
+"""Largest offset of a tile from whole pixels of the first tile's grid; beyond it would have to be resampled."""
 _VRT_HEAD = b"<VRTDataset"
 _VRT_TAGS = frozenset(
     (
@@ -47,7 +47,7 @@ _TYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Flo
 
 @dataclass(frozen=True)
 class _Tile:
-    """What is read of a tile before it is laid beside others."""
+    """Properties of a tile in a mosaic."""
 
     path: Path
     size: tuple[int, int]
@@ -56,14 +56,14 @@ class _Tile:
     kind: tuple[int, str, str, float, float]  # bands that are used, element type, nodata, scale and offset
     block: tuple[int, int]
     overviews: tuple[int, ...]
-    says: frozenset[tuple[str, str]]  # of itself, in metadata items of this project
+    own_tags: frozenset[tuple[str, str]]  # metadata items of this project
 
 
 def local_path(path: str | os.PathLike[str], argument: str) -> Path:
-    """The absolute path of a file or folder of this machine.
+    """The absolute path of a local file or folder.
 
     Raises:
-        MapError: it is an address, or does not exist.
+        MapError: it is a URL, or does not exist.
     """
     text = os.fspath(path)
     if not text or "://" in text or text.startswith("/vsi"):
@@ -79,7 +79,7 @@ def driver_of(file: Path, argument: str) -> str:
     """GDAL's driver for a file, or "VRT".
 
     Raises:
-        MapError: it is none of those that may be opened.
+        MapError: it is of no supported format.
     """
     with file.open("rb") as stream:
         head = stream.read(1024)
@@ -93,7 +93,7 @@ def driver_of(file: Path, argument: str) -> str:
 
 
 def openable(path: Path, argument: str) -> tuple[str | Path, str]:
-    """What GDAL is to open for a file or folder, and by which driver: the file itself, or the text of a VRT.
+    """What GDAL opens for a file or folder, the file itself or the text of a VRT, and its driver.
 
     Raises:
         MapError: it is no raster, or its tiles do not fit together.
@@ -108,7 +108,7 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
 
 
 def vrt_of_folder(folder: Path, argument: str) -> str:
-    """The text of a VRT that lays the tiles of a folder beside each other; what no tile covers is nodata.
+    """The text of a VRT that joins the tiles of a folder; what no tile covers is nodata.
 
     Raises:
         MapError: there are none, or they differ in CRS, size of a pixel, bands or element type, or are no tiles
@@ -122,17 +122,18 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
     first = tiles[0]
     for tile in tiles[1:]:
         _check_beside(first, tile, argument)
-    places = [_place(first, tile, argument) for tile in tiles]
-    left, top = (min(place[axis] for place in places) for axis in (0, 1))
+    positions = [_position(first, tile, argument) for tile in tiles]
+    left, top = (min(position[axis] for position in positions) for axis in (0, 1))
     right, bottom = (
-        max(place[axis] + tile.size[axis] for place, tile in zip(places, tiles, strict=True)) for axis in (0, 1)
+        max(position[axis] + tile.size[axis] for position, tile in zip(positions, tiles, strict=True))
+        for axis in (0, 1)
     )
-    corners = [(x - left, y - top) for x, y in places]
+    corners = [(x - left, y - top) for x, y in positions]
     return _vrt_text(tiles, corners, (right - left, bottom - top), _moved(first.transform, left, top))
 
 
 def _moved(transform: Any, x: int, y: int) -> list[float]:
-    """GDAL's six numbers of a transform whose first pixel is another."""
+    """GDAL's six numbers of a transform whose origin is moved by (x, y) pixels."""
     a, b, c, d, e, f = list(transform)[:6]
     return [c + a * x + b * y, a, b, f + d * x + e * y, d, e]
 
@@ -168,7 +169,7 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
             kind=(bands, dtype, str(dataset.nodata), dataset.scales[0], dataset.offsets[0]),
             block=dataset.block_shapes[0],
             overviews=tuple(dataset.overviews(1)),
-            says=frozenset((k, v) for k, v in dataset.tags().items() if k.startswith(OWN_TAGS)),
+            own_tags=frozenset((k, v) for k, v in dataset.tags().items() if k.startswith(OWN_TAGS)),
         )
 
 
@@ -193,7 +194,7 @@ def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:
             )
 
 
-def _place(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:
+def _position(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:
     """Column and row of the first tile's grid at which another begins."""
     a, b, c, d, e, f = list(first.transform)[:6]
     x, y = np.linalg.solve([[a, b], [d, e]], [tile.transform.c - c, tile.transform.f - f])
@@ -210,8 +211,8 @@ def _vrt_text(
 ) -> str:
     """The VRT of tiles by their top-left corners.
 
-    Where no tile lies is what their tag calls nodata. Where they have no tag, a mask band joins their own masks;
-    those of tagged tiles GDAL would read into it in pieces of the wrong width.
+    Pixels without a tile have the tiles' nodata value. Where there is none, a mask band joins the tiles' masks;
+    those of tiles with a nodata value GDAL would read into it in pieces of the wrong width.
     """
     bands, dtype, nodata, scale, offset = tiles[0].kind
     root = Xml.Element("VRTDataset", rasterXSize=str(size[0]), rasterYSize=str(size[1]))
@@ -219,7 +220,7 @@ def _vrt_text(
         Xml.SubElement(root, "SRS").text = tiles[0].crs.to_wkt()
     Xml.SubElement(root, "GeoTransform").text = ", ".join(repr(v) for v in transform)
     metadata = Xml.SubElement(root, "Metadata")
-    for key, value in sorted(frozenset.intersection(*(tile.says for tile in tiles))):
+    for key, value in sorted(frozenset.intersection(*(tile.own_tags for tile in tiles))):
         Xml.SubElement(metadata, "MDI", key=key).text = value
     _add_overviews(root, max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews)
     for band in range(1, bands + 1):
@@ -236,7 +237,7 @@ def _vrt_text(
 
 
 def _add_overviews(root: Xml.Element, factors: Sequence[int]) -> None:
-    """Let the VRT have the overviews of its largest tile; what a smaller one lacks, GDAL makes as it reads."""
+    """Declare the overviews of the largest tile; those that a smaller one lacks, GDAL computes as it reads."""
     if factors:
         Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
 
@@ -267,7 +268,7 @@ def _vrt_of_file(file: Path, argument: str) -> str:
     """The text of a VRT that names nothing but local raster files, with their absolute paths.
 
     Raises:
-        MapError: it can do more than lay rasters beside each other, or names what may not be opened.
+        MapError: it does more than join rasters, or names what may not be opened.
     """
     import rasterio
 
@@ -278,7 +279,7 @@ def _vrt_of_file(file: Path, argument: str) -> str:
     for element in root.iter():
         if element.tag not in _VRT_TAGS or "subClass" in element.attrib:
             what = element.attrib.get("subClass", element.tag)
-            raise MapError(f"{argument}: expected a VRT that lays local files side by side, got {what} in {file}")
+            raise MapError(f"{argument}: expected a VRT that only joins local files, got {what} in {file}")
     largest, overviews = 0, ()
     for element in root.iter("SourceFilename"):
         name = element.text or ""

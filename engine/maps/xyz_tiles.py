@@ -1,7 +1,7 @@
 """Tile caches: a folder of pictures named z/x/y.png, as tile servers and mirrors have them, read as one raster.
 
-Where a tile lies is in its name. So a folder of 100,000 tiles is listed, not opened: only the first tile's size is
-read, and each other tile is decoded, and held against that size, when its pixels are wanted.
+A tile's name gives its position. So a folder of 100,000 tiles is listed, not opened: only the first tile's size is
+read, and each other tile is decoded, and its size checked, when its pixels are read.
 
 Convention:
     Web Mercator (EPSG:3857). Zoom level z has 2^z x 2^z tiles. Column x counts from 180 degrees west, row y from
@@ -29,16 +29,23 @@ from engine.errors import MapError
 Pixels = NDArray[np.uint8]
 
 ENDINGS = ("png", "jpg", "jpeg", "webp")
-"""Of a tile's name. What it holds, its first bytes tell: mirrors write JPEG into files called png."""
+"""Of a tile's name. The format is found by the first bytes: mirrors write JPEG into files called png."""
 FORMATS = ("PNG", "JPEG", "WEBP")
 MAX_ZOOM = 30
 MAX_SIDE_PX = 1_000_000
-"""Tiles further apart than this are no one map."""
+"""Largest side of the map that the tiles span."""
 RESOURCE = "tilemapresource.xml"
-_MERCATOR_CODES = ("3857", "3785", "900913", "41001", "102100", "102113")  # what it has been called
+_MERCATOR_CODES = (
+    "3857",
+    "3785",
+    "900913",
+    "41001",
+    "102100",
+    "102113",
+)  # current and former codes of Web Mercator
 _HALF_WORLD_M = math.pi * 6378137.0
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # Pillow's, of eight bits or fewer
-_KEPT_BYTES = 64 << 20  # of decoded tiles, so that the next window finds those at its edge
+_CACHE_BYTES = 64 << 20  # of decoded tiles, which adjacent windows share
 
 
 class _Part(NamedTuple):
@@ -70,15 +77,15 @@ class _Zoom:
 
 
 class TileCache:
-    """A folder of tiles, read as rasterio reads a file: what :class:`engine.maps.rasters.GrayReader` asks of one.
+    """A folder of tiles with the part of rasterio's interface that :class:`engine.maps.rasters.GrayReader` uses.
 
     The deepest zoom level is the map, from its first column and row to its last. A coarser one serves as an
     overview if it has a tile over each of the deepest; what no tile of the deepest covers is nodata on it too.
 
     Args:
         folder: of the zoom levels.
-        levels: the deepest one by 0, and each that is an overview by how many levels it is coarser.
-        tile_px: side of a tile; that of a tile of each level is a whole number of the deepest's pixels.
+        levels: zoom levels by how many levels they are coarser than the deepest.
+        tile_px: side of a tile, a multiple of the coarsest level's factor.
         south_up: whether rows are named from the south.
     """
 
@@ -101,15 +108,15 @@ class TileCache:
         self.crs = CRS.from_epsg(3857)
         self.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         self.mask_flag_enums = ([MaskFlags.per_dataset, MaskFlags.alpha],) * 4
-        self._kept: OrderedDict[tuple[int, int, int], Pixels] = OrderedDict()
-        self._last: tuple[Any, Pixels] | None = None  # bands and alpha are asked for in turn
+        self._cached: OrderedDict[tuple[int, int, int], Pixels] = OrderedDict()
+        self._last: tuple[Any, Pixels] | None = None  # bands and alpha are read in turn
 
     def overviews(self, _band: int) -> list[int]:
-        """By how much each coarser level is coarser."""
+        """Factors of the coarser levels."""
         return [1 << level for level in sorted(self._levels) if level > 0]
 
     def tags(self) -> dict[str, str]:
-        """Nothing: a cache says nothing of itself."""
+        """No metadata items."""
         return {}
 
     def fingerprint(self) -> bytes:
@@ -125,7 +132,16 @@ class TileCache:
     def read(
         self, bands: Sequence[int], window: Any = None, out_shape: Sequence[int] | None = None, **_how: Any
     ) -> Pixels:
-        """Bands (N, h, w) of a window, each pixel the nearest of the level that fits ``out_shape`` best.
+        """Read a window, by the nearest pixels of the level that fits ``out_shape`` best.
+
+        Args:
+            bands: numbers from 1.
+            window: as rasterio's; None is the whole map.
+            out_shape: of the result, its last two entries rows and columns; None is the window's.
+            **_how: other options of rasterio, ignored.
+
+        Returns:
+            (N, h, w) uint8.
 
         Raises:
             MapError: a tile cannot be decoded, or is of another size than the first.
@@ -134,7 +150,18 @@ class TileCache:
         return np.ascontiguousarray(np.moveaxis(rgba[..., [band - 1 for band in bands]], -1, 0))
 
     def dataset_mask(self, window: Any = None, out_shape: Sequence[int] | None = None) -> Pixels:
-        """Alpha (h, w) of a window; raises as :meth:`read`."""
+        """Alpha of a window.
+
+        Args:
+            window: as rasterio's; None is the whole map.
+            out_shape: rows and columns of the result; None is the window's.
+
+        Returns:
+            (h, w) uint8.
+
+        Raises:
+            MapError: as :meth:`read`.
+        """
         return self._pixels(window, out_shape)[..., 3]
 
     def _pixels(self, window: Any, out_shape: Sequence[int] | None) -> Pixels:
@@ -151,7 +178,7 @@ class TileCache:
         shrink = min(part.width / width, part.height / height)
         level = max(one for one in self._levels if one == 0 or 1 << one <= shrink)
         at, scale = self._levels[level], 1 << level
-        # The level's pixels begin with the map's, because a tile is a whole number of them.
+        # The level's pixels are aligned with the map's, because a tile is a whole number of them.
         x = np.floor((part.col_off + (np.arange(width) + 0.5) * part.width / width) / scale).astype(np.intp)
         y = np.floor((part.row_off + (np.arange(height) + 0.5) * part.height / height) / scale).astype(np.intp)
         columns, x_in = np.divmod(x + self._corner_px[0] // scale, self._tile_px)
@@ -174,19 +201,19 @@ class TileCache:
         return self._folder / str(at.zoom) / str(column) / f"{named}.{ending}"
 
     def _tile(self, at: _Zoom, column: int, row: int) -> Pixels:
-        """A decoded tile, from those that were used last or from its file."""
+        """A decoded tile, from the cache or from its file."""
         key = (at.zoom, column, row)
-        tile = self._kept.pop(key, None)
+        tile = self._cached.pop(key, None)
         if tile is None:
             tile = _decoded(self._path(at, column, row), self._tile_px)
-        self._kept[key] = tile
-        if len(self._kept) * tile.nbytes > _KEPT_BYTES:
-            self._kept.popitem(last=False)
+        self._cached[key] = tile
+        if len(self._cached) * tile.nbytes > _CACHE_BYTES:
+            self._cached.popitem(last=False)
         return tile
 
 
 def _decoded(path: Path, tile_px: int) -> Pixels:
-    """Red, green, blue and alpha (T, T, 4) of a tile; zeros for an empty file, by which caches note a gap."""
+    """Red, green, blue and alpha (T, T, 4) of a tile; zeros for an empty file, which marks a gap."""
     if path.stat().st_size == 0:
         return np.zeros((tile_px, tile_px, 4), np.uint8)
     with _picture(path, "map") as picture:
@@ -201,7 +228,7 @@ def _decoded(path: Path, tile_px: int) -> Pixels:
 
 @contextmanager
 def _picture(path: Path, argument: str) -> Iterator[Any]:
-    """The picture in a tile's file; one that is none, or is cut short, becomes one line."""
+    """The picture in a tile's file; a damaged or truncated one raises MapError."""
     from PIL import Image
 
     try:
@@ -220,26 +247,26 @@ def is_tile_cache(folder: Path) -> bool:
 
 
 def open_tile_cache(folder: Path, argument: str) -> TileCache:
-    """List a folder of tiles and look at the first one.
+    """List a folder of tiles and read the size of the first one.
 
     Args:
         folder: one for which :func:`is_tile_cache` holds.
-        argument: what a message calls it.
+        argument: its name in messages.
 
     Raises:
-        MapError: the tiles are of another projection, lie where there is none or too far apart, or the first one
+        MapError: the tiles are of another projection, outside their zoom level or too far apart, or the first one
             is no square picture.
     """
     south_up = _follows_tms(folder, argument)
     listed = {zoom: _listed(path) for zoom, path in _zoom_folders(folder).items()}
     listed = {zoom: tiles for zoom, tiles in listed.items() if len(tiles)}
     deepest = max(listed)
-    most = 1 << deepest
+    limit = 1 << deepest
     paths = (folder / str(deepest) / str(x) / f"{y}.{ENDINGS[kind]}" for x, y, kind in listed[deepest].tolist())
-    if (listed[deepest][:, :2] >= most).any():
-        worst = next(path for path in paths if max(int(path.parent.name), int(path.stem)) >= most)
+    if (listed[deepest][:, :2] >= limit).any():
+        worst = next(path for path in paths if max(int(path.parent.name), int(path.stem)) >= limit)
         raise MapError(
-            f"{argument}: expected columns and rows below {most} on zoom level {deepest}, as z/x/y, got {worst}"
+            f"{argument}: expected columns and rows below {limit} on zoom level {deepest}, as z/x/y, got {worst}"
         )
     tile_px = _first_side_px(paths, folder, argument)
     tiles = {zoom: _from_north(some, zoom) if south_up else some for zoom, some in listed.items()}
@@ -252,15 +279,15 @@ def open_tile_cache(folder: Path, argument: str) -> TileCache:
         )
     levels = {}
     for coarser in (deepest - zoom for zoom in tiles if tile_px % (1 << deepest - zoom) == 0):
-        level = _laid(deepest - coarser, tiles[deepest - coarser], low >> coarser, high >> coarser)
+        level = _zoom_of(deepest - coarser, tiles[deepest - coarser], low >> coarser, high >> coarser)
         x, y = ((tiles[deepest][:, :2] >> coarser) - level.corner).T
         if level.kinds[y, x].all():  # an overview with gaps of its own is none
             levels[coarser] = level
     return TileCache(folder, levels, tile_px, south_up=south_up)
 
 
-def _laid(zoom: int, tiles: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> _Zoom:
-    """Those of the tiles (N, 3) that lie from one column and row to another."""
+def _zoom_of(zoom: int, tiles: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> _Zoom:
+    """The zoom level of the tiles (N, 3) from one column and row to another."""
     columns, rows = (high - low + 1).tolist()
     kinds = np.zeros((rows, columns), np.uint8)
     x, y, kind = tiles[((tiles[:, :2] >= low) & (tiles[:, :2] <= high)).all(axis=1)].T
@@ -285,7 +312,7 @@ def _zoom_folders(folder: Path) -> dict[int, Path]:
 
 
 def _numbered(folder: Path) -> Iterator[tuple[int, Path]]:
-    """What in a folder is named by a whole number."""
+    """Entries of a folder that are named by a whole number."""
     with os.scandir(folder) as entries:
         for entry in entries:
             if _is_number(entry.name):
@@ -293,7 +320,7 @@ def _numbered(folder: Path) -> Iterator[tuple[int, Path]]:
 
 
 def _is_number(name: str) -> bool:
-    """Whether it is a whole number as it would be printed, so that the name can be made of it again."""
+    """Whether it is a whole number as it would be printed, so that the name can be restored from it."""
     return name.isascii() and name.isdecimal() and len(name) < 11 and (name == "0" or name[0] != "0")
 
 
@@ -328,7 +355,7 @@ def _follows_tms(folder: Path, argument: str) -> bool:
     """Whether rows count from the south: whether the folder has a description as TMS writes it.
 
     Raises:
-        MapError: it cannot be read, or tells of another projection.
+        MapError: it cannot be read, or names another projection.
     """
     path = folder / RESOURCE
     if not path.is_file():

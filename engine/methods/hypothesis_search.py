@@ -20,7 +20,7 @@ from engine.indexes.prepared import Region
 from engine.methods.correlation import Aligned, Correlator
 from engine.methods.options import NccOptions
 from engine.ncc_fft import surfaces
-from engine.peaks import best_places
+from engine.peaks import best_positions
 from engine.values import GridPose, NoFix, Peak, Window
 
 Array = NDArray[np.float64]
@@ -125,7 +125,7 @@ def _coarse(
     found: list[tuple[float, GridPose, Array]] = []
     with query.scheduler.stage("match"):
         for aligned, trim, scores in zip(fitting, trims, _surfaces(correlator, region, templates), strict=True):
-            for x, y, score in best_places(scores, separation, _CANDIDATES):
+            for x, y, score in best_positions(scores, separation, _CANDIDATES):
                 place = np.array([x + region.window.x0, y + region.window.y0], dtype=np.float64) - trim
                 nadir = query.site.full_from_level(place - aligned.patch.offset_px, level)
                 found.append((score, aligned.pose, nadir))

@@ -91,7 +91,7 @@ class Refinement:
             last_step = _LAST_STEP if level == own else _LAST_STEP_COARSE
             fit = refine(picture, ground, pose, prior, last_step_sigmas=last_step)
             pose = pose if fit is None else fit.pose
-        return fit if fit is not None and fit.settled and fit.correlation >= min_correlation else None
+        return fit if fit is not None and fit.converged and fit.correlation >= min_correlation else None
 
     def _prior(self, fix: Fix) -> GaussianPrior:
         """The telemetry's height and attitude; the position by correlation is a start without any weight."""

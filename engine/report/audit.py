@@ -91,7 +91,7 @@ def _draw_marks(ax: Any, audit: Audit) -> None:
     scale = audit.plan.site.gsd_m_per_px
     size = float(np.clip(220.0 / max(audit.flags.shape), 1.5, _MAX_MARKS_PX))
     for flag, (marker, colour, label) in _MARKS.items():
-        places = (audit.plan.places_px[audit.flags == flag] + 0.5) * scale
+        places = (audit.plan.centers_px[audit.flags == flag] + 0.5) * scale
         if len(places):
             ax.plot(
                 *places.T, marker, color=colour, markersize=size, markeredgewidth=1.0, linestyle="", label=label

@@ -12,7 +12,8 @@ from engine.formats.telemetry import cell_text, write_table
 from engine.geo import attitude_from_rotation
 from engine.report.figures import DPI, FIX, GRID, REFUSED, TRUTH
 from engine.sim.faults import Fault
-from engine.sim.loop import START_NS, LoopResult, LoopSample, Mode
+from engine.sim.loop import LoopResult, LoopSample, Mode
+from engine.sim.vehicle import START_NS
 from engine.values import Fix
 
 Array = NDArray[np.float64]
@@ -40,10 +41,15 @@ def write_record(path: Path, flown: LoopResult) -> None:
 
 
 def _cells(row: LoopSample) -> list[str]:
-    sigmas = np.sqrt(np.diag(row.belief.covariance)[:3])
+    sigmas = np.sqrt(np.diag(row.estimate.covariance)[:3])
     true = row.truth.attitude
-    numbers = [*row.plan_m, *row.truth.position_m, *row.belief.position_m, *sigmas]
-    numbers += [true.roll_deg, true.pitch_deg, true.heading_deg, *attitude_from_rotation(row.belief.enu_from_body)]
+    numbers = [*row.plan_m, *row.truth.position_m, *row.estimate.position_m, *sigmas]
+    numbers += [
+        true.roll_deg,
+        true.pitch_deg,
+        true.heading_deg,
+        *attitude_from_rotation(row.estimate.enu_from_body),
+    ]
     stamp = str(START_NS + round(row.time_s * 1e9))
     return [stamp, row.mode.value, cell_text(row.healthy, 0), *(cell_text(float(v), 3) for v in numbers)]
 
@@ -60,7 +66,7 @@ def summarise_loop(flown: LoopResult) -> dict[str, Any]:
     """
     plan, estimate = flown.plan_error_m, flown.estimate_error_m
     settled = [k for k, row in enumerate(flown.record) if row.time_s >= _SETTLED_S] or [len(flown.record) - 1]
-    covariance = np.array([flown.record[k].belief.covariance[:2, :2] for k in settled])
+    covariance = np.array([flown.record[k].estimate.covariance[:2, :2] for k in settled])
     flat = estimate[settled][:, :2]
     nees = np.einsum("ni,nij,nj->n", flat, np.linalg.inv(covariance), flat)
     off, wrong = np.hypot(*plan[:, :2].T), np.hypot(*flat.T)
@@ -135,7 +141,7 @@ def _path(flown: LoopResult, title: str) -> Any:
     (ax,) = _axes(figure)
     plan = np.array([row.plan_m for row in flown.record])
     true = np.array([row.truth.position_m for row in flown.record])
-    estimate = np.array([row.belief.position_m for row in flown.record])
+    estimate = np.array([row.estimate.position_m for row in flown.record])
     ax.plot(plan[:, 0], plan[:, 1], color=PLAN, linewidth=5.0, alpha=0.35, label="plan")
     ax.plot(true[:, 0], true[:, 1], color=TRUTH, linewidth=1.3, label="truth")
     ax.plot(estimate[:, 0], estimate[:, 1], color=FIX, linewidth=1.0, linestyle=(0, (4, 2)), label="estimate")
@@ -153,7 +159,7 @@ def _in_time(flown: LoopResult, title: str, fault: Fault) -> Any:
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
     plan, estimate, health = _axes(figure, 3, 1, sharex=True, height_ratios=[3, 3, 1.1])
     time = np.array([row.time_s for row in flown.record])
-    sigma = np.array([row.belief.sigma_m for row in flown.record])
+    sigma = np.array([row.estimate.sigma_m for row in flown.record])
     plan.plot(time, np.hypot(*flown.plan_error_m[:, :2].T), color=TRUTH, linewidth=1.1)
     plan.set_ylabel("truth from plan (m)")
     estimate.fill_between(time, 0.0, 3.0 * sigma, color=FIX, alpha=0.18, linewidth=0, label="3 σ as believed")

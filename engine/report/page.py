@@ -312,7 +312,7 @@ def _made(record: Mapping[str, Any]) -> str:
     changes = [(name, str(value)) for name, value in (record.get("changed") or {}).items()]
     changed = table(changes) if changes else "<p>Nothing.</p>"
     versions = [
-        ("scenematch", metadata.version("scenematch")),
+        ("scenematch", metadata.version("scenematch-engine")),
         ("torch", str(torch.__version__)),
         ("OpenCV", cv2.__version__),
         ("numpy", np.__version__),

@@ -108,7 +108,7 @@ def _prepare(out: Path, left: Sequence[Job], force: bool) -> None:
                 "so far; move it away, or choose another folder"
             )
     (out / RUNS).mkdir(parents=True, exist_ok=True)
-    (out / MARKER).write_text(f"A campaign of scenematch {version('scenematch')}.\n", encoding="utf-8")
+    (out / MARKER).write_text(f"A campaign of scenematch {version('scenematch-engine')}.\n", encoding="utf-8")
     shutil.rmtree(out / UNFINISHED, ignore_errors=True)
     (out / UNFINISHED).mkdir()
     for job in left:

@@ -24,7 +24,7 @@ from engine.runs.jobs import Job, SimulateTask, TrackTask
 from engine.runs.settings import TrackSettings
 from engine.runs.simulation import WorldSettings
 from engine.sim import CONDITIONS
-from engine.sim.town import RELIEF_MAX_M
+from engine.sim.town import MAX_RELIEF_M
 
 RUNS, FLIGHTS, UNFINISHED = "runs", "flights", "unfinished"
 """Folders of a campaign's output folder."""
@@ -133,8 +133,8 @@ class SimulatedFlights:
                 raise OptionError(f"seeds: expected 0 or more, got {seed}")
         if self.frames is not None and self.frames < 1:
             raise OptionError(f"frames: expected 1 or more, got {self.frames}")
-        if not 0.0 <= self.relief_m <= RELIEF_MAX_M:
-            raise OptionError(f"relief_m: expected 0 to {RELIEF_MAX_M:g}, got {self.relief_m:g}")
+        if not 0.0 <= self.relief_m <= MAX_RELIEF_M:
+            raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {self.relief_m:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -249,7 +249,8 @@ def _worlds(simulated: SimulatedFlights) -> Iterator[tuple[str, WorldSettings]]:
 
 
 def _simulate_job(name: str, world: WorldSettings, frames: int | None, out: Path) -> Job:
-    inputs = {"simulation": json.dumps(world.facts() | {"frames": frames}), "engine": version("scenematch")}
+    facts = json.dumps(world.facts() | {"frames": frames})
+    inputs = {"simulation": facts, "engine": version("scenematch-engine")}
     return Job(name, out / FLIGHTS / name, out / UNFINISHED, inputs, SimulateTask(world, frames))
 
 
@@ -257,7 +258,7 @@ def _settings_hash(settings: TrackSettings) -> dict[str, str]:
     text = json.dumps(asdict(settings), sort_keys=True, default=str)
     return {
         "settings": hashlib.blake2b(text.encode(), digest_size=16).hexdigest(),
-        "engine": version("scenematch"),
+        "engine": version("scenematch-engine"),
     }
 
 

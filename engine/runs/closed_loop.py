@@ -30,13 +30,14 @@ from engine.runs.progress import SILENT, Progress
 from engine.runs.results import SUMMARY, TRACK
 from engine.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
 from engine.sim import FlightStyle, Town, picture_at
-from engine.sim.faults import KINDS, Fault
+from engine.sim.faults import FAULT_KINDS, Fault
 from engine.sim.flight import grid_at
 from engine.sim.light import Image
-from engine.sim.loop import START_NS, ClosedLoop
+from engine.sim.loop import ClosedLoop
 from engine.sim.pilot import plan_rounds
 from engine.sim.quadrotor import State
 from engine.sim.town import EXACT, generator
+from engine.sim.vehicle import START_NS
 from engine.values import Frame, Prior, Truth
 
 if TYPE_CHECKING:  # rerun is optional
@@ -70,7 +71,7 @@ class ClosedLoopSettings:
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
-        check_choice("fault", self.fault, KINDS)
+        check_choice("fault", self.fault, FAULT_KINDS)
         if not 0.1 <= self.minutes <= 120.0:
             raise OptionError(f"minutes: expected 0.1 to 120, got {self.minutes:g}")
         check_device(self.device)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.audit.availability import Audit, RouteAvailability, gather, predict
+from engine.audit.availability import Audit, RouteAvailability, gather, predict_route
 from engine.audit.plan import AuditOptions, AuditPlan, MapPart, plan_audit
-from engine.audit.self_match import SelfMatchStatistics, measure
+from engine.audit.self_match import SelfMatchStatistics, measure_self_match
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
@@ -94,8 +94,8 @@ def audit_map(
     check_folder(out, force)
     plan, waypoints = _plan(files, prior_sigma_m, progress)
     prepare_folder(out, force, OWNED)
-    audit = gather(plan, progress.track(measure(plan), len(plan), "auditing"))
-    route = None if waypoints is None else predict(audit, *waypoints.T)
+    audit = gather(plan, progress.track(measure_self_match(plan), len(plan), "auditing"))
+    route = None if waypoints is None else predict_route(audit, *waypoints.T)
     _write(out, audit, route, Path(files.map).name)
     facts = _summary(audit, route, files)
     (out / "summary.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
@@ -222,7 +222,7 @@ def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -
         "availability": float(audit.availability[known].mean()) if known.any() else None,
         "shares": audit.shares,
         "evidence_median": {
-            one.name: _median(getattr(audit.evidence, one.name)) for one in fields(SelfMatchStatistics)
+            one.name: _median(getattr(audit.statistics, one.name)) for one in fields(SelfMatchStatistics)
         },
         "route": None if route is None else _route_facts(route, str(files.route)),
     }
@@ -230,7 +230,7 @@ def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -
 
 def _part_facts(plan: AuditPlan, files: AuditFiles) -> dict[str, Any] | None:
     """What part of the map was audited; None for all of it."""
-    if plan.looked.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
+    if plan.audited.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
         return None
     return {
         "around": files.around,

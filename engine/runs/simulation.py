@@ -16,7 +16,7 @@ from engine.runs.inputs import FlightFiles
 from engine.runs.progress import SILENT, Progress
 from engine.runs.results import OWNED
 from engine.sim import CONDITIONS, FlightPlan, Town, build_town, plan_flight, world_from_map
-from engine.sim.town import EXACT, RELIEF_MAX_M
+from engine.sim.town import EXACT, MAX_RELIEF_M
 from engine.values import Prior
 
 FOLDER_OWNED = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")
@@ -52,8 +52,8 @@ class WorldSettings:
             check_choice("condition", self.condition, tuple(CONDITIONS))
         if self.surface is not None and self.map is None:
             raise OptionError(f"surface: expected with `map` only, got {self.surface}")
-        if not 0.0 <= self.relief_m <= RELIEF_MAX_M:
-            raise OptionError(f"relief_m: expected 0 to {RELIEF_MAX_M:g}, got {self.relief_m:g}")
+        if not 0.0 <= self.relief_m <= MAX_RELIEF_M:
+            raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {self.relief_m:g}")
         if self.relief_m and self.map is not None:
             raise OptionError(
                 f"relief_m: expected without `map`, whose surface has its own, got {self.relief_m:g}"
@@ -63,7 +63,7 @@ class WorldSettings:
         """The world with its map: a town of the seed's, or the user's rasters."""
         if self.map is not None:
             return world_from_map(self.map, self.surface, condition=self.condition, seed=self.seed)
-        return build_town(self.seed, condition=self.condition, relief_m=self.relief_m)
+        return build_town(self.seed, condition=self.condition or "noon", relief_m=self.relief_m)
 
     def facts(self) -> dict[str, Any]:
         """The same as JSON can hold it."""

@@ -19,7 +19,7 @@ from engine import device
 from engine.sift.keypoints import Points
 from engine.sift.scale_space import ScaleSpacePlan
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
 _POINTS_PER_THREAD = 64
 _ANGLE_BINS = 36
@@ -69,23 +69,43 @@ def _gradients(
 
 
 def dominant_angle(gaussians: Tensor, points: Points, plan: ScaleSpacePlan) -> Tensor:
-    """Return the angle (radians) of the highest peak in the histogram of gradient directions."""
+    """Return the direction of the highest peak in the histogram of gradient directions.
+
+    Args:
+        gaussians: (N,) float32 levels.
+        points: M keypoints.
+        plan: of the levels.
+
+    Returns:
+        (M,) radians from +x towards +y.
+    """
     if gaussians.device.type != "cpu":
         return angle_by_tensors(gaussians, points, plan)
-    from engine.kernels import compiled
+    from engine.kernels import sift_descriptors
 
     window, smooth = (weights.numpy() for weights in _orientation_weights(gaussians.device))
     window = window.reshape(_ORIENT_SAMPLES, _ORIENT_SAMPLES)
 
-    def work(where: Array, places: Array) -> Any:
+    def work(where: AnyArray, positions: AnyArray) -> Any:
         step = np.float32(_ORIENT_STEP)
-        return compiled.angles(gaussians.numpy(), plan.table.numpy(), where, places, step, window, smooth)
+        return sift_descriptors.angles(
+            gaussians.numpy(), plan.table.numpy(), where, positions, step, window, smooth
+        )
 
     return _in_parts(work, points, plan)
 
 
 def angle_by_tensors(gaussians: Tensor, points: Points, plan: ScaleSpacePlan) -> Tensor:
-    """Return the same as :func:`dominant_angle`, as tensor ops on any device."""
+    """Return the same as :func:`dominant_angle`, as tensor ops on any device.
+
+    Args:
+        gaussians: (N,) float32 levels.
+        points: M keypoints.
+        plan: of the levels.
+
+    Returns:
+        (M,) radians from +x towards +y.
+    """
     gx, gy = _gradients(gaussians, points, plan, None, _ORIENT_SAMPLES, _ORIENT_STEP)
     window, smooth = _orientation_weights(gaussians.device)
     bins = (torch.atan2(gy, gx) * (_ANGLE_BINS / math.tau)).round_().long()
@@ -108,30 +128,56 @@ def _orientation_weights(where: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def describe(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpacePlan, *, root: bool) -> Tensor:
-    """Return (P, 128) descriptors: 4 x 4 cells of 8 orientations, all in the keypoint's frame."""
+    """Return descriptors: 4 x 4 cells of 8 orientations in the keypoint's frame.
+
+    Args:
+        gaussians: (N,) float32 levels.
+        points: M keypoints.
+        angle: (M,) radians from +x towards +y.
+        plan: of the levels.
+        root: return RootSIFT.
+
+    Returns:
+        (M, 128) of unit L2 norm.
+    """
     if gaussians.device.type != "cpu":
         return normalise(cells_by_tensors(gaussians, points, angle, plan), root=root)
-    from engine.kernels import compiled
+    from engine.kernels import sift_descriptors
 
-    def work(where: Array, places: Array, turn: Array) -> Any:
+    def work(where: AnyArray, positions: AnyArray, turn: AnyArray) -> Any:
         step = np.float32(_CELL_SIGMAS / _CELL_SAMPLES)
-        return compiled.descriptors(gaussians.numpy(), plan.table.numpy(), where, places, turn, step, _tents())
+        return sift_descriptors.descriptors(
+            gaussians.numpy(), plan.table.numpy(), where, positions, turn, step, _tents()
+        )
 
     return normalise(_in_parts(work, points, plan, angle), root=root)
 
 
-def _in_parts(work: Callable[..., Array], points: Points, plan: ScaleSpacePlan, *columns: Tensor) -> Tensor:
-    """Return work(where, places, *columns) of all points: octave, image, level; x, y, sigma in octave pixels."""
+def _in_parts(work: Callable[..., AnyArray], points: Points, plan: ScaleSpacePlan, *columns: Tensor) -> Tensor:
+    """Return work(where, positions, *columns) of all points, in parallel parts.
+
+    ``where`` is octave, image, level; ``positions`` x, y, sigma in octave pixels.
+    """
     where = torch.stack([points.octave, points.image, points.level], dim=1).numpy()
-    places = torch.stack([points.x, points.y, points.growth * plan.first_sigma], dim=1).numpy()
-    rows = [where, places, *(column.numpy() for column in columns)]
+    positions = torch.stack([points.x, points.y, points.growth * plan.first_sigma], dim=1).numpy()
+    rows = [where, positions, *(column.numpy() for column in columns)]
     parts = device.parts(len(where), len(where) // _POINTS_PER_THREAD)
     done = device.in_parallel(lambda part: work(*(row[part[0] : part[1]] for row in rows)), parts)
     return torch.from_numpy(np.concatenate(done))
 
 
 def cells_by_tensors(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpacePlan) -> Tensor:
-    """Return (P, 128) of :func:`describe` before they are normalised, as tensor ops on any device."""
+    """Return the descriptors of :func:`describe` before normalisation, as tensor ops on any device.
+
+    Args:
+        gaussians: (N,) float32 levels.
+        points: M keypoints.
+        angle: (M,) radians from +x towards +y.
+        plan: of the levels.
+
+    Returns:
+        (M, 128), cells row by row, 8 orientations each.
+    """
     step = _CELL_SIGMAS / _CELL_SAMPLES
     gx, gy = _gradients(gaussians, points, plan, angle, _DESC_SAMPLES, step)
     pooled = _orient(gx, gy) @ _pooling(gaussians.device)  # (8, P, 16)
@@ -160,16 +206,26 @@ def _pooling(where: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-def _tents() -> Array:
+def _tents() -> AnyArray:
     """Return (cells, samples) float32: the weights of :func:`_pooling` along one axis."""
     ramp = (np.arange(_DESC_SAMPLES) - (_DESC_SAMPLES - 1) / 2) / _CELL_SAMPLES
     centres = np.arange(_CELLS) - (_CELLS - 1) / 2
-    tents: Array = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(-0.5 * (ramp / (_CELLS / 2)) ** 2)
+    tents: AnyArray = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(
+        -0.5 * (ramp / (_CELLS / 2)) ** 2
+    )
     return tents.astype(np.float32)
 
 
 def normalise(descriptors: Tensor, *, root: bool) -> Tensor:
-    """Return unit vectors, entries bounded by 0.2 before the last normalisation; RootSIFT if root."""
+    """Return unit vectors, entries bounded by 0.2 before the last normalisation (Lowe).
+
+    Args:
+        descriptors: (..., 128) not negative.
+        root: return RootSIFT, the square roots of the L1-normalised vectors.
+
+    Returns:
+        (..., 128) of unit L2 norm.
+    """
     unit = torch.nn.functional.normalize(descriptors, dim=-1).clamp_max_(0.2)
     if root:
         return torch.nn.functional.normalize(unit, p=1.0, dim=-1).sqrt()

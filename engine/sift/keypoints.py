@@ -1,6 +1,6 @@
-"""Keypoints: extrema of differences of Gaussians over position and scale, and the choice among them.
+"""Keypoints: extrema of differences of Gaussians over position and scale, and the selection of the strongest.
 
-An extremum is refined by a quadratic; what is of low contrast or lies along an edge is dropped (Lowe's tests).
+An extremum is refined by a quadratic; those of low contrast or along an edge are dropped (Lowe's tests).
 """
 
 import threading
@@ -16,19 +16,19 @@ from torch import Tensor
 from engine import device
 from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan, gaussian_levels, reach_px
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
-_BORDER = 4  # octave pixels along the edge that carry no keypoint
+_BORDER = 4  # octave pixels along the edge without keypoints
 _EDGE_RATIO = 10.0
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
-_PART_PX = 200_000  # pixels of an octave from which on a thread of its own pays
+_PART_PX = 200_000  # pixels of an octave per thread, below which another thread does not pay
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Keypoints in the pixels of their octave."""
+    """M keypoints in the pixels of their octave, (M,) each."""
 
     octave: Tensor  # int64, as image and level
     image: Tensor
@@ -40,7 +40,14 @@ class Points:
     pixel_px: Tensor  # image pixels per octave pixel
 
     def take(self, index: Tensor) -> "Points":
-        """Return the points of these indices."""
+        """Select points.
+
+        Args:
+            index: (K,) int64.
+
+        Returns:
+            K points.
+        """
         fields = (self.octave, self.image, self.level, self.x, self.y, self.growth, self.contrast, self.pixel_px)
         return Points(*(field[index] for field in fields))
 
@@ -60,30 +67,30 @@ def detect(images: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> t
 
     Args:
         images: (B, H, W) float32; on a CPU one at a time.
-        plan: made for these images.
+        plan: of these images.
         contrast_threshold: Lowe's.
 
     Returns:
-        The Gaussian levels, flat, which on a CPU the thread's next call overwrites; and the points.
+        The Gaussian levels (N,) float32, which on a CPU the thread's next call overwrites; and the points.
     """
     if images.device.type == "cpu":
         return _detect_compiled(images[0], plan, contrast_threshold)
     gaussians = gaussian_levels(images, plan)
-    return gaussians, search(gaussians, plan, contrast_threshold)
+    return gaussians, find_points(gaussians, plan, contrast_threshold)
 
 
 def _detect_compiled(image: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> tuple[Tensor, Points]:
     """Do :func:`detect` for one image, (H, W), on the CPU."""
-    from engine.kernels import compiled
+    from engine.kernels.sift_refinement import refine_extrema
 
     gaussians = _buffer(plan.gaussian_size)
     threshold = contrast_threshold / SCALES
     limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, _EDGE_RATIO)
     found, source = [], image.contiguous()
     for number, octave in enumerate(plan.octaves):
-        height, width, *place, _ = plan.table[number].tolist()
-        voxels = _voxels_compiled(source.numpy(), octave, gaussians.numpy(), tuple(place), _EARLY * threshold)
-        found.append(compiled.refine(gaussians.numpy(), (height, width, *place), voxels, limits, number))
+        height, width, *layout, _ = plan.table[number].tolist()
+        voxels = _voxels_compiled(source.numpy(), octave, gaussians.numpy(), tuple(layout), _EARLY * threshold)
+        found.append(refine_extrema(gaussians.numpy(), (height, width, *layout), voxels, limits, number))
         source = octave.levels(gaussians)[SCALES, :height:2, 0, :width:2].contiguous()
     x, y, growth, contrast, level, of = torch.from_numpy(np.concatenate(found)).unbind(1)
     pixel = torch.exp2(of) / plan.upsample
@@ -91,17 +98,17 @@ def _detect_compiled(image: Tensor, plan: ScaleSpacePlan, contrast_threshold: fl
 
 
 def _voxels_compiled(
-    source: Array, octave: Octave, buffer: Array, place: tuple[int, ...], threshold: float
-) -> Array:
-    """Write an octave's levels and return its extrema, by as many threads as its size is worth."""
-    from engine.kernels import compiled
+    source: AnyArray, octave: Octave, buffer: AnyArray, layout: tuple[int, ...], threshold: float
+) -> AnyArray:
+    """Write an octave's levels and return its extrema (M, 3), by a number of threads that suits its size."""
+    from engine.kernels.sift_extrema import filters, find_extrema
 
     (rows, columns), reach = octave.source, tuple(map(reach_px, octave.sigmas))
-    across = compiled.filters(columns, octave.width, octave.sigmas, reach, octave.up)
-    down = compiled.filters(rows, octave.height, octave.sigmas, reach, octave.up)
+    across = filters(columns, octave.width, octave.sigmas, reach, octave.up)
+    down = filters(rows, octave.height, octave.sigmas, reach, octave.up)
 
     def work(part: tuple[int, int]) -> Any:
-        return compiled.search(source, across, down, buffer, place, part, _BORDER, np.float32(threshold))
+        return find_extrema(source, across, down, buffer, layout, part, _BORDER, np.float32(threshold))
 
     parts = device.parts(octave.height, octave.height * octave.width // _PART_PX)
     return np.concatenate(device.in_parallel(work, parts))
@@ -111,15 +118,24 @@ _local = threading.local()
 
 
 def _buffer(size: int) -> Tensor:
-    """Return the thread's own memory for a scale space: new pages from the system are a tenth of the work."""
+    """Return the thread's own memory for a scale space: allocating new pages takes a tenth of the time."""
     buffer: Tensor | None = getattr(_local, "buffer", None)
     if buffer is None or buffer.numel() < size:
         buffer = _local.buffer = torch.empty(size)
     return buffer[:size]
 
 
-def search(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> Points:
-    """Find the points of all octaves in their Gaussian levels, as tensor ops."""
+def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> Points:
+    """Find and refine the points of all octaves in their Gaussian levels, as tensor ops.
+
+    Args:
+        gaussians: (N,) float32 from :func:`engine.sift.scale_space.gaussian_levels`.
+        plan: of these levels.
+        contrast_threshold: Lowe's.
+
+    Returns:
+        The points that pass the tests of contrast and edges.
+    """
     threshold = contrast_threshold / SCALES
     found = [_extrema(gaussians, octave, _EARLY * threshold) for octave in plan.octaves]
     number = torch.cat([torch.full_like(f[:, 0], n) for n, f in enumerate(found)])
@@ -202,7 +218,15 @@ def _quadratic(where: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def allowed(points: Points, mask: Tensor) -> Tensor:
-    """Return the indices of the points whose nearest pixel is True in mask (B, 1, H, W)."""
+    """Return the indices of the points whose nearest pixel is allowed.
+
+    Args:
+        points: M keypoints.
+        mask: (B, 1, H, W) bool.
+
+    Returns:
+        (K,) int64.
+    """
     x = (points.x * points.pixel_px).round().long().clamp_(0, mask.shape[3] - 1)
     y = (points.y * points.pixel_px).round().long().clamp_(0, mask.shape[2] - 1)
     return mask[points.image, 0, y, x].nonzero()[:, 0]
@@ -211,7 +235,17 @@ def allowed(points: Points, mask: Tensor) -> Tensor:
 def strongest(points: Points, plan: ScaleSpacePlan, max_keypoints: int, spread: int) -> Tensor:
     """Return the indices of the points to keep, ordered by image and then by precedence.
 
-    Of two keypoints of like contrast the coarser is the surer: what counts is contrast times the root of scale.
+    Strength is contrast times the root of scale, since of two keypoints of equal contrast the coarser is detected
+    more reliably.
+
+    Args:
+        points: M keypoints.
+        plan: of their images.
+        max_keypoints: per image.
+        spread: cells along each side of the image; keypoints beyond a cell's double share come last.
+
+    Returns:
+        (K,) int64.
     """
     order = (points.contrast * points.scale_px.sqrt()).argsort(descending=True, stable=True)
     octave = plan.octaves[0]
@@ -226,8 +260,15 @@ def strongest(points: Points, plan: ScaleSpacePlan, max_keypoints: int, spread: 
 
 
 def rank(group: Tensor) -> Tensor:
-    """Return for each element how many before it are of the same group."""
+    """Return for each element how many before it are of the same group.
+
+    Args:
+        group: (M,) int64.
+
+    Returns:
+        (M,) int64 from 0.
+    """
     order = group.argsort(stable=True)
     ordered = group[order]
-    place = torch.arange(group.numel(), device=group.device)
-    return torch.empty_like(group).scatter_(0, order, place - torch.searchsorted(ordered, ordered))
+    index = torch.arange(group.numel(), device=group.device)
+    return torch.empty_like(group).scatter_(0, order, index - torch.searchsorted(ordered, ordered))

@@ -1,8 +1,8 @@
 """Scale space: all Gaussian levels of a batch of images, octave by octave, in one flat buffer.
 
 Every level is ``G_y I G_x^T``; upsampling is part of G, so that no interpolation comes before the blur. As tensor
-ops G is a banded matrix that is cut into blocks for the matmul; :mod:`engine.kernels.compiled` has the same
-weights as a filter.
+ops G is a banded matrix that is cut into blocks for the matmul; :mod:`engine.kernels.sift_extrema` has the
+same weights as a filter.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch import Tensor
 
 SCALES = 3  # DoG levels searched per octave, Lowe's s
 _LEVELS = SCALES + 3  # Gaussian levels per octave
-_CAMERA_SIGMA_PX = 0.5  # blur that an image is taken to have
+_CAMERA_SIGMA_PX = 0.5  # assumed blur of an image
 FIRST_SIGMA_PX = 0.8  # sigma of the first Gaussian level, in pixels of the image
 _TRUNCATE = 3.0  # a Gaussian's reach in sigmas
 _BLOCK = 16  # input samples per block of a banded matrix
@@ -35,7 +35,7 @@ class _Band:
 
 
 def reach_px(sigma: float) -> int:
-    """Return how far a Gaussian is taken, in pixels of what it blurs."""
+    """Return the reach of a truncated Gaussian, in pixels of its input."""
     return math.ceil(_TRUNCATE * sigma)
 
 
@@ -63,7 +63,7 @@ def _outputs(inputs: int, up: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Octave:
-    """Where an octave lies in the flat buffer of Gaussians: levels x rows x images x columns."""
+    """Layout of an octave in the flat buffer of Gaussians: levels x rows x images x columns."""
 
     source: tuple[int, int]  # height and width of the picture that is blurred
     up: int  # outputs per pixel of it
@@ -74,13 +74,20 @@ class Octave:
     offset: int
 
     def levels(self, gaussians: Tensor) -> Tensor:
-        """Return the octave's part of the buffer, (levels, rows, images, columns)."""
+        """Return the octave's part of the buffer.
+
+        Args:
+            gaussians: (N,) the buffer.
+
+        Returns:
+            (levels, rows, images, columns), a view.
+        """
         return gaussians[self.offset : self.offset + math.prod(self.shape)].view(self.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleSpacePlan:
-    """What depends on the images' shape alone."""
+    """Layout of a scale space, which depends on the images' shape alone."""
 
     upsample: int
     octaves: tuple[Octave, ...]
@@ -100,7 +107,7 @@ class ScaleSpacePlan:
 
 @lru_cache(maxsize=32)
 def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> ScaleSpacePlan:
-    """Lay out the octaves; kept for the shapes met last, as frames come in one size."""
+    """Lay out the octaves; cached for the most recent shapes, as frames come in one size."""
     growth = [2.0 ** (level / SCALES) for level in range(_LEVELS)]
     sigmas = tuple(math.sqrt((FIRST_SIGMA_PX * g) ** 2 - _CAMERA_SIGMA_PX**2) for g in growth)
     octaves: list[Octave] = []
@@ -120,7 +127,15 @@ def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.
 
 
 def gaussian_levels(images: Tensor, plan: ScaleSpacePlan) -> Tensor:
-    """Return all Gaussian levels of all octaves, flat, from images (B, H, W)."""
+    """Return all Gaussian levels of all octaves.
+
+    Args:
+        images: (B, H, W) float32.
+        plan: of these images.
+
+    Returns:
+        (N,) float32, laid out by the plan.
+    """
     gaussians = images.new_empty(plan.gaussian_size)
     for octave in plan.octaves:
         images = _blur(images, octave, gaussians)[SCALES, :, ::2, ::2]

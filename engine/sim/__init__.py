@@ -1,7 +1,7 @@
 """The software-in-the-loop flight: a simulated town, the camera over it, the vehicle and its sensors."""
 
 from engine.sim.conditions import CONDITIONS, Condition
-from engine.sim.flight import FlightPlan, SimulatedFlight, paper_flight, picture_at, plan_flight
+from engine.sim.flight import FlightPlan, SimulatedFlight, TownOptions, picture_at, plan_flight
 from engine.sim.light import LIGHTS, Light
 from engine.sim.optics import ExposureMotion, Optics, take_picture
 from engine.sim.raster_world import world_from_map
@@ -22,9 +22,9 @@ __all__ = [
     "SensorNoise",
     "SimulatedFlight",
     "Town",
+    "TownOptions",
     "World",
     "build_town",
-    "paper_flight",
     "picture_at",
     "plan_flight",
     "render_frame",

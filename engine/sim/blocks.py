@@ -1,4 +1,4 @@
-"""What stands between a town's streets: houses, flats, courts, halls, parks, fields, a square, a sports ground.
+"""The blocks between a town's streets: houses, flats, courts, halls, parks, fields, a square, a sports ground.
 
 Convention:
     Town coordinates (u, v) are those of :mod:`engine.sim.canvas`; a block is its centre and its sides du, dv.
@@ -66,8 +66,8 @@ def _perimeter(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None
             at = -room / 2 + 2
             while at < room / 2 - 8:
                 length = min(rng.uniform(11, 20), room / 2 - at - 1)
-                place = np.array([at + length / 2, side * (across / 2 - 8.5)])
-                uv = (u + place[0], v + place[1]) if not turn else (u + place[1], v + place[0])
+                offset = np.array([at + length / 2, side * (across / 2 - 8.5)])
+                uv = (u + offset[0], v + offset[1]) if not turn else (u + offset[1], v + offset[0])
                 kind = "flat" if rng.random() < 0.2 else "gable"
                 # Neighbours share a wall: the gap that keeps houses apart is a metre and a half of alley here.
                 building(canvas, *uv, length - 1.3, rng.uniform(11, 13), rng.uniform(9, 17), kind, turn)
@@ -173,6 +173,6 @@ def fill_blocks(canvas: Canvas, edges_u: list[float], edges_v: list[float]) -> N
         kind = first[index] if index < len(first) else int(rng.choice(len(_KINDS), p=_SHARES))
         if math.hypot(cell[0], cell[1]) < canvas.reach_m + 40:
             _KINDS[kind](canvas, *cell)
-    # The winding road cuts through blocks: give it back what they painted over, but for crowns above it.
+    # The winding road cuts through blocks: restore what they painted over, except for crowns above it.
     road &= canvas.height == 0.0
     canvas.rgb[road], canvas.material[road] = before[0][road], before[1][road]

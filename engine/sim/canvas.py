@@ -1,4 +1,4 @@
-"""What a town is drawn with: a canvas of colour, height and material, and the buildings and trees put on it.
+"""A canvas of colour, height and material on which a town is drawn, with buildings and trees.
 
 Convention:
     Town coordinates (u, v) are metres from the town's centre along and across its main streets, turned against
@@ -51,18 +51,43 @@ class Canvas:
         self.reach_m = gsd * math.hypot(*size) / 2.0 + 5.0
 
     def px(self, uv: Array) -> Array:
-        """Raster pixels (N, 2) of town coordinates (N, 2)."""
+        """Raster pixels of town coordinates.
+
+        Args:
+            uv: (N, 2) metres.
+
+        Returns:
+            (N, 2) pixels (x, y).
+        """
         return self.centre + uv @ self.turn.T / self.gsd
 
     def corners(self, u: float, v: float, length: float, width: float, angle: float = 0.0) -> Array:
-        """Town coordinates (4, 2) of a rectangle's corners; the angle is in radians from the u axis."""
+        """Corners of a rectangle.
+
+        Args:
+            u: of its centre, in metres.
+            v: of its centre, in metres.
+            length: in metres.
+            width: in metres.
+            angle: of its length from the u axis, in radians.
+
+        Returns:
+            (4, 2) town coordinates in order.
+        """
         c, s = math.cos(angle) / 2.0, math.sin(angle) / 2.0
         along, across = np.array([c, s]) * length, np.array([-s, c]) * width
         uv: Array = np.array([u, v]) + np.array([-along - across, along - across, along + across, across - along])
         return uv
 
     def fill(self, uv: Array, rgb: Colour, material: int | None = None, busy: bool = False) -> None:
-        """Paint a polygon of town coordinates."""
+        """Paint a polygon.
+
+        Args:
+            uv: (N, 2) town coordinates of its corners.
+            rgb: colour.
+            material: None leaves the material as it is.
+            busy: whether nothing may be built there.
+        """
         points = np.rint(self.px(uv) * 16.0).astype(np.int32)
         cv2.fillPoly(self.rgb, [points], rgb, cv2.LINE_AA, 4)
         if material is not None:
@@ -94,7 +119,17 @@ class Canvas:
         return self.tint(colours[int(self.rng.integers(len(colours)))])
 
     def patch(self, u: float, v: float, radius_m: float) -> tuple[tuple[slice, slice], Array, Array] | None:
-        """Raster window about a place, with town offsets (u, v) of its pixels; None where it is cut off."""
+        """The raster window about a position.
+
+        Args:
+            u: of its centre, in metres.
+            v: of its centre, in metres.
+            radius_m: half of its side.
+
+        Returns:
+            Slices of rows and columns, and offsets (h, w) of the pixels from the centre in u and in v, in metres;
+            None where the canvas cuts the window off.
+        """
         x, y = np.rint(self.px(np.array([[u, v]]))[0]).astype(int)
         r = math.ceil(radius_m / self.gsd) + 1
         if x < r or y < r or x + r >= self.shape[1] or y + r >= self.shape[0]:
@@ -104,12 +139,21 @@ class Canvas:
         return window, exact[:, 0].reshape(2 * r + 1, -1), exact[:, 1].reshape(2 * r + 1, -1)
 
     def value(self, raster: NDArray[np.generic], u: float, v: float) -> float:
-        """A raster's value at a place, -1 outside."""
+        """A raster's value at a position.
+
+        Args:
+            raster: (H, W).
+            u: town coordinate in metres.
+            v: town coordinate in metres.
+
+        Returns:
+            The value of the nearest pixel, -1 outside.
+        """
         x, y = np.rint(self.px(np.array([[u, v]]))[0]).astype(int)
         return float(raster[y, x]) if 0 <= x < raster.shape[1] and 0 <= y < raster.shape[0] else -1.0
 
     def texture(self) -> None:
-        """Grain the painted colours by material, at three scales."""
+        """Add texture to the painted colours by material, at three scales."""
         gain = np.ones(self.shape, np.float32)
         for scale, cell_m in enumerate((self.gsd, 1.5, 12.0)):
             cells = [max(2, math.ceil(n * self.gsd / cell_m)) for n in self.shape]
@@ -125,7 +169,7 @@ class Canvas:
 def building(
     canvas: Canvas, u: float, v: float, length: float, width: float, eave: float, kind: str, angle: float = 0.0
 ) -> bool:
-    """Put up a building where the ground is free; ``kind`` is "gable", "hip" or "flat"."""
+    """Draw a building ("gable", "hip" or "flat") where the ground is free, and return whether it was drawn."""
     found = canvas.patch(u, v, math.hypot(length, width) / 2 + 1.0)
     if found is None:
         return False
@@ -196,7 +240,7 @@ def _flat_roof(canvas: Canvas, a: Array, b: Array, gap: Array, length: float, wi
 
 
 def tree(canvas: Canvas, u: float, v: float, radius: float) -> None:
-    """A crown, where neither road nor house stands."""
+    """Draw a crown where there is neither road nor house."""
     found = canvas.patch(u, v, radius)
     if found is None:
         return
@@ -220,7 +264,7 @@ def tree(canvas: Canvas, u: float, v: float, radius: float) -> None:
 def grove(
     canvas: Canvas, u: float, v: float, du: float, dv: float, per_m2: float, radius: tuple[float, float]
 ) -> None:
-    """Trees anywhere in a block."""
+    """Draw trees at random positions in a block."""
     rng = canvas.rng
     for _ in range(int(du * dv / per_m2)):
         tree(canvas, u + rng.uniform(-0.5, 0.5) * du, v + rng.uniform(-0.5, 0.5) * dv, rng.uniform(*radius))

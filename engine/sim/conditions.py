@@ -1,6 +1,6 @@
-"""Conditions: the light, the season and the air of a day, and how they change what a place looks like.
+"""Conditions: light, season and air of a day, and how they change the appearance of the ground.
 
-Snow, foliage and lamps work on the drawn colours before light falls on them, by what each pixel is made of.
+Snow, foliage and lamps work on the drawn colours before light falls on them, by the material of each pixel.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from engine.sim.optics import Sensor
 from engine.sim.render import Atmosphere
 
 _SNOW: tuple[float, ...] = (0.92, 0.18, 0.45, 0.72, 0.92, 0.0, 0.35)
-"""Share of each material, in the canvas's order, that lies under a closed cover of snow; streets are cleared."""
+"""Share of each material, in the canvas's order, that a closed cover of snow hides; streets are cleared."""
 _SNOW_RGB, _STRAW_RGB, _LITTER_RGB, _BARK_RGB = (214, 220, 230), (148, 134, 92), (98, 88, 68), (110, 98, 86)
 _TURNED: tuple[tuple[int, int, int], ...] = ((164, 118, 46), (150, 78, 38), (120, 112, 52), (110, 70, 44))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """What a day does to a picture; the defaults are a clear summer day.
+    """Light, season and air of a day; the defaults are a clear summer day.
 
     Attributes:
         light: sun and sky, as exposed.
@@ -35,7 +35,7 @@ class Condition:
         turned: share of the foliage that has its autumn colours.
         dry: 0 green to 1 withered lawns and crops.
         visibility_m: distance at which 2 % of a contrast is left (Koschmieder); inf is perfectly clear.
-        air_rgb: colour, in grey levels, of the air that is looked through.
+        air_rgb: colour of the air, in grey levels.
         lamps: strength of the street lamps.
         noise: the sensor's noise as a multiple of its own.
 
@@ -65,12 +65,12 @@ class Condition:
 
     @property
     def air(self) -> Atmosphere | None:
-        """What is looked through, None where it is perfectly clear."""
+        """The air between camera and ground, None where it is perfectly clear."""
         return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
 
     @property
-    def dresses(self) -> bool:
-        """Whether the drawn colours change before light falls on them."""
+    def changes_ground(self) -> bool:
+        """Whether the season changes the drawn colours."""
         return bool(self.snow or self.leaves < 1.0 or self.turned or self.dry)
 
     def sensor(self, sensor: Sensor) -> Sensor:
@@ -124,7 +124,7 @@ def condition_by_name(condition: str | Condition) -> Condition:
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, ...], cell_px: float) -> Float32:
-    """Smooth noise (H, W) of about unit variance whose waves are some ``cell_px`` long."""
+    """Smooth noise (H, W) of about unit variance and a wavelength of about ``cell_px``."""
     cells = [max(4, math.ceil(n / cell_px)) for n in shape]
     raised = cv2.resize(rng.standard_normal(cells, np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(raised * np.float32(1.25), dtype=np.float32)
@@ -135,7 +135,7 @@ def _mix(rgb: Float32, colour: Array | Float32, share: Float32) -> None:
     rgb += (colour - rgb) * share[..., None]
 
 
-def dress(
+def apply_season(
     albedo: Image,
     height_m: Float32,
     material: Image,
@@ -144,39 +144,59 @@ def dress(
     gsd_m_per_px: float,
     rng: np.random.Generator,
 ) -> tuple[Image, Float32]:
-    """Colours and heights of a place in a season; as they are where the condition has none.
+    """Colours and heights of the ground in a season; unchanged where the condition has none.
 
     Args:
         albedo: (H, W, 3) drawn colours of summer.
         height_m: (H, W) of the highest surface.
-        material: (H, W) what a pixel is made of, as in :mod:`engine.sim.canvas`.
+        material: (H, W) indices of the materials of :mod:`engine.sim.canvas`.
         ground_m: (H, W) of the bare ground, None where it is flat at 0.
         condition: of the day.
         gsd_m_per_px: pixel in metres.
-        rng: of where snow lies and which branches are bare.
+        rng: of the snow's patches and the bare branches.
+
+    Returns:
+        (H, W, 3) uint8 colours and (H, W) heights.
     """
-    if not condition.dresses:
+    if not condition.changes_ground:
         return albedo, height_m
     ground = np.zeros_like(height_m) if ground_m is None else ground_m
     rgb, height, kind = albedo.astype(np.float32), height_m.copy(), material.copy()
     large, small = (_noise(rng, kind.shape, m / gsd_m_per_px) for m in (14.0, 1.4))
     grain = _noise(rng, kind.shape, 0.45 / gsd_m_per_px)
     _wither(rgb, kind, condition, large, rng, gsd_m_per_px)
+    _shed(rgb, height, kind, ground, condition, grain, small)
+    if condition.snow:
+        _cover_with_snow(rgb, kind, condition.snow, large, small)
+    return np.clip(rgb, 0, 255).astype(np.uint8), height
+
+
+def _shed(
+    rgb: Float32,
+    height: Float32,
+    kind: Image,
+    ground: Float32,
+    condition: Condition,
+    grain: Float32,
+    small: Float32,
+) -> None:
+    """Open the crowns of trees by their share of leaves: bare ground between branches, in place."""
     bare = (kind == CANOPY) & (0.5 + 0.29 * grain + 0.12 * small > condition.leaves)
-    if condition.leaves < 0.5:  # what stands of a bare tree is wood
+    if condition.leaves < 0.5:  # what is left of a bare tree is wood
         wood = ((kind == CANOPY) & ~bare).astype(np.float32) * np.float32(0.85 * (1.0 - condition.leaves))
         _mix(rgb, np.array(_BARK_RGB, np.float32), wood)
         height[wood > 0] = ground[wood > 0] + np.float32(0.65) * (height - ground)[wood > 0]
     rgb[bare] = np.array(_LITTER_RGB, np.float32) * (1.0 + 0.08 * small[bare][:, None])
     height[bare] = ground[bare]
     kind[bare] = GRASS
-    if condition.snow:
-        cover = np.array(_SNOW, np.float32)[kind] * np.float32(condition.snow * 1.2)
-        lying = np.clip(2.2 * (cover - 0.5) + 0.5 + 0.22 * large + 0.1 * small, 0.0, 1.0) * (cover > 0)
-        # A thin cover lets some of what lies below show through.
-        grey = rgb.mean(axis=2, keepdims=True) / np.float32(110.0)
-        _mix(rgb, np.array(_SNOW_RGB, np.float32) * (0.86 + 0.14 * np.clip(grey, 0.3, 1.7)), lying * 0.94)
-    return np.clip(rgb, 0, 255).astype(np.uint8), height
+
+
+def _cover_with_snow(rgb: Float32, kind: Image, snow: float, large: Float32, small: Float32) -> None:
+    """Blend in snow by material, in patches, in place; through a thin cover the ground shows."""
+    cover = np.array(_SNOW, np.float32)[kind] * np.float32(snow * 1.2)
+    share = np.clip(2.2 * (cover - 0.5) + 0.5 + 0.22 * large + 0.1 * small, 0.0, 1.0) * (cover > 0)
+    grey = rgb.mean(axis=2, keepdims=True) / np.float32(110.0)
+    _mix(rgb, np.array(_SNOW_RGB, np.float32) * (0.86 + 0.14 * np.clip(grey, 0.3, 1.7)), share * 0.94)
 
 
 def _wither(

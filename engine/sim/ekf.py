@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import enu_from_body
+from engine.geo import chi_square, enu_from_body
 from engine.sim.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s
 from engine.sim.rotations import cross_matrix, rotation
 from engine.sim.sensors import GpsSample, SensorSuite
@@ -27,22 +27,22 @@ POSITION, VELOCITY, TURN, ACCEL, GYRO = (slice(k, k + 3) for k in range(0, 15, 3
 BARO, COMPASS = 15, 16
 STATES = 17
 START_TILT_DEG = 0.5
-"""How well roll and pitch are known of a vehicle that was levelled."""
+"""Standard deviation of roll and pitch of a vehicle that was levelled."""
 
 
 @dataclass(frozen=True, slots=True)
 class FilterState:
-    """What the filter believes of one moment.
+    """Estimate of the vehicle at one time, with its covariance.
 
     Attributes:
-        time_s: of that moment.
+        time_s: since the start.
         position_m: (3,) east, north, up.
         velocity_mps: (3,) the same.
         enu_from_body: (3, 3) attitude.
         accel_bias_mps2: (3,) in the body.
         gyro_bias_rps: (3,) in the body.
-        baro_drift_m: what the barometer reads too high.
-        compass_bias_rad: what the compass reads too far clockwise.
+        baro_drift_m: error of the barometer, positive where it reads too high.
+        compass_bias_rad: error of the compass, positive where it reads too far clockwise.
         covariance: (17, 17) of the errors, in the order of the attributes.
     """
 
@@ -62,14 +62,17 @@ class FilterState:
         return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
 
 
-def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> FilterState:
-    """The belief of a vehicle at rest that was levelled: its heading is known as well as by its compass.
+def initial_state(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> FilterState:
+    """The state of a levelled vehicle at rest, whose heading is as uncertain as its compass.
 
     Args:
         position_m: (3,) east, north, up.
         sigma_m: of each of them.
         attitude: of the body.
-        suite: what it carries.
+        suite: its sensors.
+
+    Returns:
+        The state at time 0, biases and drifts 0.
     """
     imu = suite.imu
     tilt = math.radians(START_TILT_DEG)
@@ -79,7 +82,7 @@ def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSu
         + [imu.gyro_start_rps] * 3 + [0.02, math.radians(suite.compass.bias_deg)]
     )  # fmt: skip
     covariance = np.diag(sigmas**2)
-    # The heading is the compass's: as far as that reads too far clockwise, the nose lies anticlockwise of it.
+    # The heading is the compass's: where that reads too far clockwise, the true heading is anticlockwise of it.
     up = TURN.start + 2
     covariance[up, COMPASS] = covariance[COMPASS, up] = math.radians(suite.compass.bias_deg) ** 2
     return FilterState(
@@ -95,27 +98,27 @@ def begin(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSu
     )
 
 
-def predict(belief: FilterState, sample: IdealImu, suite: SensorSuite) -> FilterState:
-    """The belief one step later, by what the IMU measured meanwhile."""
-    rates, dt = sample.rates_rps - belief.gyro_bias_rps, STEP_S
-    half = belief.enu_from_body @ rotation(0.5 * dt * rates)
-    force = half @ (sample.force_mps2 - belief.accel_bias_mps2)
+def predict(state: FilterState, sample: IdealImu, suite: SensorSuite) -> FilterState:
+    """The state one step later, from what the IMU measured in between."""
+    rates, dt = sample.rates_rps - state.gyro_bias_rps, STEP_S
+    half = state.enu_from_body @ rotation(0.5 * dt * rates)
+    force = half @ (sample.force_mps2 - state.accel_bias_mps2)
     acceleration = force + GRAVITY
     keep_accel = math.exp(-dt / suite.imu.accel_time_s)
     keep_gyro = math.exp(-dt / suite.imu.gyro_time_s)
     keep_baro = math.exp(-dt / suite.barometer.drift_time_s)
-    F = _motion(half, force, keep_accel, keep_gyro, keep_baro)
-    covariance = F @ belief.covariance @ F.T
+    F = _transition(half, force, keep_accel, keep_gyro, keep_baro)
+    covariance = F @ state.covariance @ F.T
     covariance[_DIAGONAL] += _process_noise(suite)
     return FilterState(
-        next_time_s(belief.time_s),
-        belief.position_m + dt * belief.velocity_mps + 0.5 * dt**2 * acceleration,
-        belief.velocity_mps + dt * acceleration,
-        belief.enu_from_body @ rotation(dt * rates),
-        keep_accel * belief.accel_bias_mps2,
-        keep_gyro * belief.gyro_bias_rps,
-        keep_baro * belief.baro_drift_m,
-        belief.compass_bias_rad,
+        next_time_s(state.time_s),
+        state.position_m + dt * state.velocity_mps + 0.5 * dt**2 * acceleration,
+        state.velocity_mps + dt * acceleration,
+        state.enu_from_body @ rotation(dt * rates),
+        keep_accel * state.accel_bias_mps2,
+        keep_gyro * state.gyro_bias_rps,
+        keep_baro * state.baro_drift_m,
+        state.compass_bias_rad,
         covariance,
     )
 
@@ -123,8 +126,8 @@ def predict(belief: FilterState, sample: IdealImu, suite: SensorSuite) -> Filter
 _DIAGONAL = np.diag_indices(STATES)
 
 
-def _motion(half: Array, force: Array, keep_accel: float, keep_gyro: float, keep_baro: float) -> Array:
-    """(17, 17) how the errors of one moment become those of the next."""
+def _transition(half: Array, force: Array, keep_accel: float, keep_gyro: float, keep_baro: float) -> Array:
+    """Transition matrix (17, 17) of the errors over one step."""
     dt, F = STEP_S, np.eye(STATES)
     F[POSITION, VELOCITY] = dt * np.eye(3)
     F[VELOCITY, TURN] = -dt * cross_matrix(force)
@@ -144,80 +147,82 @@ def _process_noise(suite: SensorSuite) -> Array:
     return STEP_S * np.concatenate([np.repeat(drive, 3), [drift, 0.0]]) ** 2
 
 
-def correct(belief: FilterState, residual: Array, H: Array, R: Array) -> FilterState:
-    """The belief after a measurement (Joseph's form, which keeps the covariance positive definite).
+def correct(state: FilterState, residual: Array, H: Array, R: Array) -> FilterState:
+    """The state after a measurement, in Joseph's form, which keeps the covariance positive definite.
 
     Args:
-        belief: before.
+        state: before.
         residual: (M,) measured less expected.
-        H: (M, 17) how the errors enter the measurement.
+        H: (M, 17) Jacobian of the measurement by the errors.
         R: (M, M) covariance of its noise.
+
+    Returns:
+        The corrected state, with the errors taken into its position, velocity, attitude, biases and drifts.
     """
-    P = belief.covariance
+    P = state.covariance
     gain = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-    kept = np.eye(STATES) - gain @ H
-    covariance = kept @ P @ kept.T + gain @ R @ gain.T
+    update = np.eye(STATES) - gain @ H
+    covariance = update @ P @ update.T + gain @ R @ gain.T
     error = gain @ residual
-    # Taking the turn into the attitude moves the others' frame by half of it (Solà, eq. 287): too little to keep.
+    # Injecting the turn into the attitude rotates the error frame by half of it (Solà, eq. 287): negligible.
     return FilterState(
-        belief.time_s,
-        belief.position_m + error[POSITION],
-        belief.velocity_mps + error[VELOCITY],
-        rotation(error[TURN]) @ belief.enu_from_body,
-        belief.accel_bias_mps2 + error[ACCEL],
-        belief.gyro_bias_rps + error[GYRO],
-        belief.baro_drift_m + float(error[BARO]),
-        belief.compass_bias_rad + float(error[COMPASS]),
+        state.time_s,
+        state.position_m + error[POSITION],
+        state.velocity_mps + error[VELOCITY],
+        rotation(error[TURN]) @ state.enu_from_body,
+        state.accel_bias_mps2 + error[ACCEL],
+        state.gyro_bias_rps + error[GYRO],
+        state.baro_drift_m + float(error[BARO]),
+        state.compass_bias_rad + float(error[COMPASS]),
         0.5 * (covariance + covariance.T),
     )
 
 
-def fuse_height(belief: FilterState, height_m: float, suite: SensorSuite) -> FilterState:
-    """Takes in the barometer."""
+def fuse_height(state: FilterState, height_m: float, suite: SensorSuite) -> FilterState:
+    """Fuse a height of the barometer, in metres in the datum of the position."""
     H = np.zeros((1, STATES))
     H[0, 2] = H[0, BARO] = 1.0
-    residual = np.array([height_m - belief.position_m[2] - belief.baro_drift_m])
-    return correct(belief, residual, H, np.array([[suite.barometer.noise_m**2]]))
+    residual = np.array([height_m - state.position_m[2] - state.baro_drift_m])
+    return correct(state, residual, H, np.array([[suite.barometer.noise_m**2]]))
 
 
-def fuse_heading(belief: FilterState, heading_deg: float, suite: SensorSuite) -> FilterState:
-    """Takes in the compass; a body that points straight up or down has no heading."""
-    east, north, up = belief.enu_from_body[:, 0].tolist()
+def fuse_heading(state: FilterState, heading_deg: float, suite: SensorSuite) -> FilterState:
+    """Fuse a heading of the compass, clockwise from north; a body that points straight up or down has none."""
+    east, north, up = state.enu_from_body[:, 0].tolist()
     flat2 = east**2 + north**2
     if flat2 < 1e-3:
-        return belief
+        return state
     H = np.zeros((1, STATES))
     # d atan2(east, north) under a turn from the left, which moves the nose by turn x nose.
     H[0, TURN] = (up * east / flat2, up * north / flat2, -1.0)
     H[0, COMPASS] = 1.0
-    off = math.radians(heading_deg) - math.atan2(east, north) - belief.compass_bias_rad
+    off = math.radians(heading_deg) - math.atan2(east, north) - state.compass_bias_rad
     residual = np.array([(off + math.pi) % (2.0 * math.pi) - math.pi])
-    return correct(belief, residual, H, np.array([[math.radians(suite.compass.noise_deg) ** 2]]))
+    return correct(state, residual, H, np.array([[math.radians(suite.compass.noise_deg) ** 2]]))
 
 
-def fuse_gps(belief: FilterState, sample: GpsSample, suite: SensorSuite) -> FilterState:
-    """Takes in position and velocity of the receiver, at the moment that they are of."""
+def fuse_gps(state: FilterState, sample: GpsSample, suite: SensorSuite) -> FilterState:
+    """Fuse position and velocity of the receiver; the state is that of the sample's time."""
     gps = suite.gps
     variances = np.array([gps.noise_m] * 2 + [gps.height_noise_m] + [gps.velocity_noise_mps] * 3) ** 2
-    residual = np.concatenate([sample.position_m - belief.position_m, sample.velocity_mps - belief.velocity_mps])
-    return correct(belief, residual, np.eye(6, STATES), np.diag(variances))
+    residual = np.concatenate([sample.position_m - state.position_m, sample.velocity_mps - state.velocity_mps])
+    return correct(state, residual, np.eye(6, STATES), np.diag(variances))
 
 
-def fuse_fix(belief: FilterState, fix: Fix) -> FilterState:
-    """Takes in a fix of the engine with its covariance, at its capture; its height too where it has one.
+def fuse_fix(state: FilterState, fix: Fix) -> FilterState:
+    """Fuse a fix of the engine with its covariance, and its height where it has one.
 
     Args:
-        belief: of the moment of capture, about the same origin and in the same datum of heights.
-        fix: what the engine said of it.
+        state: at the capture of the frame, about the same origin and in the same datum of heights.
+        fix: of that frame.
     """
-    place = [fix.east_m, fix.north_m] + ([] if fix.up_m is None else [fix.up_m])
-    count = len(place)
-    spread = fix.covariance_m2[:count, :count]
-    return correct(belief, np.array(place) - belief.position_m[:count], np.eye(count, STATES), spread)
+    position_m = [fix.east_m, fix.north_m] + ([] if fix.up_m is None else [fix.up_m])
+    count = len(position_m)
+    covariance_m2 = fix.covariance_m2[:count, :count]
+    return correct(state, np.array(position_m) - state.position_m[:count], np.eye(count, STATES), covariance_m2)
 
 
-def fix_chi_square(belief: FilterState, fix: Fix) -> float:
-    """Squared horizontal distance of a fix from the belief, in units of both covariances: 2 degrees of freedom."""
-    apart = np.array([fix.east_m, fix.north_m]) - belief.position_m[:2]
-    spread = belief.covariance[:2, :2] + fix.covariance_m2[:2, :2]
-    return float(apart @ np.linalg.solve(spread, apart))
+def fix_chi_square(state: FilterState, fix: Fix) -> float:
+    """Chi-square of a fix against the state, horizontally, with both covariances: 2 degrees of freedom."""
+    offset_m = np.array([fix.east_m, fix.north_m]) - state.position_m[:2]
+    return chi_square(offset_m, state.covariance[:2, :2] + fix.covariance_m2[:2, :2])

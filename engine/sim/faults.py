@@ -1,4 +1,4 @@
-"""What goes wrong in a closed loop by choice: an engine that is killed, a map that is shifted, a frozen camera."""
+"""Faults injected into a closed loop: a killed engine, a shifted map, a frozen camera."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from engine.errors import OptionError
 from engine.navigator import Matcher
 from engine.values import Fix, Frame, NoFix, Prior
 
-KINDS = ("none", "killed", "shifted", "frozen")
+FAULT_KINDS = ("none", "killed", "shifted", "frozen")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """A fault and when.
+    """A fault and its times.
 
     Attributes:
-        kind: "none"; "killed": the engine is gone, and begins anew at the end, where the filter believes itself;
-            "shifted": the map lies to the east of where it says; "frozen": the camera repeats its last picture.
+        kind: "none"; "killed": the engine stops, and restarts at the end from the filter's estimate;
+            "shifted": the map's georeference is off to the east; "frozen": the camera repeats its last picture.
         start_s: when it begins.
         duration_s: how long it lasts; ``math.inf`` to the end of the flight.
         shift_m: how far the map is shifted.
@@ -34,8 +34,8 @@ class Fault:
     shift_m: float = 40.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise OptionError(f"fault: expected one of {', '.join(KINDS)}, got {self.kind!r}")
+        if self.kind not in FAULT_KINDS:
+            raise OptionError(f"fault: expected one of {', '.join(FAULT_KINDS)}, got {self.kind!r}")
         if not (math.isfinite(self.start_s) and self.start_s >= 0.0):
             raise OptionError(f"start_s: expected 0 or more, got {self.start_s}")
         if not self.duration_s > 0.0:
@@ -44,21 +44,21 @@ class Fault:
             raise OptionError(f"shift_m: expected a finite number, got {self.shift_m}")
 
     def acts(self, kind: str, time_s: float) -> bool:
-        """Whether it is of this kind and acts at this time."""
+        """Whether it is of this kind and active at this time."""
         return self.kind == kind and self.start_s <= time_s < self.start_s + self.duration_s
 
 
 class ShiftedMap:
     """A matcher whose map can be shifted to the east while it works.
 
-    A map that shows everything ``shift_m`` too far east finds what it is asked for near a place by looking that
-    far west of it on the right map, and says where it found it that far too far east.
+    On a map that shows everything ``shift_m`` too far east a search near a prior is one that far west of it on the
+    correct map, and its fix is reported that far too far east.
 
     Args:
-        matcher: on the right map.
+        matcher: on the correct map.
 
     Attributes:
-        shift_m: as it stands; 0 is the right map.
+        shift_m: current shift; 0 is the correct map.
     """
 
     def __init__(self, matcher: Matcher) -> None:
@@ -67,7 +67,7 @@ class ShiftedMap:
         self.shift_m = 0.0
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
-        """As the matcher; a prior is one in metres about the map's origin."""
+        """As the matcher's; a prior is in metres about the map's origin."""
         if prior is not None and self.shift_m:
             if prior.east_m is None:
                 raise OptionError("prior: expected east_m and north_m over a shifted map")

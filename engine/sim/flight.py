@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +21,21 @@ from engine.sim.light import Image
 from engine.sim.optics import ExposureMotion, Optics, Sensor, take_picture
 from engine.sim.render import transformer
 from engine.sim.town import Town, build_town, generator
-from engine.sim.vehicle import STEP_S, FlightStyle, Motion, SensorNoise, fly, measure
+from engine.sim.vehicle import (
+    COURSE_STEP_S,
+    START_NS,
+    FlightStyle,
+    Motion,
+    SensorNoise,
+    fly_waypoints,
+    simulate_telemetry,
+)
 from engine.values import Attitude, Frame, Truth
 
 Array = NDArray[np.float64]
 
-START_NS = 1_000_000_000
 EDGE_M = 20.0
-"""Distance that footprints keep from the map's edge when the camera hangs level."""
+"""Distance of footprints from the map's edge while the camera looks straight down."""
 DRONE_SENSOR = Sensor(
     gamma=1.1,
     balance_rgb=(0.96, 1.02, 1.09),
@@ -37,11 +45,20 @@ DRONE_SENSOR = Sensor(
     blur_px=0.45,
     noise_sd=2.5,
 )
-"""The drone's camera: cooler and harder than the map's."""
+"""The drone's camera: a cooler white balance and more contrast than the map's."""
 
 
 def grid_at(town: Town, origin: LocalFrame, east_north_m: Array) -> tuple[float, float]:
-    """Easting and northing in the town's CRS of a place (2,) or (3,) in the local frame."""
+    """Easting and northing of a position in the local frame.
+
+    Args:
+        town: whose CRS is meant.
+        origin: of the local frame.
+        east_north_m: (2,) or (3,) east and north in metres; what follows is not read.
+
+    Returns:
+        (easting, northing) in metres in the town's CRS.
+    """
     lat, lon = origin.geodetic_from_enu(float(east_north_m[0]), float(east_north_m[1]))
     easting, northing = transformer(town.crs_epsg).transform(float(lon), float(lat))
     return easting, northing
@@ -59,18 +76,21 @@ def picture_at(
     optics: Optics | None = None,
     sway: ExposureMotion | None = None,
 ) -> Image:
-    """The picture (H, W, 3) RGB that a camera at a place delivers.
+    """The picture that a camera at a position delivers.
 
     Args:
         town: what it looks at.
         camera: intrinsics and mount.
         origin: of the local east-north-up frame.
-        east_north_up_m: (3,) the camera's place in it, up above the world's height 0.
+        east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
         attitude: of the body, about true north.
         rng: of the sensor's noise and exposure.
         sensor: how light becomes grey levels; None takes the drone's, as it is in the town's condition.
         optics: exposure time, shutter and gain; None is an ideal camera.
         sway: motion while the picture is taken.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
 
     Raises:
         OptionError: the camera looks above the horizon, or is not above the highest roof.
@@ -88,11 +108,11 @@ class FlightPlan:
         town: what it flies over.
         camera: what it looks through.
         origin: of the local east-north-up frame of its motions: the map's centre; up from the world's height 0.
-        truth: the exact motion, one entry a frame.
-        telemetry: the same as the sensors have it.
+        truth: the exact motion, one entry per frame.
+        telemetry: the same as the sensors measure it.
         timestamps_ns: capture times.
         seed: of the camera's noise.
-        optics: what else happens in the camera; None is nothing.
+        optics: exposure, shutter and gain; None is an ideal camera.
         sways: motion while each picture is taken, where the optics show it.
     """
 
@@ -110,24 +130,26 @@ class FlightPlan:
         return len(self.timestamps_ns)
 
     def iter_frames(self) -> Iterator[Frame]:
-        """Draw the frames one after the other."""
+        """Draw the frames one after the other, each with its telemetry."""
         rng = generator(self.seed, 0xCA)
         for k in range(len(self)):
             yield self._frame(k, rng)
 
     def _frame(self, k: int, rng: np.random.Generator) -> Frame:
-        truth, told = self.truth, self.telemetry
+        truth, telemetry = self.truth, self.telemetry
         attitude = Attitude(float(truth.roll_deg[k]), float(truth.pitch_deg[k]), float(truth.heading_deg[k]))
-        place, sway = truth.position_m[k], self.sways[k] if self.sways else None
+        position_m, sway = truth.position_m[k], self.sways[k] if self.sways else None
         return Frame(
-            picture_at(self.town, self.camera, self.origin, place, attitude, rng, optics=self.optics, sway=sway),
+            picture_at(
+                self.town, self.camera, self.origin, position_m, attitude, rng, optics=self.optics, sway=sway
+            ),
             timestamp_ns=self.timestamps_ns[k],
-            height_agl_m=float(told.position_m[k, 2]) - self._ground_m(k),
-            heading_deg=float(told.heading_deg[k]),
-            roll_deg=float(told.roll_deg[k]),
-            pitch_deg=float(told.pitch_deg[k]),
-            east_velocity_mps=float(told.velocity_mps[k, 0]),
-            north_velocity_mps=float(told.velocity_mps[k, 1]),
+            height_agl_m=float(telemetry.position_m[k, 2]) - self._ground_m(k),
+            heading_deg=float(telemetry.heading_deg[k]),
+            roll_deg=float(telemetry.roll_deg[k]),
+            pitch_deg=float(telemetry.pitch_deg[k]),
+            east_velocity_mps=float(telemetry.velocity_mps[k, 0]),
+            north_velocity_mps=float(telemetry.velocity_mps[k, 1]),
         )
 
     def _ground_m(self, k: int) -> float:
@@ -135,7 +157,7 @@ class FlightPlan:
         return self.town.world.ground_at(grid_at(self.town, self.origin, self.truth.position_m[k]))
 
     def truth_rows(self) -> list[Truth]:
-        """Where the camera really was, one row a frame."""
+        """True poses of the camera, one row per frame."""
         motion = self.truth
         lat, lon = self.origin.geodetic_from_enu(motion.position_m[:, 0], motion.position_m[:, 1])
         return [
@@ -152,6 +174,10 @@ class FlightPlan:
             for k, stamp in enumerate(self.timestamps_ns)
         ]
 
+    def draw(self) -> SimulatedFlight:
+        """Draw all pictures at once; :meth:`iter_frames` holds one at a time."""
+        return SimulatedFlight(self.town, self.camera, list(self.iter_frames()), self.truth_rows())
+
 
 @dataclass(frozen=True)
 class SimulatedFlight:
@@ -162,20 +188,16 @@ class SimulatedFlight:
         camera: what the frames were taken with.
         frames: pictures with noisy telemetry in them.
         truth: the exact poses, row for row with the frames.
-        names: file names for the frames.
-        description: one sentence for people.
     """
 
     town: Town
     camera: Camera
     frames: list[Frame]
     truth: list[Truth]
-    names: list[str]
-    description: str
 
 
 def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Generator) -> Array:
-    """Corners (5, 2) of the largest rectangle on which level footprints stay on the map, moved a little."""
+    """Corners (5, 2) of the largest rectangle whose level footprints lie on the map, jittered."""
     half_w, half_h = (0.5 * n * town.gsd_m_per_px for n in (town.ortho.shape[1], town.ortho.shape[0]))
     corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
     reach = height_m * math.hypot(corner[0], corner[1]) + EDGE_M
@@ -196,11 +218,11 @@ def _check_frames(frames: int | None, rate_hz: float) -> None:
 
 
 def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
-    """Velocity and turn at each time, from the motion a hundredth of a second before and after."""
-    before, now, after = (motion.at(time_s + step) for step in (-STEP_S, 0.0, STEP_S))
+    """Velocity and turn rate at each time, by central differences over one step of the motion."""
+    before, now, after = (motion.at(time_s + step) for step in (-COURSE_STEP_S, 0.0, COURSE_STEP_S))
 
     def rate(ends: tuple[Array, Array]) -> Array:
-        return ((ends[1] - ends[0] + 180.0) % 360.0 - 180.0) / (2.0 * STEP_S)
+        return ((ends[1] - ends[0] + 180.0) % 360.0 - 180.0) / (2.0 * COURSE_STEP_S)
 
     angles = ("roll_deg", "pitch_deg", "heading_deg")
     turns = np.column_stack([rate((getattr(before, name), getattr(after, name))) for name in angles])
@@ -210,109 +232,78 @@ def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
     )
 
 
+class TownOptions(TypedDict, total=False):
+    """Keyword arguments of :func:`plan_flight` about the town that is built, see :func:`build_town`.
+
+    Attributes:
+        condition: day of the frames: light, season and air.
+        map_condition: day of the map.
+        relief_m: height of the hills. The flight keeps its height above the ground where it begins.
+        river: whether one crosses the town.
+        changed: share of the houses, 0 to 1, that differ between the map and the flight.
+    """
+
+    condition: str | Condition
+    map_condition: str | Condition
+    relief_m: float
+    river: bool
+    changed: float
+
+
 def plan_flight(
     seed: int = 1,
     *,
     frames: int | None = None,
     rate_hz: float = 1.12,
-    light: str = "noon",
     noise: SensorNoise | None = None,
     style: FlightStyle | None = None,
     town: Town | None = None,
     camera: Camera | None = None,
-    condition: str | Condition | None = None,
-    map_condition: str | Condition = "noon",
-    relief_m: float = 0.0,
-    river: bool = False,
-    changed: float = 0.0,
     optics: Optics | None = None,
+    **town_options: Unpack[TownOptions],
 ) -> FlightPlan:
-    """FlightPlan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
+    """Plan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
 
     Args:
         seed: of town, path, sensors and camera.
         frames: how many, from take-off on; None flies to the end (about 150).
         rate_hz: frames per second.
-        light: of the frames, "noon" or "evening".
         noise: of the telemetry; None takes the defaults, as for the style.
         style: of flying.
-        town: to fly over; None builds the seed's. Light, conditions, relief and river are of one that is built.
+        town: to fly over; None builds the seed's by ``town_options``.
         camera: None takes the paper's, 300 x 300 px with 60 degrees.
-        condition: of the frames, in place of the light: see :func:`engine.sim.build_town`.
-        map_condition: of the map.
-        relief_m: height of the hills. The flight keeps its height above the ground where it begins.
-        river: whether one crosses the town.
-        changed: share of the houses that the map and the flight do not have in common.
         optics: exposure time, shutter and gain of the camera; None is an ideal one.
+        **town_options: see :class:`TownOptions`; without effect where a town is given.
 
     Raises:
         OptionError: an argument is out of range, or the map is too small for the height.
     """
     _check_frames(frames, rate_hz)
     style, camera = style or FlightStyle(), camera or Camera.from_fov(300, 300, 60.0)
-    town = town or build_town(
-        seed,
-        light=light,
-        condition=condition,
-        map_condition=map_condition,
-        relief_m=relief_m,
-        river=river,
-        changed=changed,
-    )
-    rng = generator(seed, 0xF1)
+    town = town or build_town(seed, **town_options)
+    motion, origin = _fly_over(town, camera, style, generator(seed, 0xF1))
+    stamps_ns = _stamps_ns(motion, frames, rate_hz)
+    time_s = np.asarray(stamps_ns * 1e-9, np.float64)
+    truth = motion.at(time_s)
+    telemetry = simulate_telemetry(truth, noise or SensorNoise(), generator(seed, 0x5E))
+    sways = () if optics is None else _sways(motion, time_s)
+    stamps = tuple((START_NS + stamps_ns).tolist())
+    return FlightPlan(town, camera, origin, truth, telemetry, stamps, seed, optics=optics, sways=sways)
+
+
+def _fly_over(
+    town: Town, camera: Camera, style: FlightStyle, rng: np.random.Generator
+) -> tuple[Motion, LocalFrame]:
+    """The motion round the map, up from the world's height 0, and the local frame about the map's centre."""
     middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
     lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
     origin = LocalFrame(lat, lon)
-    motion = fly(_waypoints(town, camera, style.height_agl_m, rng), style, rng)
+    motion = fly_waypoints(_waypoints(town, camera, style.height_agl_m, rng), style, rng)
     motion.position_m[:, 2] += town.world.ground_at(grid_at(town, origin, motion.position_m[0]))
+    return motion, origin
+
+
+def _stamps_ns(motion: Motion, frames: int | None, rate_hz: float) -> NDArray[np.int64]:
+    """Times (N,) of the frames since take-off in nanoseconds."""
     count = int(motion.time_s[-1] * rate_hz) + 1
-    stamps = np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz).astype(np.int64)
-    truth = motion.at(stamps * 1e-9)
-    told = measure(truth, noise or SensorNoise(), generator(seed, 0x5E))
-    sways = () if optics is None else _sways(motion, stamps * 1e-9)
-    return FlightPlan(
-        town, camera, origin, truth, told, tuple((START_NS + stamps).tolist()), seed, optics=optics, sways=sways
-    )
-
-
-def paper_flight(
-    seed: int = 1,
-    *,
-    frames: int | None = None,
-    rate_hz: float = 1.12,
-    light: str = "noon",
-    noise: SensorNoise | None = None,
-    style: FlightStyle | None = None,
-    town: Town | None = None,
-    camera: Camera | None = None,
-    condition: str | Condition | None = None,
-    map_condition: str | Condition = "noon",
-    relief_m: float = 0.0,
-    river: bool = False,
-    changed: float = 0.0,
-    optics: Optics | None = None,
-) -> SimulatedFlight:
-    """Fly the paper's flight and draw it; the arguments and errors are those of :func:`plan_flight`."""
-    plan = plan_flight(
-        seed,
-        frames=frames,
-        rate_hz=rate_hz,
-        light=light,
-        noise=noise,
-        style=style,
-        town=town,
-        camera=camera,
-        condition=condition,
-        map_condition=map_condition,
-        relief_m=relief_m,
-        river=river,
-        changed=changed,
-        optics=optics,
-    )
-    day = light if condition is None else condition if isinstance(condition, str) else "a day of your own"
-    names = [f"frame_{k:06d}.png" for k in range(len(plan))]
-    height = (style or FlightStyle()).height_agl_m
-    description = (
-        f"Simulated town (seed {seed}, {day}): {len(plan)} frames at {rate_hz:g} Hz from {height:g} m above ground"
-    )
-    return SimulatedFlight(plan.town, plan.camera, list(plan.iter_frames()), plan.truth_rows(), names, description)
+    return np.asarray(np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz), np.int64)

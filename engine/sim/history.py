@@ -1,4 +1,4 @@
-"""Delayed measurements: the filter's last seconds, so that each is taken in at the moment that it is of."""
+"""Delayed measurements: the filter's last seconds, so that each is fused at the time it was taken."""
 
 from __future__ import annotations
 
@@ -12,60 +12,60 @@ from engine.sim.quadrotor import STEP_S, IdealImu
 from engine.sim.sensors import SensorSuite
 
 Correction = Callable[[FilterState], FilterState]
-"""A measurement: the belief before it in, the belief after it out."""
+"""Fuses one measurement: takes the state before it, returns the state after it."""
 
 
 @dataclass(slots=True)
 class _Step:
-    """What led from one belief to the next, and that belief."""
+    """An IMU sample, the state after it, and the measurements fused into that state."""
 
     sample: IdealImu
-    belief: FilterState
+    state: FilterState
     corrections: list[Correction] = field(default_factory=list)
 
 
 class History:
-    """A filter that can be told of the past: what came since is then taken in again, in its order.
+    """A filter that fuses late measurements: it goes back to their time and repeats what followed, in order.
 
-    That is exact, at the price of as many predictions as steps have gone by: 12 for a fix of 120 ms ago.
+    That is exact, at the cost of one prediction per step since: 12 for a fix of 120 ms ago.
 
     Args:
-        start: the first belief.
-        suite: what the vehicle carries.
-        keep_s: how far back a measurement may lie.
+        start: the first state.
+        suite: the vehicle's sensors.
+        keep_s: largest age of a measurement.
     """
 
     def __init__(self, start: FilterState, suite: SensorSuite, keep_s: float = 2.0) -> None:
         self._suite = suite
         self._before = start
         self._steps: deque[_Step] = deque()
-        self._most = round(keep_s / STEP_S)
+        self._max_steps = round(keep_s / STEP_S)
 
     @property
     def now(self) -> FilterState:
-        """The newest belief."""
-        return self._steps[-1].belief if self._steps else self._before
+        """The latest state."""
+        return self._steps[-1].state if self._steps else self._before
 
     def advance(self, sample: IdealImu) -> None:
-        """One step on, by what the IMU measured."""
+        """Predict one step, from what the IMU measured."""
         self._steps.append(_Step(sample, predict(self.now, sample, self._suite)))
-        if len(self._steps) > self._most:
-            self._before = self._steps.popleft().belief
+        if len(self._steps) > self._max_steps:
+            self._before = self._steps.popleft().state
 
     def at(self, time_s: float) -> FilterState:
-        """The belief of a moment as it stands by now.
+        """The state at a time, by all measurements so far.
 
         Raises:
-            StateError: it lies in the future, or further back than is kept.
+            StateError: the time is in the future, or further back than is kept.
         """
         back = self._back(time_s)
-        return self._before if back == len(self._steps) else self._steps[len(self._steps) - 1 - back].belief
+        return self._before if back == len(self._steps) else self._steps[len(self._steps) - 1 - back].state
 
     def fuse(self, correction: Correction, time_s: float) -> None:
-        """Take in a measurement at the moment that it is of.
+        """Fuse a measurement at the time it was taken.
 
         Raises:
-            StateError: that lies in the future, or further back than is kept.
+            StateError: the time is in the future, or further back than is kept.
         """
         back = self._back(time_s)
         if back == len(self._steps):
@@ -74,17 +74,17 @@ class History:
             last = len(self._steps) - 1 - back
             step = self._steps[last]
             step.corrections.append(correction)
-            step.belief = correction(step.belief)
-        belief = self._before if last < 0 else self._steps[last].belief
+            step.state = correction(step.state)
+        state = self._before if last < 0 else self._steps[last].state
         for k in range(last + 1, len(self._steps)):
             step = self._steps[k]
-            belief = predict(belief, step.sample, self._suite)
-            for known in step.corrections:
-                belief = known(belief)
-            step.belief = belief
+            state = predict(state, step.sample, self._suite)
+            for later in step.corrections:
+                state = later(state)
+            step.state = state
 
     def _back(self, time_s: float) -> int:
-        """How many steps ago a moment is."""
+        """How many steps ago a time is."""
         back = round((self.now.time_s - time_s) / STEP_S)
         if not 0 <= back <= len(self._steps):
             oldest = self.now.time_s - STEP_S * len(self._steps)

@@ -16,8 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import OptionError
-
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -28,10 +26,10 @@ class Light:
     """A sun and a sky.
 
     Attributes:
-        azimuth_deg: where the sun stands, clockwise from the raster's up direction.
+        azimuth_deg: of the sun, clockwise from the raster's up direction.
         elevation_deg: above the horizon.
         sun_rgb: strength of the sun on a surface that faces it.
-        sky_rgb: strength of the light that reaches shadows too.
+        sky_rgb: strength of the diffuse light, which reaches shadows too.
     """
 
     azimuth_deg: float
@@ -53,25 +51,22 @@ LIGHTS = {
         azimuth_deg=262.0, elevation_deg=17.0, sun_rgb=(1.05, 0.76, 0.46), sky_rgb=(0.25, 0.28, 0.36)
     ),
 }
-"""The lights that a flight can be flown in."""
-
-
-def light_by_name(name: str) -> Light:
-    """The light of that name.
-
-    Raises:
-        OptionError: there is none.
-    """
-    if name not in LIGHTS:
-        raise OptionError(f"light: expected one of {', '.join(LIGHTS)}, got {name!r}")
-    return LIGHTS[name]
+"""Lights of the published flights, by name."""
 
 
 def sun_visibility(height_m: Float32, gsd_m_per_px: float, light: Light) -> Float32:
-    """Share of the sun that reaches every pixel (H, W), in [0, 1].
+    """Share of the sun's light that reaches every pixel.
 
     The raster is turned until light travels along its rows; the shadow's height is then a running maximum of
     the heights less the sun's descent, which one pass finds exactly for any length of shadow.
+
+    Args:
+        height_m: (H, W) of the highest surface.
+        gsd_m_per_px: pixel in metres.
+        light: direction of the sun.
+
+    Returns:
+        (H, W) in [0, 1].
     """
     h, w = height_m.shape
     east, down, up = light.towards_sun
@@ -95,13 +90,21 @@ def sun_visibility(height_m: Float32, gsd_m_per_px: float, light: Light) -> Floa
 LAMP_RGB = (0.95, 0.72, 0.42)
 """Light right below a street lamp."""
 SHADE_REACH_M = 7.0
-"""How far a wall takes away the sky's light."""
+"""Distance from a wall within which it blocks light of the sky."""
 
 
 def sky_share(height_m: Float32, gsd_m_per_px: float, shade: float) -> Float32:
-    """Share of the sky (H, W) that is left beside walls and between crowns: 1 on roofs and open ground.
+    """Share of the sky that is visible beside walls and between crowns: 1 on roofs and open ground.
 
-    How far a place lies below the mean height around it stands for how much of the sky it sees.
+    It is approximated by how far a pixel is below the mean height around it.
+
+    Args:
+        height_m: (H, W) of the highest surface.
+        gsd_m_per_px: pixel in metres.
+        shade: share that is lost at the foot of high walls, in [0, 1].
+
+    Returns:
+        (H, W) in [0, 1].
     """
     around = cv2.GaussianBlur(height_m, (0, 0), SHADE_REACH_M / gsd_m_per_px)
     sunk = np.clip((around - height_m) / np.float32(SHADE_REACH_M), 0.0, 1.0)
@@ -117,7 +120,7 @@ def illuminate(
     shade: float = 0.0,
     lamps: Float32 | None = None,
 ) -> Image:
-    """Colours (H, W, 3) of a height field under a light: Lambert shading, cast shadows, sky, street lamps.
+    """Colours of a height field under a light: Lambert shading, cast shadows, sky, street lamps.
 
     Args:
         albedo: (H, W, 3) colours in even white light.
@@ -126,6 +129,9 @@ def illuminate(
         light: sun and sky.
         shade: share of the sky that is lost at the foot of high walls.
         lamps: (H, W) light of lamps in [0, 1].
+
+    Returns:
+        (H, W, 3) uint8 RGB.
     """
     step = 1.0 / (2.0 * gsd_m_per_px)
     kernel = np.array([[-step, 0.0, step]], np.float32)
@@ -147,14 +153,17 @@ def illuminate(
 def box_sides(
     ab_m: tuple[Array, Array], size_m: tuple[float, float], axis: Array, wall: Sequence[float], light: Light
 ) -> Image:
-    """Colours (H, W, 4) of a box's walls as :attr:`World.sides` has them, each given to the pixels nearest it.
+    """Colours of a box's walls as :attr:`World.sides` has them, each for the pixels nearest to it.
 
     Args:
         ab_m: offsets (H, W) of the pixels from the box's centre along its length and its width.
         size_m: length and width.
         axis: (2,) direction of the length in raster axes.
         wall: (3,) RGB of the plaster.
-        light: what falls on it; walls in the shadow of others are not darkened.
+        light: on it; walls in the shadow of others are not darkened.
+
+    Returns:
+        (H, W, 4) uint8 RGB, and 255 in columns of windows.
     """
     a, b = ab_m
     end = size_m[0] / 2 - np.abs(a) < size_m[1] / 2 - np.abs(b)

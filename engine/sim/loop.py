@@ -2,13 +2,13 @@
 
 What it does when they fail:
 
-- No fix: the filter coasts on the IMU, and the vehicle flies on along its route while the estimate's sigma stays
-  below ``hold_sigma_m``.
-- Above that it holds: it slows down on its route and hovers by what it has, until fixes have brought the sigma
+- No fix: the filter propagates on the IMU alone, and the vehicle follows its route while the estimate's sigma
+  stays below ``hold_sigma_m``.
+- Above that it holds: it slows down on its route and hovers by the estimate, until fixes have brought the sigma
   below half of that limit. Then it returns to where it left the route, and flies on.
-- Above ``give_up_sigma_m`` there is nothing to hover by: the flight is handed over to the pilot.
-- A fix that contradicts the filter by chi-square is not taken in. Where ``distrust_after`` fixes in a row do so,
-  somebody is wrong, and nobody on board can say who: the flight is handed over as well.
+- Above ``give_up_sigma_m`` the estimate is too uncertain to hover by: the flight is handed over to the pilot.
+- A fix that contradicts the filter by chi-square is not fused. Where ``max_contradictions`` fixes in a row do so,
+  either the filter or the engine is wrong, and the flight is handed over as well.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ from engine.navigator import Matcher, Navigator, NavigatorState
 from engine.sim.ekf import (
     START_TILT_DEG,
     FilterState,
-    begin,
     fix_chi_square,
     fuse_fix,
     fuse_gps,
     fuse_heading,
     fuse_height,
+    initial_state,
 )
 from engine.sim.faults import Fault, ShiftedMap
 from engine.sim.history import History
 from engine.sim.pilot import Gains, Pilot, Route, Setpoint
 from engine.sim.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
 from engine.sim.sensors import GpsSample, Instruments, SensorSuite, steps_between
+from engine.sim.vehicle import START_NS
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-View = Callable[[State], Image]
-"""Takes the picture that the camera delivers where the vehicle is."""
-START_NS = 1_000_000_000
+RenderCallback = Callable[[State], Image]
+"""Returns the picture that the camera delivers at a state of the vehicle."""
 
 
 class Mode(enum.Enum):
-    """What the vehicle does: it follows its route, holds where it is, or is handed over to the pilot."""
+    """Whether the vehicle follows its route, holds its position, or is handed over to the pilot."""
 
     FOLLOW = "follow"
     HOLD = "hold"
@@ -62,21 +62,21 @@ class LoopOptions:
     """How the closed loop is flown.
 
     Attributes:
-        airframe: what flies.
-        wind: what blows.
-        sensors: what it carries.
-        gains: of its controller.
+        airframe: of the vehicle.
+        wind: mean and gusts.
+        sensors: on board.
+        gains: of the position controller.
         frame_rate_hz: of the camera.
         latency_s: from the capture of a frame to the arrival of its fix.
-        start_sigma_m: how well the position is known at the start, per axis.
-        hold_sigma_m: horizontal sigma of the estimate from which on the vehicle holds.
-        give_up_sigma_m: the same from which on the flight is handed over.
-        resume_m: how near to its route the vehicle must believe itself to fly on after a hold.
-        pace_change_per_s: how fast it slows down along its route, and takes up speed again; 1 is in a second.
+        start_sigma_m: standard deviation of the position at the start, per axis.
+        hold_sigma_m: horizontal sigma of the estimate above which the vehicle holds.
+        give_up_sigma_m: horizontal sigma of the estimate above which the flight is handed over.
+        resume_m: largest estimated distance from the route at which the vehicle flies on after a hold.
+        pace_change_per_s: how fast it slows down along its route and speeds up again; 1 is within a second.
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts the filter.
-        distrust_after: fixes in a row that contradict the filter, after which the flight is handed over.
+        max_contradictions: fixes in a row that contradict the filter, at which the flight is handed over.
         healthy_s: age of the last fix, beyond its latency, up to which the engine counts as healthy.
-        gps: whether the receiver's positions are taken in, and the engine's fixes are not.
+        gps: whether the receiver's positions are fused instead of the engine's fixes.
 
     Raises:
         OptionError: a value is not above 0.
@@ -94,13 +94,13 @@ class LoopOptions:
     resume_m: float = 5.0
     pace_change_per_s: float = 0.25
     gate: float = 18.4
-    distrust_after: int = 15
+    max_contradictions: int = 15
     healthy_s: float = 1.0
     gps: bool = False
 
     def __post_init__(self) -> None:
         names = ("latency_s", "start_sigma_m", "hold_sigma_m", "give_up_sigma_m", "resume_m")
-        check_positive(self, *names, "pace_change_per_s", "gate", "distrust_after", "healthy_s")
+        check_positive(self, *names, "pace_change_per_s", "gate", "max_contradictions", "healthy_s")
         steps_between(self.frame_rate_hz)
 
 
@@ -110,16 +110,16 @@ class LoopSample:
 
     Attributes:
         time_s: since the start.
-        truth: the vehicle as it is.
-        belief: the vehicle as the filter has it.
-        plan_m: (3,) where it should be, where it does not hold.
-        mode: what it does.
-        healthy: whether the last fix that the engine handed out is young.
+        truth: the true state of the vehicle.
+        estimate: the filter's.
+        plan_m: (3,) position of the setpoint, east, north and up.
+        mode: of the flight.
+        healthy: whether the engine's last fix is recent.
     """
 
     time_s: float
     truth: State
-    belief: FilterState
+    estimate: FilterState
     plan_m: Array
     mode: Mode
     healthy: bool
@@ -127,14 +127,14 @@ class LoopSample:
 
 @dataclass(frozen=True, slots=True)
 class LoopAnswer:
-    """What became of one frame.
+    """The engine's answer to one frame.
 
     Attributes:
         timestamp_ns: of its capture.
-        truth: the vehicle at that moment.
-        result: what the engine said.
-        state: the navigator's after it; None where the engine was dead.
-        arrives_s: when the vehicle is told.
+        truth: the vehicle's true state then.
+        result: of the engine.
+        state: the navigator's after it; None where the engine was killed.
+        arrives_s: when the vehicle receives the answer.
     """
 
     timestamp_ns: int
@@ -150,10 +150,10 @@ class LoopResult:
 
     Attributes:
         record: ten times a second.
-        answers: what became of every frame.
-        used: stamps of the fixes that the filter took in.
-        start_m: (3,) where the filter believed itself before the start.
-        resets: how often the engine took up its position anew.
+        answers: the engine's, one per frame.
+        used: timestamps of the fixes that the filter fused.
+        start_m: (3,) the filter's estimate before the start, east, north and up.
+        resets: how often the navigator reset its position.
     """
 
     record: list[LoopSample]
@@ -164,18 +164,18 @@ class LoopResult:
 
     @property
     def plan_error_m(self) -> Array:
-        """(N, 3) truth less plan of every instant, in east, north and up."""
+        """(N, 3) truth less plan of every sample, in east, north and up."""
         return np.array([row.truth.position_m - row.plan_m for row in self.record])
 
     @property
     def estimate_error_m(self) -> Array:
-        """(N, 3) estimate less truth of every instant, in east, north and up."""
-        return np.array([row.belief.position_m - row.truth.position_m for row in self.record])
+        """(N, 3) estimate less truth of every sample, in east, north and up."""
+        return np.array([row.estimate.position_m - row.truth.position_m for row in self.record])
 
 
 def fly_closed_loop(
     route: Route,
-    camera: View,
+    camera: RenderCallback,
     matcher: Matcher,
     *,
     seed: int = 1,
@@ -192,8 +192,8 @@ def fly_closed_loop(
         seed: of wind, vibration and all sensors.
         seconds: how long at most; None flies as long as the route takes without holding. A flight that is handed
             over ends there.
-        fault: what goes wrong.
-        options: settings; the defaults serve.
+        fault: injected failure.
+        options: settings.
 
     Raises:
         OptionError: an option is out of range.
@@ -205,18 +205,18 @@ def fly_closed_loop(
 
 
 class ClosedLoop:
-    """A flight while it is flown, for those who want its frames; the arguments are :func:`fly_closed_loop`'s.
+    """A closed-loop flight in progress, frame by frame; the arguments are those of :func:`fly_closed_loop`.
 
     Attributes:
-        options: as they were given.
-        fault: likewise.
-        flown: what has become of it so far.
+        options: as given.
+        fault: as given.
+        flown: the flight so far.
     """
 
     def __init__(
         self,
         route: Route,
-        camera: View,
+        camera: RenderCallback,
         matcher: Matcher,
         *,
         seed: int = 1,
@@ -231,60 +231,60 @@ class ClosedLoop:
         self._instruments = Instruments(options.sensors, sensors)
         self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
         keep_s = 1.0 + max(options.latency_s, options.sensors.gps.latency_s)
-        self._history = History(self._first_belief(start), options.sensors, keep_s)
+        self._history = History(self._initial_estimate(start), options.sensors, keep_s)
         self._navigator: Navigator | None = self._new_engine()
         self._clock_s, self._pace, self._plan = 0.0, 1.0, route.at(0.0)
         self._kicks = deque(route.kicks_s)
         self._picture: Image | None = None
-        self._on_its_way: deque[LoopAnswer] = deque()
+        self._pending: deque[LoopAnswer] = deque()
         self._receiver: deque[GpsSample] = deque()
         self._contradictions = 0  # in a row
         self._last_fix_s = -math.inf
         self._mode = Mode.FOLLOW
         self.flown = LoopResult([], [], [], self._history.now.position_m)
 
-    def _first_belief(self, rng: np.random.Generator) -> FilterState:
-        """At rest, with an error of each that the filter expects."""
-        sigma, wrong = self.options.start_sigma_m, rng.standard_normal(5)
+    def _initial_estimate(self, rng: np.random.Generator) -> FilterState:
+        """At rest, with errors drawn from the filter's own covariance."""
+        sigma, white = self.options.start_sigma_m, rng.standard_normal(5)
         heading = self._instruments.heading_deg(self._state)
-        attitude = Attitude(START_TILT_DEG * wrong[3], START_TILT_DEG * wrong[4], heading)
-        return begin(self._state.position_m + sigma * wrong[:3], sigma, attitude, self.options.sensors)
+        attitude = Attitude(START_TILT_DEG * white[3], START_TILT_DEG * white[4], heading)
+        return initial_state(self._state.position_m + sigma * white[:3], sigma, attitude, self.options.sensors)
 
     def _new_engine(self) -> Navigator:
-        """An engine that begins where the filter believes itself."""
-        belief = self._history.now
-        east, north = (float(v) for v in belief.position_m[:2])
-        return Navigator(self._map, Prior(east_m=east, north_m=north, sigma_m=belief.sigma_m))
+        """A navigator that starts from the filter's estimate."""
+        estimate = self._history.now
+        east, north = (float(v) for v in estimate.position_m[:2])
+        return Navigator(self._map, Prior(east_m=east, north_m=north, sigma_m=estimate.sigma_m))
 
     def fly(self, seconds: float | None = None) -> Iterator[Frame]:
-        """Fly; gives every frame as the engine is given it, once it has been answered."""
+        """Fly; yields every frame as the engine gets it, after its answer."""
         every = steps_between(self.options.frame_rate_hz)
         for k in range(1, round((self._route.duration_s if seconds is None else seconds) / STEP_S) + 1):
             self._step(k)
             if k % every == 0:
-                yield self._look()
+                yield self._process_frame()
             self._receive()
             self._choose_mode()
             over = self._mode is Mode.HANDED_OVER
             if over or k % round(0.1 / STEP_S) == 0:
-                self._note()
+                self._record()
             if over:
                 return
 
     def _step(self, k: int) -> None:
         """The ``k``-th step of :data:`engine.sim.quadrotor.STEP_S`."""
-        options, belief = self.options, self._history.now
+        options, estimate = self.options, self._history.now
         target = self._plan = self._target()
         while self._kicks and self._clock_s >= self._kicks[0]:
             self._kicks.popleft()
             self._state = shaken(self._state, options.airframe, self._shakes)
-        wanted = self._pilot.steer(target, belief.position_m, belief.velocity_mps)
+        wanted = self._pilot.steer(target, estimate.position_m, estimate.velocity_mps)
         self._state, felt = advance(self._state, wanted, target.heading_deg, options.airframe, self._air.next())
         self._history.advance(self._instruments.imu(felt))
         self._sense(k)
 
     def _target(self) -> Setpoint:
-        """The setpoint; while the vehicle holds, the route's clock runs out, and afterwards it runs again."""
+        """The setpoint; while the vehicle holds, the route's clock slows to a stop, and afterwards runs again."""
         faster = self.options.pace_change_per_s * (1.0 if self._mode is Mode.FOLLOW else -1.0)
         pace = min(max(self._pace + faster * STEP_S, 0.0), 1.0)
         change, self._pace = (pace - self._pace) / STEP_S, pace
@@ -292,7 +292,7 @@ class ClosedLoop:
         return self._route.at(self._clock_s, pace, change)
 
     def _sense(self, k: int) -> None:
-        """Barometer and compass, and the receiver where it is asked for."""
+        """Read barometer and compass, and the GPS receiver where it is used."""
         suite, instruments, state = self.options.sensors, self._instruments, self._state
         now_s = self._history.now.time_s
         if k % steps_between(suite.barometer.rate_hz) == 0:
@@ -304,15 +304,15 @@ class ClosedLoop:
         if self.options.gps and k % steps_between(suite.gps.rate_hz) == 0:
             self._receiver.append(instruments.gps(state))
 
-    def _look(self) -> Frame:
-        """A picture is taken and matched; the vehicle hears of it later."""
+    def _process_frame(self) -> Frame:
+        """Take a picture and match it; the answer arrives after the latency."""
         time_s, fault = self._state.time_s, self.fault
         if self._picture is None or not fault.acts("frozen", time_s):
             self._picture = self._camera(self._state)
         self._map.shift_m = fault.shift_m if fault.acts("shifted", time_s) else 0.0
         stamp_ns = START_NS + round(time_s * 1e9)
         frame = self._frame(self._picture, stamp_ns)
-        result: Fix | NoFix = NoFix(reason=Reason.FAILED, detail="the engine is dead", timestamp_ns=stamp_ns)
+        result: Fix | NoFix = NoFix(reason=Reason.FAILED, detail="the engine was killed", timestamp_ns=stamp_ns)
         if fault.acts("killed", time_s):
             self._navigator = None
         else:
@@ -323,48 +323,48 @@ class ClosedLoop:
         state = None if self._navigator is None else self._navigator.state
         answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.options.latency_s)
         self.flown.answers.append(answer)
-        self._on_its_way.append(answer)
+        self._pending.append(answer)
         return frame
 
     def _frame(self, picture: Image, stamp_ns: int) -> Frame:
-        """The picture with what the vehicle believes when it is taken."""
-        belief = self._history.now
-        roll, pitch, heading = attitude_from_rotation(belief.enu_from_body)
+        """The picture with the filter's estimate at its capture."""
+        estimate = self._history.now
+        roll, pitch, heading = attitude_from_rotation(estimate.enu_from_body)
         return Frame(
             picture,
             timestamp_ns=stamp_ns,
-            height_agl_m=max(float(belief.position_m[2]) - self._map.site.ground_m, 1.0),
+            height_agl_m=max(float(estimate.position_m[2]) - self._map.site.ground_m, 1.0),
             heading_deg=heading,
             roll_deg=roll,
             pitch_deg=pitch,
-            east_velocity_mps=float(belief.velocity_mps[0]),
-            north_velocity_mps=float(belief.velocity_mps[1]),
+            east_velocity_mps=float(estimate.velocity_mps[0]),
+            north_velocity_mps=float(estimate.velocity_mps[1]),
         )
 
     def _receive(self) -> None:
-        """What has arrived by now is taken in, at the moment that it is of."""
+        """Fuse what has arrived by now, each at its own time."""
         now_s, options = self._state.time_s, self.options
-        while self._on_its_way and self._on_its_way[0].arrives_s <= now_s + 0.5 * STEP_S:
-            answer = self._on_its_way.popleft()
+        while self._pending and self._pending[0].arrives_s <= now_s + 0.5 * STEP_S:
+            answer = self._pending.popleft()
             if isinstance(answer.result, Fix) and not options.gps:
-                self._judge(answer.result, answer)
+                self._gate(answer.result, answer)
         while self._receiver and self._receiver[0].time_s + options.sensors.gps.latency_s <= now_s + 0.5 * STEP_S:
             sample = self._receiver.popleft()
             self._history.fuse(partial(fuse_gps, sample=sample, suite=options.sensors), sample.time_s)
 
     def _choose_mode(self) -> None:
-        belief, options = self._history.now, self.options
-        sigma_m = belief.sigma_m
-        off_m = float(np.hypot(*(belief.position_m - self._plan.position_m)[:2]))
-        if self._contradictions >= options.distrust_after or sigma_m > options.give_up_sigma_m:
+        estimate, options = self._history.now, self.options
+        sigma_m = estimate.sigma_m
+        off_m = float(np.hypot(*(estimate.position_m - self._plan.position_m)[:2]))
+        if self._contradictions >= options.max_contradictions or sigma_m > options.give_up_sigma_m:
             self._mode = Mode.HANDED_OVER
         elif sigma_m > options.hold_sigma_m:
             self._mode = Mode.HOLD
         elif sigma_m < 0.5 * options.hold_sigma_m and off_m < options.resume_m:
             self._mode = Mode.FOLLOW
 
-    def _judge(self, fix: Fix, answer: LoopAnswer) -> None:
-        """A fix that agrees is taken in, any other is counted."""
+    def _gate(self, fix: Fix, answer: LoopAnswer) -> None:
+        """Fuse a fix that passes the chi-square gate, count any other."""
         captured_s = answer.truth.time_s
         self._last_fix_s = captured_s
         if fix_chi_square(self._history.at(captured_s), fix) > self.options.gate:
@@ -374,8 +374,8 @@ class ClosedLoop:
         self._history.fuse(partial(fuse_fix, fix=fix), captured_s)
         self.flown.used.append(answer.timestamp_ns)
 
-    def _note(self) -> None:
-        """One row of the record."""
+    def _record(self) -> None:
+        """Add a row to the record."""
         state, options = self._state, self.options
         healthy = state.time_s - self._last_fix_s - options.latency_s <= options.healthy_s
         row = LoopSample(state.time_s, state, self._history.now, self._plan.position_m, self._mode, healthy)

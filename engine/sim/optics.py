@@ -1,4 +1,4 @@
-"""What a camera makes of what it sees: exposure and noise, motion while the shutter is open, the lens.
+"""The camera's image formation: exposure and noise, motion while the shutter is open, the lens.
 
 Convention:
     The stamp of a picture is the middle of the exposure of its middle row. During the milliseconds of a picture
@@ -23,7 +23,7 @@ from engine.sim.render import World, render_frame
 from engine.values import Attitude
 
 GAIN_LIMITS = (0.25, 8.0)
-"""What automatic exposure can do."""
+"""Range of the gain of automatic exposure."""
 MAX_VIEW = 4.0
 """Sides of the pinhole picture that a lens is drawn from, as a multiple of the camera's."""
 
@@ -51,7 +51,15 @@ class Sensor:
     noise_sd: float
 
     def develop(self, seen: Image, rng: np.random.Generator) -> Image:
-        """The picture (H, W, 3) that this sensor takes of an ideal one."""
+        """The picture that this sensor takes of an ideal one.
+
+        Args:
+            seen: (H, W, 3) uint8 RGB.
+            rng: of noise and exposure.
+
+        Returns:
+            (H, W, 3) uint8 RGB.
+        """
         h, w = seen.shape[:2]
         y, x = np.ogrid[:h, :w]
         far = ((x - (w - 1) / 2) ** 2 + (y - (h - 1) / 2) ** 2) * (4.0 / (w**2 + h**2))
@@ -67,7 +75,7 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """What else happens in a camera; by default nothing does.
+    """Exposure time, shutter and gain of a camera; the defaults are an ideal one.
 
     Attributes:
         exposure_ms: how long every row gathers light; motion meanwhile blurs it. 0 freezes it.
@@ -75,7 +83,7 @@ class Optics:
             shutter.
         gain: multiplies light and noise alike.
         target_level: mean grey level that automatic exposure aims at, on top of the gain; None leaves it alone.
-        looks: poses that a motion blur is averaged from.
+        exposure_samples: number of poses that motion blur is averaged from.
 
     Raises:
         OptionError: a value is out of range.
@@ -85,13 +93,13 @@ class Optics:
     readout_ms: float = 0.0
     gain: float = 1.0
     target_level: float | None = None
-    looks: int = 5
+    exposure_samples: int = 5
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value, least = getattr(self, item.name), 0.0 if item.name.endswith("_ms") else 1e-3
-            if value is not None and not least <= value < math.inf:
-                raise OptionError(f"{item.name}: expected {least:g} or more, got {value}")
+            value, minimum = getattr(self, item.name), 0.0 if item.name.endswith("_ms") else 1e-3
+            if value is not None and not minimum <= value < math.inf:
+                raise OptionError(f"{item.name}: expected {minimum:g} or more, got {value}")
 
     @property
     def moves(self) -> bool:
@@ -124,34 +132,33 @@ def take_picture(
     optics: Optics | None = None,
     sway: ExposureMotion | None = None,
 ) -> Image:
-    """The picture (H, W, 3) RGB that a real camera delivers.
+    """The picture that a real camera delivers.
 
-    One sharp pinhole picture, wide enough, is drawn from the pose of the stamp; what each row saw at each moment
-    is looked up in it by way of the ground below. A roof of 20 m seen from 150 m is thereby misplaced by 13 % of
-    what the vehicle flies during the picture: centimetres.
+    What each row sees at each time is resampled from one sharp pinhole picture, by way of the ground plane, which
+    misplaces a roof of 20 m seen from 150 m by 13 % of what the vehicle flies meanwhile: centimetres.
 
     Args:
-        world: what is there.
+        world: what is seen.
         camera: intrinsics, lens and mount.
         grid_m: its (easting, northing) in the world's CRS at the stamp.
         up_m: above the world's height 0.
         attitude: of the body, about true north.
-        rng: of the sensor's noise and exposure.
+        rng: of noise and exposure.
         sensor: how light becomes grey levels.
-        optics: what else happens; None is nothing.
+        optics: exposure, shutter and gain; None is an ideal camera.
         sway: motion meanwhile; None is none.
 
+    Returns:
+        (H, W, 3) uint8 RGB.
+
     Raises:
-        OptionError: the camera looks above the horizon, is not above the highest roof, or its lens sees farther
-            to the side than a pinhole can show.
+        OptionError: the camera looks above the horizon, is too low, or its lens is too wide for a pinhole picture.
     """
-    optics, sway = optics or Optics(), sway or ExposureMotion()
+    optics, sway, view = optics or Optics(), sway or ExposureMotion(), (world, camera, grid_m, up_m, attitude)
     if camera.distorts or (optics.moves and sway != ExposureMotion()):
-        height_m = up_m - world.ground_at(grid_m)
-        looks = _looks(camera, attitude, height_m, optics, sway)
-        seen = _looked_up(world, camera, grid_m, up_m, attitude, looks)
+        seen = _resampled(*view, _row_rays(camera, attitude, up_m - world.ground_at(grid_m), optics, sway))
     else:
-        seen = render_frame(world, camera, grid_m, up_m, attitude)
+        seen = render_frame(*view)
     return _exposed(sensor, optics, seen).develop(seen, rng)
 
 
@@ -169,7 +176,14 @@ def _exposed(sensor: Sensor, optics: Optics, seen: Image) -> Sensor:
 
 @lru_cache(maxsize=4)
 def lens_rays(camera: Camera) -> Float32:
-    """Optical rays (H, W, 3) with z = 1 of all pixels, with the lens's distortion taken out."""
+    """Optical rays of all pixels, with the lens's distortion taken out.
+
+    Args:
+        camera: intrinsics and distortion.
+
+    Returns:
+        (H, W, 3) float32 x right, y down, z = 1.
+    """
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
     if camera.distortion_model in ("equidistant", "fisheye"):
@@ -180,10 +194,10 @@ def lens_rays(camera: Camera) -> Float32:
     return np.dstack([flat.reshape(camera.height_px, camera.width_px, 2), np.ones(x.shape)]).astype(np.float32)
 
 
-def _looks(
+def _row_rays(
     camera: Camera, attitude: Attitude, height_m: float, optics: Optics, sway: ExposureMotion
 ) -> list[Float32]:
-    """For each moment of the exposure the rays (H, W, 2), x / z and y / z, of the pose of the stamp.
+    """For each time of the exposure the rays (H, W, 2), x / z and y / z, in the pose of the stamp.
 
     A ray d of a camera displaced by s meets the ground where d - s d_z / h of the undisplaced one does.
     """
@@ -197,29 +211,29 @@ def _looks(
 
     rays, half_s = lens_rays(camera), 0.5e-3 * optics.readout_ms
     share = np.linspace(0.0, 1.0, camera.height_px)[:, None, None]
-    count = optics.looks if optics.exposure_ms > 0.0 and sway != ExposureMotion() else 1
-    moments_s = ((np.arange(count) + 0.5) / count - 0.5) * optics.exposure_ms * 1e-3
+    count = optics.exposure_samples if optics.exposure_ms > 0.0 and sway != ExposureMotion() else 1
+    times_s = ((np.arange(count) + 0.5) / count - 0.5) * optics.exposure_ms * 1e-3
     found = []
-    for moment_s in moments_s.tolist():
+    for time_s in times_s.tolist():
         # A readout lasts tens of milliseconds: between its first and its last row matrices change evenly.
-        first, last = (seen_after(moment_s + end_s) for end_s in (-half_s, half_s))
+        first, last = (seen_after(time_s + end_s) for end_s in (-half_s, half_s))
         rows = (first + share * (last - first)).astype(np.float32)
         seen = rays @ rows.transpose(0, 2, 1)
         found.append(seen[..., :2] / seen[..., 2:])
     return found
 
 
-def _looked_up(
+def _resampled(
     world: World,
     camera: Camera,
     grid_m: tuple[float, float],
     up_m: float,
     attitude: Attitude,
-    looks: list[Float32],
+    rays: list[Float32],
 ) -> Image:
-    """The mean of the looks into one sharp pinhole picture that holds them all."""
+    """The mean of the pictures along all rays, resampled from one sharp pinhole picture that holds them all."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    pixels = [look * np.array([fx, fy], np.float32) for look in looks]
+    pixels = [ray * np.array([fx, fy], np.float32) for ray in rays]
     low = np.floor(np.min([p.min(axis=(0, 1)) for p in pixels], axis=0)) - 2.0
     high = np.ceil(np.max([p.max(axis=(0, 1)) for p in pixels], axis=0)) + 2.0
     size = (high - low + 1.0).astype(int)

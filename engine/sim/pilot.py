@@ -1,4 +1,4 @@
-"""Who flies: a route with its times, and the cascade from position over velocity to acceleration along it."""
+"""The autopilot: a timed route, and the cascade from position over velocity to acceleration that follows it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from engine.errors import OptionError
 from engine.sim.quadrotor import STEP_S
-from engine.sim.vehicle import STEP_S as COURSE_STEP_S
-from engine.sim.vehicle import FlightStyle, course
+from engine.sim.vehicle import COURSE_STEP_S, FlightStyle, course
 from engine.values import check_positive
 
 Array = NDArray[np.float64]
@@ -19,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Setpoint:
-    """Where the vehicle should be at one moment: (3,) place, velocity and acceleration, and its heading."""
+    """Where the vehicle should be at one time: (3,) position, velocity and acceleration, and its heading."""
 
     position_m: Array
     velocity_mps: Array
@@ -29,14 +28,14 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class Route:
-    """A flight as it is planned, every :data:`engine.sim.vehicle.STEP_S` of its own clock.
+    """A flight as it is planned, every :data:`engine.sim.vehicle.COURSE_STEP_S` of its own clock.
 
     Attributes:
         position_m: (N, 3) east, north, up.
         velocity_mps: (N, 3).
         acceleration_mps2: (N, 3).
         heading_deg: (N,), unwrapped.
-        kicks_s: when speeding up, braking and stopping shake the vehicle.
+        kicks_s: times at which speeding up, braking and stopping shake the vehicle.
     """
 
     position_m: Array
@@ -47,11 +46,11 @@ class Route:
 
     @property
     def duration_s(self) -> float:
-        """From the first moment to the last."""
+        """From the first setpoint to the last."""
         return (len(self.heading_deg) - 1) * COURSE_STEP_S
 
     def at(self, clock_s: float, pace: float = 1.0, change_per_s: float = 0.0) -> Setpoint:
-        """The setpoint where the route's clock stands.
+        """The setpoint at a time of the route's clock.
 
         Args:
             clock_s: on the route's clock; before it and after it the vehicle hovers at the ends.
@@ -66,10 +65,17 @@ class Route:
 
 
 def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
-    """Legs between waypoints (N, 2) with a stop at each, as the built-in flight has them (its height is constant).
+    """Legs between waypoints with a stop at each, as in the built-in flight, at a constant height.
+
+    Args:
+        waypoints_m: (N, 2) east and north.
+        style: speed, acceleration, pauses and height.
+
+    Returns:
+        Route: from the first waypoint to the last.
 
     Raises:
-        OptionError: there are fewer than two waypoints, or two in a row are one place.
+        OptionError: there are fewer than two waypoints, or two in a row are less than 1 m apart.
     """
     style = style or FlightStyle()
     points = np.asarray(waypoints_m, float)
@@ -79,10 +85,10 @@ def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
         raise OptionError("waypoints_m: expected neighbours 1 m apart or more")
     push, nose, kicks = course(points, style)
     speed = np.cumsum(push, axis=0) * COURSE_STEP_S
-    place = points[0] + np.cumsum(speed, axis=0) * COURSE_STEP_S
+    position = points[0] + np.cumsum(speed, axis=0) * COURSE_STEP_S
     flat = np.zeros((len(push), 1))
     return Route(
-        np.hstack([place, flat + style.height_agl_m]),
+        np.hstack([position, flat + style.height_agl_m]),
         np.hstack([speed, flat]),
         np.hstack([push, flat]),
         nose,
@@ -91,11 +97,11 @@ def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
 
 
 def plan_rounds(half_m: tuple[float, float], seconds: float, style: FlightStyle | None = None) -> Route:
-    """As many rounds of a rectangle about the origin as take at least so long.
+    """As many rounds of a rectangle about the origin as take at least the given time.
 
     Args:
         half_m: half of its sides, to the east and to the north.
-        seconds: how long.
+        seconds: least duration.
         style: speed and height.
 
     Raises:
@@ -112,16 +118,16 @@ def plan_rounds(half_m: tuple[float, float], seconds: float, style: FlightStyle 
 
 @dataclass(frozen=True, kw_only=True)
 class Gains:
-    """Of the cascade; the defaults are those of PX4's multicopter position control (MPC_XY_P and its siblings).
+    """Gains of the cascade, by default those of PX4's multicopter position control (MPC_XY_P and its siblings).
 
     Attributes:
         position_per_s: velocity per error of the position, horizontally (MPC_XY_P).
         velocity_per_s: acceleration per error of the velocity (MPC_XY_VEL_P_ACC).
-        integral_per_s2: acceleration per second of that error, which learns the wind (MPC_XY_VEL_I_ACC).
+        integral_per_s2: acceleration per second of that error, which compensates the wind (MPC_XY_VEL_I_ACC).
         height_per_s: as ``position_per_s``, vertically (MPC_Z_P).
         climb_per_s: as ``velocity_per_s`` (MPC_Z_VEL_P_ACC).
         climb_integral_per_s2: as ``integral_per_s2`` (MPC_Z_VEL_I_ACC).
-        max_correction_mps: largest velocity that an error of the position asks for.
+        max_correction_mps: largest velocity commanded for an error of the position.
         max_acceleration_mps2: largest horizontal acceleration; gentler than MPC_ACC_HOR.
 
     Raises:
@@ -142,7 +148,7 @@ class Gains:
 
 
 class Pilot:
-    """Follows setpoints by what it believes of the vehicle's place and velocity; remembers the wind."""
+    """Follows setpoints by the estimated position and velocity; its integral compensates the wind."""
 
     def __init__(self, gains: Gains | None = None) -> None:
         self._gains = g = gains or Gains()
@@ -152,7 +158,16 @@ class Pilot:
         self._wind = np.zeros(3)
 
     def steer(self, target: Setpoint, position_m: Array, velocity_mps: Array) -> Array:
-        """The acceleration (3,) to ask for over the next :data:`engine.sim.quadrotor.STEP_S`."""
+        """The acceleration to command over the next :data:`engine.sim.quadrotor.STEP_S`.
+
+        Args:
+            target: setpoint.
+            position_m: (3,) estimated, east, north, up.
+            velocity_mps: (3,) estimated.
+
+        Returns:
+            (3,) m/s^2.
+        """
         limit = self._gains.max_correction_mps
         towards = np.clip(self._position * (target.position_m - position_m), -limit, limit)
         error = target.velocity_mps + towards - velocity_mps

@@ -1,4 +1,4 @@
-"""A quadrotor in wind: thrust along its body, attitude that swings into place, drag, and what an IMU in it feels.
+"""A quadrotor in wind: thrust along its body, a second-order attitude response, drag, and its ideal IMU.
 
 Convention:
     World axes are east-north-up, body axes forward-right-down; ``enu_from_body`` takes the second to the first.
@@ -25,12 +25,12 @@ Array = NDArray[np.float64]
 STEP_S = 0.01
 """Time step of dynamics, control and IMU."""
 GRAVITY = np.array([0.0, 0.0, -GRAVITY_MPS2])
-_PEAK_OF_SWING = 0.71  # first peak of the swing after a kick, as a share of kick / frequency, at damping 0.25
+_PEAK_OF_SWING = 0.71  # first peak after an impulse over impulse / frequency, at a damping of 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
 class Airframe:
-    """What flies: of the size of the 3DR Iris, whose mass Gazebo's model gives as 1.5 kg.
+    """The vehicle: of the size of the 3DR Iris, whose mass Gazebo's model gives as 1.5 kg.
 
     Attributes:
         mass_kg: of the vehicle with its battery.
@@ -40,11 +40,11 @@ class Airframe:
         swing_rps: natural frequency of roll and pitch under control, in radians per second.
         swing_damping: share of critical damping of the same; 0.25 rings for about half a second.
         yaw_rps: natural frequency of the heading, which is damped critically.
-        max_tilt_deg: beyond which the controller does not tilt.
-        shake_deg: largest swing that a start or a stop sets off.
+        max_tilt_deg: largest tilt that the controller commands.
+        shake_deg: largest swing that a start or a stop excites.
 
     Raises:
-        OptionError: a value is not above 0, or the thrust does not lift the mass.
+        OptionError: a value is not above 0, or the thrust is below the weight.
     """
 
     mass_kg: float = 1.5
@@ -73,12 +73,12 @@ class Wind:
     Attributes:
         mean_east_mps: the air's mean velocity to the east.
         mean_north_mps: the same to the north.
-        gust_sd_mps: of each horizontal component; the vertical one has half of it.
+        gust_sd_mps: standard deviation of each horizontal component; the vertical one has half of it.
         gust_time_s: how long a gust lasts: each component is a Gauss-Markov process, which has the spectrum of
             Dryden's longitudinal gusts (MIL-F-8785C).
 
     Raises:
-        OptionError: a value is not finite, or a gust lasts no time.
+        OptionError: a value is not finite, or ``gust_time_s`` is not above 0.
     """
 
     mean_east_mps: float = 2.5
@@ -93,7 +93,7 @@ class Wind:
 
 
 class WindField:
-    """The wind as it blows, step after step."""
+    """Wind with gusts, one velocity per :data:`STEP_S`."""
 
     def __init__(self, wind: Wind, rng: np.random.Generator) -> None:
         self._mean = np.array([wind.mean_east_mps, wind.mean_north_mps, 0.0])
@@ -103,7 +103,11 @@ class WindField:
         self._gust = self._sd * rng.standard_normal(3)
 
     def next(self) -> Array:
-        """Velocity (3,) of the air in the next step."""
+        """Velocity of the air in the next step.
+
+        Returns:
+            (3,) m/s to the east, north and up.
+        """
         kick = math.sqrt(1.0 - self._keep**2) * self._rng.standard_normal(3)
         self._gust = self._keep * self._gust + self._sd * kick
         return np.asarray(self._mean + self._gust)
@@ -111,12 +115,12 @@ class WindField:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The vehicle at one moment.
+    """The vehicle at one time.
 
     Attributes:
         time_s: since the start.
         position_m: (3,) east, north, up.
-        velocity_mps: (3,) the same.
+        velocity_mps: (3,) east, north, up.
         enu_from_body: (3, 3) attitude.
         rates_rps: (3,) turn rates about forward, right and down.
         thrust_mps2: thrust per mass.
@@ -144,22 +148,38 @@ class IdealImu:
 
 
 def hovering(position_m: Array, heading_deg: float) -> State:
-    """The vehicle at rest in still air."""
+    """The vehicle at rest in still air.
+
+    Args:
+        position_m: (3,) east, north, up.
+        heading_deg: clockwise from north.
+
+    Returns:
+        State: level, at time 0.
+    """
     attitude = enu_from_body(0.0, 0.0, heading_deg)
     return State(0.0, np.asarray(position_m, float), np.zeros(3), attitude, np.zeros(3), GRAVITY_MPS2)
 
 
 def aim(acceleration_mps2: Array, heading_deg: float, airframe: Airframe) -> tuple[Array, Array]:
-    """The attitude (3, 3) that gives an acceleration (3,) in still air, and the force per mass (3,) that it takes.
+    """The attitude that gives an acceleration in still air, and the force per mass that it takes.
 
-    A force that would tilt beyond ``max_tilt_deg`` keeps its vertical part and loses of its horizontal one; the
-    rotors push up, never down.
+    A force that would tilt beyond ``max_tilt_deg`` keeps its vertical component and gets a smaller horizontal one;
+    the rotors push up, never down.
+
+    Args:
+        acceleration_mps2: (3,) east, north, up.
+        heading_deg: clockwise from north.
+        airframe: its tilt limit.
+
+    Returns:
+        enu_from_body (3, 3), and the force per mass (3,) in m/s^2.
     """
     force = acceleration_mps2 - GRAVITY
     force[2] = max(force[2], 0.3 * GRAVITY_MPS2)
-    flat, most = math.hypot(force[0], force[1]), force[2] * math.tan(math.radians(airframe.max_tilt_deg))
-    if flat > most:
-        force[:2] *= most / flat
+    flat, max_flat = math.hypot(force[0], force[1]), force[2] * math.tan(math.radians(airframe.max_tilt_deg))
+    if flat > max_flat:
+        force[:2] *= max_flat / flat
     down = -force / np.linalg.norm(force)
     heading = math.radians(heading_deg)
     right = np.cross(down, (math.sin(heading), math.cos(heading), 0.0))
@@ -174,19 +194,19 @@ def advance(
 
     Args:
         state: at its beginning.
-        acceleration_mps2: (3,) that the controller asks for.
-        heading_deg: where it wants the nose.
-        airframe: what flies.
+        acceleration_mps2: (3,) that the controller commands.
+        heading_deg: that the controller commands.
+        airframe: of the vehicle.
         air_mps: (3,) velocity of the air.
 
     Returns:
         State: at its end.
-        IdealImu: what an IMU measured meanwhile.
+        IdealImu: what an IMU measured in between.
     """
     wanted, force = aim(acceleration_mps2, heading_deg, airframe)
     up = -state.enu_from_body[:, 2]
-    most = airframe.max_thrust_n / airframe.mass_kg
-    thrust = state.thrust_mps2 + (min(float(force @ up), most) - state.thrust_mps2) * (
+    max_thrust = airframe.max_thrust_n / airframe.mass_kg
+    thrust = state.thrust_mps2 + (min(float(force @ up), max_thrust) - state.thrust_mps2) * (
         1.0 - math.exp(-STEP_S / airframe.thrust_lag_s)
     )
     pushed = thrust * up - airframe.drag_per_s * (state.velocity_mps - air_mps)
@@ -203,25 +223,25 @@ def advance(
 
 
 def next_time_s(time_s: float) -> float:
-    """The time one step later; a multiple of the step, so that hours of them add up."""
+    """The time one step later, rounded to a multiple of the step, so that errors do not accumulate."""
     return (round(time_s / STEP_S) + 1) * STEP_S
 
 
 def _swing(state: State, wanted: Array, airframe: Airframe) -> Array:
-    """Angular acceleration (3,): attitude under control is a damped spring towards the wanted one."""
+    """Angular acceleration (3,): the controlled attitude is a damped oscillator about the commanded one."""
     error = rotation_vector(state.enu_from_body.T @ wanted)
-    error[2] = np.clip(error[2], -0.5, 0.5)  # the nose turns at its own pace
+    error[2] = np.clip(error[2], -0.5, 0.5)  # the yaw rate is limited
     spring = np.array([airframe.swing_rps, airframe.swing_rps, airframe.yaw_rps])
     damping = np.array([airframe.swing_damping, airframe.swing_damping, 1.0])
     return np.asarray(spring**2 * error - 2.0 * damping * spring * state.rates_rps)
 
 
 def shaken(state: State, airframe: Airframe, rng: np.random.Generator) -> State:
-    """The vehicle as a start or a stop shakes it: a swing in roll and pitch, most of it in pitch.
+    """The vehicle after the impulse of a start or a stop: a swing in roll and pitch, mostly in pitch.
 
     Its first peak is 0.6 to 1 of ``shake_deg``.
     """
     peak = math.radians(airframe.shake_deg) * rng.uniform(0.6, 1.0)
-    way = rng.uniform(-0.9, 0.9)
-    kick = peak * airframe.swing_rps / _PEAK_OF_SWING * np.array([math.sin(way), math.cos(way), 0.0])
+    direction = rng.uniform(-0.9, 0.9)
+    kick = peak * airframe.swing_rps / _PEAK_OF_SWING * np.array([math.sin(direction), math.cos(direction), 0.0])
     return replace(state, rates_rps=state.rates_rps + kick)

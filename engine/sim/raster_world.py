@@ -1,4 +1,4 @@
-"""A world from your own map: an orthophoto, with or without a surface model, that frames are drawn from."""
+"""A world from the user's map: an orthophoto, with or without a surface model, from which frames are drawn."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ import numpy as np
 
 from engine.errors import MapError
 from engine.maps.grids import Grid, warp_between
+from engine.maps.heights import read_surface
 from engine.maps.metric_copy import open_metric_copy
-from engine.maps.rasters import GrayReader, Source, map_errors, open_source, read_surface
+from engine.maps.rasters import GrayReader, Source, map_errors, open_source
 from engine.sim.canvas import ASPHALT, CANOPY, GRASS, ROOF
-from engine.sim.conditions import CONDITIONS, Condition, condition_by_name, dress
+from engine.sim.conditions import CONDITIONS, Condition, apply_season, condition_by_name
 from engine.sim.light import LIGHTS, Float32, Image, Light, illuminate
 from engine.sim.render import World
 from engine.sim.town import Town, generator
 from engine.values import Window
 
 LIMIT_PX = 100 * 2**20
-"""A world lies in memory, with some 20 bytes a pixel."""
+"""Largest world, since it is held in memory at about 20 bytes per pixel."""
 LIMIT_SIDE_PX = 32767
 """OpenCV's remap counts in 16 bits."""
 BARE_CELL_M, BARE_REACH_M = 2.0, 40.0
-"""Ground is what is left of a surface when everything narrower than 40 m is cut off."""
+"""Ground is the morphological opening of the surface by 40 m, on cells of 2 m."""
 GREEN = 12.0
-"""Grey levels that green must lead red and blue by, for a pixel to count as foliage."""
+"""Grey levels by which green exceeds red and blue where a pixel counts as foliage."""
 
 
 def world_from_map(
@@ -40,23 +41,22 @@ def world_from_map(
     crs: Any = None,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> Town:
-    """A world of the user's rasters, to be flown over as a built town is; its map are the rasters themselves.
+    """A world of the user's rasters, flown over as a built town is; its map is the rasters themselves.
 
-    Colours are those of the file where it holds three bands of bytes on a north-up metric grid, else grey. Walls,
-    which no orthophoto shows, have the darkened colour of what stands above them.
+    Colours are those of the file where it has three uint8 bands on a north-up metric grid, else grey. Walls, which
+    no orthophoto shows, have the darkened colour of the roof.
 
     Args:
         path: the orthophoto; for what may be opened see :meth:`engine.OrthoMap.open`.
         surface: heights in any grid and CRS; None is flat.
-        condition: light, season and air of the frames, on top of the light in the photograph, whose shadows stay;
-            None leaves the photograph as it is.
-        seed: of where snow lies and which branches are bare.
+        condition: of the frames, on top of the light in the photograph; None leaves the photograph as it is.
+        seed: of the snow's patches and the bare branches.
         bounds_deg: of a picture without georeference.
         crs: of a file that names none.
         cache_dir: where resampled maps are kept.
 
     Raises:
-        MapError: a file cannot be read, is too large for memory, or its grid has no EPSG code.
+        MapError: a file cannot be read, is too large, or its grid has no EPSG code.
         OptionError: there is no such condition.
     """
     day = None if condition is None else condition_by_name(condition)
@@ -93,17 +93,17 @@ def _photograph(source: Source, cache_dir: str | os.PathLike[str] | None) -> tup
 def _heights(
     surface: str | os.PathLike[str] | None, grid: Grid, gsd: float
 ) -> tuple[Float32, Float32 | None, float]:
-    """Surface and bare ground (H, W) above the lowest place, and its height; flat where there is no surface."""
+    """Surface and bare ground (H, W) above the lowest point, and its height; flat where there is no surface."""
     shape = (grid.height_px, grid.width_px)
     if surface is None:
         return np.zeros(shape, np.float32), None, 0.0
-    raw, lies = read_surface(open_source(surface, "surface"), grid)
+    raw, surface_grid = read_surface(open_source(surface, "surface"), grid)
     known = np.isfinite(raw)
     if not known.any():
         raise MapError(f"surface: expected known heights under the map, got none in {surface}")
     filled = np.where(known, raw, np.float32(np.percentile(raw[known], 20.0))).astype(np.float32)
     columns, rows = np.arange(shape[1], dtype=np.float64), np.arange(shape[0], dtype=np.float64)
-    at = warp_between(grid, lies).on_grid(columns, rows).astype(np.float32)
+    at = warp_between(grid, surface_grid).on_grid(columns, rows).astype(np.float32)
     heights: Any = cv2.remap(filled, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     lowest = float(heights.min())
     heights = np.asarray(heights - np.float32(lowest), dtype=np.float32)
@@ -111,7 +111,15 @@ def _heights(
 
 
 def bare_ground(height_m: Float32, gsd_m_per_px: float) -> Float32:
-    """The ground (H, W) under what stands on it: the surface with everything narrower than 40 m cut off."""
+    """The ground below roofs and crowns: the morphological opening of the surface by 40 m, smoothed.
+
+    Args:
+        height_m: (H, W) of the surface.
+        gsd_m_per_px: pixel in metres.
+
+    Returns:
+        (H, W) heights, nowhere above the surface.
+    """
     shape = height_m.shape
     cells = [max(1, round(n * gsd_m_per_px / BARE_CELL_M)) for n in shape]
     coarse = cv2.resize(height_m, cells[::-1], interpolation=cv2.INTER_AREA)
@@ -122,7 +130,7 @@ def bare_ground(height_m: Float32, gsd_m_per_px: float) -> Float32:
 
 
 def _materials(rgb: Image, above_m: Float32) -> Image:
-    """What pixels (H, W) may be made of, by their colour and their height above the ground."""
+    """Materials (H, W) guessed by colour and height above the ground."""
     red, green, blue = (rgb[..., k].astype(np.float32) for k in range(3))
     foliage = green - 0.5 * (red + blue) > GREEN
     material = np.full(above_m.shape, ASPHALT, np.uint8)
@@ -135,9 +143,9 @@ def _materials(rgb: Image, above_m: Float32) -> Image:
 def _on_another_day(
     rgb: Image, heights: Float32, ground: Float32 | None, day: Condition, gsd: float, seed: int
 ) -> tuple[Image, Float32]:
-    """The photograph's colours and heights in another season, and light that differs as the day's from noon's."""
+    """The photograph's colours and heights in another season, relit by the ratio of the day's light to noon's."""
     above = heights if ground is None else heights - ground
-    dressed, standing = dress(rgb, heights, _materials(rgb, above), ground, day, gsd, generator(seed, 0x77))
+    dressed, standing = apply_season(rgb, heights, _materials(rgb, above), ground, day, gsd, generator(seed, 0x77))
     noon = LIGHTS["noon"]
     level = [s * noon.towards_sun[2] + k for s, k in zip(noon.sun_rgb, noon.sky_rgb, strict=True)]
     light: Light = replace(

@@ -24,16 +24,16 @@ from engine.sim.light import Array, Float32, Image, Light
 from engine.values import Attitude
 
 LAYER_M = 1.0
-"""Height step of the search for the first surface that a ray meets; narrower things may be missed."""
+"""Height step of the search for the first surface that a ray meets; thinner structures may be missed."""
 SLOPE_VARIANCE, GLINT = 0.02, 0.9
-"""Variance of the slopes of ripples in a light breeze, and how bright the sun is where all facets mirror it."""
+"""Variance of the slopes of ripples in a light breeze, and the sun's brightness where all facets mirror it."""
 FLOOR_M = 3.0
 """Height of one storey: the pitch of the rows of windows."""
 
 
 @dataclass(frozen=True)
 class Atmosphere:
-    """Atmosphere that is looked through: a contrast fades by exp(-3.912 d / visibility) (Koschmieder).
+    """Air between camera and ground: a contrast fades by exp(-3.912 d / visibility) (Koschmieder).
 
     Attributes:
         visibility_m: distance at which 2 % of a contrast is left.
@@ -49,8 +49,8 @@ class Glint:
     """The sun on water: facets of ripples that mirror it to the lens (Cox and Munk's Gaussian slopes).
 
     Attributes:
-        light: whose sun it is.
-        water: (H, W) above 0 where there is water.
+        light: its sun is mirrored.
+        water: (H, W) uint8, above 0 where there is water.
     """
 
     light: Light
@@ -68,7 +68,7 @@ class World:
         pixel_to_crs: (2, 3) affine from pixels (x, y), centres at integers, to the projected CRS.
         crs_epsg: code of that CRS.
         ground_m: (H, W) of the bare ground where it is not flat at 0.
-        air: what is looked through; None is perfectly clear.
+        air: between camera and ground; None is perfectly clear.
         glint: the sun on water; None has none.
         gsd_m_per_px: a pixel in grid metres.
 
@@ -109,7 +109,7 @@ class World:
 
     @cached_property
     def _coarse_height(self) -> tuple[Image, float]:
-        """Heights in whole units of a byte, and that unit in metres: what the layer search reads."""
+        """Heights (H, W) quantised to bytes, rounded up, and the unit in metres; the layer search reads them."""
         unit = max(float(self.height_m.max()), 1e-3) / 254.0
         return np.ceil(self.height_m / np.float32(unit)).astype(np.uint8), unit
 
@@ -123,9 +123,16 @@ def transformer(crs_epsg: int) -> Any:
 
 
 def grid_from_enu(crs_epsg: int, grid_m: tuple[float, float]) -> Array:
-    """Jacobian (2, 2) at a grid position: grid metres per metre of true east and north.
+    """Jacobian at a grid position: grid metres per metre of true east and north.
 
-    Its rotation is the grid's convergence, its length the point scale, both as the projection has them.
+    Its rotation is the meridian convergence of the projection, its scale the point scale.
+
+    Args:
+        crs_epsg: code of the projected CRS.
+        grid_m: (easting, northing).
+
+    Returns:
+        (2, 2) d(easting, northing) / d(east, north).
     """
     to_grid = transformer(crs_epsg)
     lon, lat = to_grid.transform(*grid_m, direction="INVERSE")
@@ -206,7 +213,7 @@ def _nearest(raster: NDArray[Any], x: Float32, y: Float32) -> NDArray[Any]:
     return raster[rows, np.clip(np.rint(x).astype(np.int32), 0, raster.shape[1] - 1)]
 
 
-def _refine(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
+def _intersect(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
     """Height at which rays meet the surface, and whether they meet it from the side.
 
     Bisects between the layer inside and the free layer above it; a surface that rises above the free end is a
@@ -238,7 +245,7 @@ def _wall_colours(world: World, x: Float32, y: Float32, z_m: Float32) -> Image:
 
 
 def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tuple[Float32, Float32]) -> None:
-    """Let the sun flash on water, in place.
+    """Add the sun's glint on water, in place.
 
     Args:
         picture: (H, W, 3) to be changed.
@@ -262,7 +269,7 @@ def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tup
 
 
 def _seen_through(air: Atmosphere, picture: Image, slant_m: Float32) -> Image:
-    """The picture (H, W, 3) after its light has come a way (H, W) through air."""
+    """The picture (H, W, 3) through air along slant ranges (H, W)."""
     left = np.exp(np.float32(-3.912 / air.visibility_m) * slant_m)[..., None]
     mixed: Float32 = picture * left + np.array(air.rgb, np.float32) * (np.float32(1.0) - left)
     return mixed.astype(np.uint8)
@@ -271,7 +278,7 @@ def _seen_through(air: Atmosphere, picture: Image, slant_m: Float32) -> Image:
 def _after_light(
     world: World, picture: Image, at: tuple[Float32, Float32], per_metre: tuple[Float32, Float32], drop: Float32
 ) -> Image:
-    """What lies between the surface and the lens: mirrored sun on water, then air."""
+    """The picture with the glint of water, then the air between surface and lens."""
     if world.glint is None and world.air is None:
         return picture
     right, down = (pixels * np.float32(world.gsd_m_per_px) for pixels in per_metre)
@@ -300,15 +307,18 @@ def render_frame(
     *,
     supersample: int | None = None,
 ) -> Image:
-    """The picture (H, W, 3) RGB that a pinhole camera takes of a world, without the sensor's faults.
+    """The picture that a pinhole camera takes of a world, without noise and exposure.
 
     Args:
-        world: what is there; beyond its edge lies its outermost pixel on flat ground.
+        world: what is seen; beyond its edge its outermost pixels continue on flat ground.
         camera: intrinsics and mount, without distortion.
         grid_m: the camera's (easting, northing) in the world's CRS.
-        height_agl_m: above the world's height 0 (the flat ground), and above everything that stands there.
+        height_agl_m: above the world's height 0 (the flat ground), and above its highest surface.
         attitude: of the body, about true north.
-        supersample: rays per pixel and axis; None takes as many as the world's raster deserves (1 to 4).
+        supersample: rays per pixel and axis; None follows the world's resolution (1 to 4).
+
+    Returns:
+        (H, W, 3) uint8 RGB.
 
     Raises:
         OptionError: the camera distorts, looks above the horizon, or is not above the highest roof.
@@ -317,18 +327,22 @@ def render_frame(
     if supersample is None:
         supersample = int(np.clip(round(height_agl_m / camera.focal_px / world.gsd_m_per_px), 1, 4))
     rays = _Rays.cast(world, camera, grid_m, height_agl_m, attitude, supersample)
+    size = (camera.width_px, camera.height_px)
+    return np.asarray(cv2.resize(_trace(world, rays), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _trace(world: World, rays: _Rays) -> Image:
+    """Colours (H, W, 3) along all rays, supersampled."""
     found, heights = _first_layer(world, rays)
     per_metre = x, y = rays.per_metre()
-    # On flat ground a ray that met no layer ends at 0; on hills every ray looks for its own ground.
+    # On flat ground a ray that met no layer ends at 0; on hills every ray is intersected with its own ground.
     where = np.flatnonzero(found) if world.ground_m is None else np.arange(found.size)
     far_x, far_y = x.ravel()[where], y.ravel()[where]
-    z_m, wall = _refine(world, rays, far_x, far_y, heights[found.ravel()[where]], float(heights[1]))
-    drop = np.full(found.shape, height_agl_m, np.float32)
+    z_m, wall = _intersect(world, rays, far_x, far_y, heights[found.ravel()[where]], float(heights[1]))
+    drop = np.full(found.shape, rays.camera_m, np.float32)
     drop.reshape(-1)[where] -= z_m
     x, y = x * drop + np.float32(rays.nadir_px[0]), y * drop + np.float32(rays.nadir_px[1])
     picture: Any = cv2.remap(world.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     walls = where[wall]
     picture.reshape(-1, 3)[walls] = _wall_colours(world, x.ravel()[walls], y.ravel()[walls], z_m[wall])
-    picture = _after_light(world, picture, (x, y), per_metre, drop)
-    size = (camera.width_px, camera.height_px)
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return _after_light(world, picture, (x, y), per_metre, drop)

@@ -11,13 +11,27 @@ Array = NDArray[np.float64]
 
 
 def cross_matrix(v: Array) -> Array:
-    """(3, 3) that multiplies as the cross product with v does."""
+    """The matrix of the cross product, [v]x.
+
+    Args:
+        v: (3,).
+
+    Returns:
+        (3, 3) with ``cross_matrix(v) @ w == np.cross(v, w)``.
+    """
     x, y, z = v.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation(vector_rad: Array) -> Array:
-    """(3, 3) turn about a vector (3,) by its length in radians (Rodrigues)."""
+    """Rotation about a vector by its length (Rodrigues' formula).
+
+    Args:
+        vector_rad: (3,) axis times angle in radians.
+
+    Returns:
+        (3, 3) rotation matrix.
+    """
     x, y, z = vector_rad.tolist()
     angle2 = x * x + y * y + z * z
     angle = math.sqrt(angle2)
@@ -34,7 +48,14 @@ def rotation(vector_rad: Array) -> Array:
 
 
 def rotation_vector(matrix: Array) -> Array:
-    """(3,) whose :func:`rotation` this is, for turns of less than half a circle."""
+    """Axis times angle of a rotation, the inverse of :func:`rotation`.
+
+    Args:
+        matrix: (3, 3) rotation by less than half a turn.
+
+    Returns:
+        (3,) in radians.
+    """
     twice_sine = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
     sine = 0.5 * float(np.linalg.norm(twice_sine))
     angle = math.atan2(sine, 0.5 * (float(np.trace(matrix)) - 1.0))

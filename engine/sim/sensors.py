@@ -18,19 +18,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Imu:
-    """Accelerometer and gyroscope: white noise, and a bias that wanders (Gauss-Markov).
+    """Accelerometer and gyroscope: white noise, and a bias (Gauss-Markov).
 
     The defaults are the ADIS16448's as RotorS and PX4's Gazebo have it (Furrer et al., 2016); the biases at the
     start are what levelling and a gyroscope's calibration on the ground leave.
 
     Attributes:
         accel_noise: white noise of the specific force, in m/s^2 per root Hz.
-        accel_walk: what drives its bias, in m/s^3 per root Hz.
-        accel_time_s: how long that bias stays correlated.
+        accel_walk: driving noise of its bias, in m/s^3 per root Hz.
+        accel_time_s: correlation time of that bias.
         accel_start_mps2: standard deviation of the bias at the start.
         gyro_noise: white noise of the turn rates, in rad/s per root Hz.
-        gyro_walk: what drives their bias, in rad/s^2 per root Hz.
-        gyro_time_s: how long that bias stays correlated.
+        gyro_walk: driving noise of their bias, in rad/s^2 per root Hz.
+        gyro_time_s: correlation time of that bias.
         gyro_start_rps: standard deviation of the bias at the start.
 
     Raises:
@@ -55,9 +55,9 @@ class Compass:
     """Heading by the magnetic field, after declination: the HMC5883L's data sheet gives 1 to 2 degrees.
 
     Attributes:
-        rate_hz: how often.
+        rate_hz: samples per second.
         noise_deg: white noise.
-        bias_deg: standard deviation of the constant error that iron and calibration leave.
+        bias_deg: standard deviation of the constant error left by iron and calibration.
 
     Raises:
         OptionError: a value is not above 0.
@@ -76,10 +76,10 @@ class Barometer:
     """Height by air pressure: noise of a MS5611 (0.1 m at its finest) in the rotors' wash, and a slow drift.
 
     Attributes:
-        rate_hz: how often.
+        rate_hz: samples per second.
         noise_m: white noise.
         drift_m: standard deviation of the drift (Gauss-Markov), which is 0 at the start.
-        drift_time_s: how long it stays correlated.
+        drift_time_s: its correlation time.
 
     Raises:
         OptionError: a value is not above 0.
@@ -99,11 +99,11 @@ class Gps:
     """A receiver of the class of u-blox's M8 (data sheet: 2.5 m horizontally, half of the time; 0.05 m/s).
 
     Attributes:
-        rate_hz: how often.
+        rate_hz: samples per second.
         noise_m: white noise of east and of north.
         height_noise_m: of the height.
         velocity_noise_mps: of each component of the velocity.
-        latency_s: from the moment that a position is of to its arrival.
+        latency_s: from the time of a position to its arrival.
 
     Raises:
         OptionError: a value is not above 0.
@@ -125,7 +125,7 @@ def _check_rate(sensor: Compass | Barometer | Gps) -> None:
 
 
 def steps_between(rate_hz: float) -> int:
-    """How many steps of the simulation lie between two samples.
+    """How many steps of the simulation there are per sample.
 
     Raises:
         OptionError: the rate is above that of the steps.
@@ -137,7 +137,7 @@ def steps_between(rate_hz: float) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSuite:
-    """What the vehicle carries."""
+    """The sensors on board."""
 
     imu: Imu = field(default_factory=Imu)
     compass: Compass = field(default_factory=Compass)
@@ -147,7 +147,7 @@ class SensorSuite:
 
 @dataclass(frozen=True, slots=True)
 class GpsSample:
-    """(3,) east, north, up and (3,) velocity, of the moment ``time_s``."""
+    """(3,) position and (3,) velocity, east, north and up, at ``time_s``."""
 
     time_s: float
     position_m: Array
@@ -155,13 +155,13 @@ class GpsSample:
 
 
 class Instruments:
-    """The sensors of one flight, with errors of their own; each draws from a stream of its own.
+    """The sensors of one flight with their errors, each drawn from a random stream of its own.
 
     Attributes:
-        accel_bias_mps2: (3,) as it stands.
-        gyro_bias_rps: (3,) as it stands.
+        accel_bias_mps2: (3,) current bias.
+        gyro_bias_rps: (3,) current bias.
         compass_bias_deg: constant.
-        baro_drift_m: as it stands.
+        baro_drift_m: current drift.
     """
 
     def __init__(self, suite: SensorSuite, rng: np.random.Generator) -> None:
@@ -173,27 +173,27 @@ class Instruments:
         self.baro_drift_m = 0.0
 
     def imu(self, felt: IdealImu) -> IdealImu:
-        """One step's specific force and turn rates as they are measured; the biases walk on."""
+        """One step's specific force and turn rates as measured; advances the biases."""
         imu, rng = self.suite.imu, self._imu
         white = rng.standard_normal(12)
-        per_step, walked = 1.0 / math.sqrt(STEP_S), math.sqrt(STEP_S)
+        per_step, drive = 1.0 / math.sqrt(STEP_S), math.sqrt(STEP_S)
         force = felt.force_mps2 + self.accel_bias_mps2 + imu.accel_noise * per_step * white[:3]
         rates = felt.rates_rps + self.gyro_bias_rps + imu.gyro_noise * per_step * white[3:6]
         self.accel_bias_mps2 = (
-            math.exp(-STEP_S / imu.accel_time_s) * self.accel_bias_mps2 + imu.accel_walk * walked * white[6:9]
+            math.exp(-STEP_S / imu.accel_time_s) * self.accel_bias_mps2 + imu.accel_walk * drive * white[6:9]
         )
         self.gyro_bias_rps = (
-            math.exp(-STEP_S / imu.gyro_time_s) * self.gyro_bias_rps + imu.gyro_walk * walked * white[9:]
+            math.exp(-STEP_S / imu.gyro_time_s) * self.gyro_bias_rps + imu.gyro_walk * drive * white[9:]
         )
         return IdealImu(force, rates)
 
     def heading_deg(self, state: State) -> float:
-        """The compass, in [0, 360)."""
+        """Heading by the compass in degrees, in [0, 360)."""
         error = self.compass_bias_deg + self.suite.compass.noise_deg * float(self._compass.standard_normal())
         return wrap_heading_deg(state.attitude.heading_deg + error)
 
     def height_m(self, state: State) -> float:
-        """The barometer, above the ground on which it was set to 0; its drift goes on by one sample."""
+        """Height by the barometer, above the ground on which it was set to 0; advances its drift."""
         baro = self.suite.barometer
         white, walk = self._baro.standard_normal(2).tolist()
         measured = float(state.position_m[2]) + self.baro_drift_m + baro.noise_m * white
@@ -202,8 +202,8 @@ class Instruments:
         return float(measured)
 
     def gps(self, state: State) -> GpsSample:
-        """The receiver; what it says arrives ``latency_s`` later."""
+        """Position and velocity by the receiver; they arrive ``latency_s`` later."""
         gps, white = self.suite.gps, self._gps.standard_normal(6)
-        spread = np.array([gps.noise_m, gps.noise_m, gps.height_noise_m])
-        position, velocity = state.position_m + spread * white[:3], state.velocity_mps
+        sigmas_m = np.array([gps.noise_m, gps.noise_m, gps.height_noise_m])
+        position, velocity = state.position_m + sigmas_m * white[:3], state.velocity_mps
         return GpsSample(state.time_s, position, velocity + gps.velocity_noise_mps * white[3:])

@@ -1,6 +1,6 @@
-"""The lie of the land: smooth hills under a town, roofs and ponds that stay level on them, and a river.
+"""Terrain: smooth hills under a town, roofs and ponds that stay level on them, and a river.
 
-Heights are metres above a datum of the world, the lowest ground; nothing lies below 0.
+Heights are metres above the lowest ground; none is below 0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,17 @@ BANK_M = 130.0
 
 
 def hills(shape: tuple[int, int], gsd_m_per_px: float, relief_m: float, rng: np.random.Generator) -> Float32:
-    """Ground (H, W) between 0 and ``relief_m``, smooth enough for streets."""
+    """Smooth hills.
+
+    Args:
+        shape: (H, W) in pixels.
+        gsd_m_per_px: pixel in metres.
+        relief_m: from the lowest ground to the highest.
+        rng: of the hills.
+
+    Returns:
+        (H, W) heights in metres between 0 and ``relief_m``.
+    """
     cells = [max(4, math.ceil(n * gsd_m_per_px / HILL_M) + 2) for n in shape]
     coarse = cv2.resize(rng.standard_normal(cells, np.float32), None, fx=16, fy=16, interpolation=cv2.INTER_CUBIC)
     ground = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), 6.0), shape[::-1], interpolation=cv2.INTER_CUBIC)
@@ -28,11 +38,18 @@ def hills(shape: tuple[int, int], gsd_m_per_px: float, relief_m: float, rng: np.
     return np.asarray((ground - low) * np.float32(relief_m / (high - low)), dtype=np.float32)
 
 
-def lay_on(canvas: Canvas, ground_m: Float32, river: Image | None) -> Float32:
-    """Raise everything on a canvas by the ground below it; the ground (H, W) as it then is comes back.
+def raise_by_ground(canvas: Canvas, ground_m: Float32, river: Image | None) -> Float32:
+    """Raise everything on a canvas by the ground below it, in place.
 
-    A river's bed and banks are at 0. Every house stands on the mean of the ground below it, and every pond lies
-    level.
+    A river's bed and banks are at 0. Every house stands on the mean of the ground below it, and ponds are level.
+
+    Args:
+        canvas: its heights are raised.
+        ground_m: (H, W) of the hills.
+        river: (H, W) uint8, above 0 in its water; None where there is none.
+
+    Returns:
+        (H, W) float32 heights of the ground, levelled under houses and ponds.
     """
     if river is not None:
         away: Array = cv2.distanceTransform(255 - river, cv2.DIST_L2, 3) * canvas.gsd
@@ -50,7 +67,15 @@ def lay_on(canvas: Canvas, ground_m: Float32, river: Image | None) -> Float32:
 
 
 def draw_river(canvas: Canvas, rng: np.random.Generator) -> Image:
-    """Draw a river across the town with a path on each bank; (H, W) is 255 in its water."""
+    """Draw a river across the town with a path on each bank.
+
+    Args:
+        canvas: is drawn on.
+        rng: of its course and width.
+
+    Returns:
+        (H, W) uint8, 255 in its water.
+    """
     along = np.linspace(-canvas.reach_m, canvas.reach_m, 160)
     width = rng.uniform(22.0, 30.0)
     swing = rng.uniform(26.0, 44.0) * np.sin(along / rng.uniform(70.0, 110.0) + rng.uniform(0, 6))

@@ -1,4 +1,4 @@
-"""A town that does not exist: streets, houses, parks and fields from one seed, with its map and surface model.
+"""A fictional town: streets, houses, parks and fields from one seed, with its map and surface model.
 
 Convention:
     Town coordinates (u, v) are those of :mod:`engine.sim.canvas`. Everything is drawn twice as fine as the map.
@@ -18,28 +18,28 @@ from engine.errors import OptionError
 from engine.orthomap import OrthoMap
 from engine.sim.blocks import fill_blocks
 from engine.sim.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
-from engine.sim.conditions import CONDITIONS, Condition, condition_by_name, dress
-from engine.sim.light import Array, Float32, Image, Light, illuminate, light_by_name
+from engine.sim.conditions import CONDITIONS, Condition, apply_season, condition_by_name
+from engine.sim.light import Array, Float32, Image, Light, illuminate
 from engine.sim.optics import Sensor
 from engine.sim.render import Glint, World, transformer
-from engine.sim.terrain import draw_river, hills, lay_on
+from engine.sim.terrain import draw_river, hills, raise_by_ground
 
 CRS_EPSG = 32633
 """UTM zone 33 north; the town lies 1.45 degrees east of its central meridian: convergence +1.08 degrees."""
 CENTRE_LAT_DEG, CENTRE_LON_DEG = 48.25, 16.45
 EXACT = 1e-3
-"""Metres and degrees by which a simulated map says that it is off: none, but a sigma is above 0."""
+"""Georeferencing accuracy in metres and slope accuracy in degrees of a simulated map: exact, but above 0."""
 GROUND_AMSL_M = 155.0
 """Height of the flat or lowest ground above mean sea level."""
 MARGIN_M = 40.0
-"""How far the drawn world reaches beyond the map, so that a tilted camera still sees a town."""
+"""How far the drawn world extends beyond the map, so that a tilted camera still sees a town."""
 MAP_SENSOR = Sensor(
     gamma=0.92, balance_rgb=(0.97, 0.94, 0.88), haze=8.0, vignette=0.0, exposure_sd=0.0, blur_px=0.55, noise_sd=2.2
 )
-"""The camera of the map's survey: warmer and softer than the drone's."""
+"""The camera of the map's survey: a warmer white balance and less contrast than the drone's."""
 LAMP_M = 6.0
 """Height of street lamps: what is higher is not lit by them."""
-RELIEF_MAX_M = 80.0
+MAX_RELIEF_M = 80.0
 _EARTH: Colour = (146, 126, 98)
 _CARS: tuple[Colour, ...] = (
     (236, 236, 236), (40, 42, 46), (150, 154, 158), (132, 44, 44), (58, 72, 104), (206, 206, 200), (90, 92, 96),
@@ -71,7 +71,7 @@ class Town:
     datum_amsl_m: float = GROUND_AMSL_M
 
     def site(self) -> OrthoMap:
-        """The town's map as the engine has it; it lies exactly, and says so."""
+        """The town's map as the engine takes it, with exact georeferencing and slope accuracy."""
         gray = np.asarray(cv2.cvtColor(self.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
         return OrthoMap.from_arrays(
             gray,
@@ -118,7 +118,7 @@ def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array
 
 
 def _stations(line: Array, pitch_m: float) -> list[tuple[float, float, float]]:
-    """Places (u, v) and directions in radians every ``pitch_m`` along a line."""
+    """Positions (u, v) and directions in radians every ``pitch_m`` along a line."""
     run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     at = np.arange(pitch_m / 2, run[-1], pitch_m)
     u, v = (np.interp(at, run, line[:, k]) for k in (0, 1))
@@ -195,7 +195,7 @@ def _check_size(width_px: int, height_px: int, gsd: float) -> None:
 
 
 def _lamp_light(canvas: Canvas, roads: list[tuple[Array, float]]) -> Float32:
-    """Light (H, W) of street lamps in [0, 1], one every 27 m on alternating sides, on what is lower than they."""
+    """Light (H, W) of lamps in [0, 1], one every 27 m on alternating sides, on what is lower than a lamp."""
     pools = np.zeros(canvas.shape, np.float32)
     for line, width in roads:
         for k, (u, v, angle) in enumerate(_stations(line, 27.0)):
@@ -229,7 +229,7 @@ class _Drawn:
 
 
 def _without(day: _Day, gone: NDArray[np.bool_], ground_m: Float32 | None, rng: np.random.Generator) -> _Day:
-    """The day with bare earth where (H, W) something is not there."""
+    """The day with bare earth where (H, W) something is gone."""
     rgb, height, material = day.rgb.copy(), day.height_m.copy(), day.material.copy()
     count = int(gone.sum())
     rgb[gone] = np.clip(np.array(_EARTH) * (1.0 + 0.07 * rng.standard_normal((count, 1))), 0, 255)
@@ -239,7 +239,7 @@ def _without(day: _Day, gone: NDArray[np.bool_], ground_m: Float32 | None, rng: 
 
 
 def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
-    """The town with a share of its houses put up, and as many pulled down, between the map and the flight."""
+    """The town with a share of its houses built or demolished, half each, between the map and the flight."""
     roofs = (drawn.canvas.material == ROOF).astype(np.uint8)
     count, labels = cv2.connectedComponents(roofs, connectivity=4)
     fate = rng.random(count)
@@ -266,7 +266,7 @@ def _draw(
     canvas.texture()
     then, today = _park_cars(canvas, roads)
     lamps = _lamp_light(canvas, roads) * (canvas.height < LAMP_M)
-    ground = lay_on(canvas, hills(size, gsd, relief_m, hill_rng), river) if relief_m else None
+    ground = raise_by_ground(canvas, hills(size, gsd, relief_m, hill_rng), river) if relief_m else None
     height, material = canvas.height, canvas.material
     return _Drawn(canvas, _Day(then, height, material), _Day(today, height, material), ground, lamps)
 
@@ -274,7 +274,7 @@ def _draw(
 def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generator) -> tuple[Image, Float32]:
     """Colours and heights of a town on a day."""
     gsd = drawn.canvas.gsd
-    dressed, height = dress(day.rgb, day.height_m, day.material, drawn.ground_m, condition, gsd, rng)
+    dressed, height = apply_season(day.rgb, day.height_m, day.material, drawn.ground_m, condition, gsd, rng)
     lamps = drawn.lamps * np.float32(condition.lamps) if condition.lamps else None
     return illuminate(dressed, height, gsd, condition.light, shade=condition.shade, lamps=lamps), height
 
@@ -298,8 +298,7 @@ def build_town(
     width_px: int = 900,
     height_px: int = 1000,
     gsd_m_per_px: float = 0.53,
-    light: str = "noon",
-    condition: str | Condition | None = None,
+    condition: str | Condition = "noon",
     map_condition: str | Condition = "noon",
     relief_m: float = 0.0,
     river: bool = False,
@@ -312,39 +311,45 @@ def build_town(
         width_px: columns of the map.
         height_px: rows of the map.
         gsd_m_per_px: a map pixel in metres on the grid.
-        light: a name of :data:`LIGHTS`, for the frames; the map's is noon.
-        condition: a name of :data:`engine.sim.CONDITIONS` or one of your own, for the frames; it takes the place
-            of the light.
-        map_condition: the day on which the map was taken; another one than the frames' even if it is the same.
+        condition: day of the frames: a name of :data:`engine.sim.CONDITIONS`, or one of your own.
+        map_condition: day of the map, an independent photograph even where it is the same condition.
         relief_m: height of the hills under the town, from the lowest ground to the highest; 0 is flat.
         river: whether one crosses the town.
-        changed: share of the houses that were put up or pulled down between the map and the flight.
+        changed: share of the houses, 0 to 1, that were built or demolished between the map and the flight.
 
     Raises:
         OptionError: an argument is out of range.
     """
     _check_size(width_px, height_px, gsd_m_per_px)
-    if not 0.0 <= relief_m <= RELIEF_MAX_M:
-        raise OptionError(f"relief_m: expected 0 to {RELIEF_MAX_M:g}, got {relief_m}")
+    if not 0.0 <= relief_m <= MAX_RELIEF_M:
+        raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {relief_m}")
     if not 0.0 <= changed <= 1.0:
         raise OptionError(f"changed: expected 0 to 1, got {changed}")
-    light_by_name(light)
-    today, surveyed = (
-        condition_by_name(light if condition is None else condition),
-        condition_by_name(map_condition),
-    )
-    fine = max(1, round(gsd_m_per_px / 0.265))
-    margin = math.ceil(MARGIN_M / gsd_m_per_px)
-    size = ((height_px + 2 * margin) * fine, (width_px + 2 * margin) * fine)
+    days = condition_by_name(condition), condition_by_name(map_condition)
+    return _built(seed, (width_px, height_px), gsd_m_per_px, days, (relief_m, river, changed))
+
+
+def _built(
+    seed: int,
+    map_px: tuple[int, int],
+    gsd: float,
+    days: tuple[Condition, Condition],
+    site: tuple[float, bool, float],
+) -> Town:
+    """The town of checked arguments: days of the frames and the map; relief, river and changed share."""
+    (width, height), (today, surveyed), (relief_m, river, changed) = map_px, days, site
+    fine = max(1, round(gsd / 0.265))
+    margin = math.ceil(MARGIN_M / gsd)
+    size = ((height + 2 * margin) * fine, (width + 2 * margin) * fine)
     rng, water_rng = generator(seed, 0x70), generator(seed, 0x71) if river else None
-    drawn = _draw(rng, size, gsd_m_per_px / fine, today.light, relief_m, water_rng, generator(seed, 0x72))
+    drawn = _draw(rng, size, gsd / fine, today.light, relief_m, water_rng, generator(seed, 0x72))
     if changed:
         drawn = _rebuilt(drawn, changed, generator(seed, 0x75))
     inner = (slice(margin * fine, -margin * fine),) * 2
     then, heights = _lit(drawn, drawn.then, surveyed, generator(seed, 0x73))
     ortho, surface = MAP_SENSOR.develop(_shrink(then[inner], fine), rng), _shrink(heights[inner], fine)
-    to_crs = _georeference(width_px, height_px, gsd_m_per_px)
+    to_crs = _georeference(width, height, gsd)
     first = -margin - 0.5 + 0.5 / fine
     fine_to_crs = np.column_stack([to_crs[:, :2] / fine, to_crs @ (first, first, 1.0)])
     world = _world(drawn, today, fine_to_crs, generator(seed, 0x74))
-    return Town(ortho, surface, to_crs, CRS_EPSG, gsd_m_per_px, world, today)
+    return Town(ortho, surface, to_crs, CRS_EPSG, gsd, world, today)

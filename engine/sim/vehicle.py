@@ -1,4 +1,4 @@
-"""How the drone flies and what its sensors say: a path of straight legs with stops, and noisy telemetry.
+"""How the drone flies and what its sensors report: a path of straight legs with stops, and noisy telemetry.
 
 Convention:
     Positions are local east-north-up metres about the map's centre, up above the flat ground. The body is
@@ -19,8 +19,10 @@ from engine.errors import OptionError
 Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.80665
-STEP_S = 0.01
-"""Time step of the flight's integration."""
+COURSE_STEP_S = 0.01
+"""Time step by which a flight along waypoints is integrated."""
+START_NS = 1_000_000_000
+"""Timestamp at which simulated flights begin."""
 
 
 def _check_positive(owner: object, *, zero: bool = False) -> None:
@@ -68,9 +70,9 @@ class FlightStyle:
         cruise_mps: speed in the middle of a leg; with the defaults legs are flown at 6.6 m/s on average.
         acceleration_mps2: on a leg; its tilt is atan(a / g).
         ramp_s: time in which the acceleration builds up and fades, which limits the jerk.
-        pause_s: hover at each waypoint, in which the nose turns.
-        peak_tilt_deg: largest tilt of the flight, reached where vibration adds to acceleration.
-        height_sd_m: slow wander about the set height.
+        pause_s: hover at each waypoint, in which the vehicle yaws.
+        peak_tilt_deg: largest tilt of the flight, where vibration adds to acceleration.
+        height_sd_m: slow variation about the set height.
 
     Raises:
         OptionError: a value is not positive, or acceleration alone tilts beyond the peak.
@@ -105,27 +107,43 @@ class Motion:
     heading_deg: Array
 
     def at(self, time_s: Array) -> Motion:
-        """The motion at other times; positions between the integration's steps are interpolated."""
+        """The motion at other times, interpolated linearly between the steps of the integration.
+
+        Args:
+            time_s: (M,) seconds since take-off.
+
+        Returns:
+            The motion at these M times; headings in [0, 360) degrees.
+        """
 
         def pick(values: Array) -> Array:
             return np.asarray(np.interp(time_s, self.time_s, values))
 
-        place, speed = (
+        position_m, velocity_mps = (
             np.column_stack([pick(v[:, k]) for k in range(3)]) for v in (self.position_m, self.velocity_mps)
         )
         heading = np.degrees(pick(np.unwrap(np.radians(self.heading_deg)))) % 360.0
-        return Motion(np.asarray(time_s), place, speed, pick(self.roll_deg), pick(self.pitch_deg), heading)
+        roll, pitch = pick(self.roll_deg), pick(self.pitch_deg)
+        return Motion(np.asarray(time_s), position_m, velocity_mps, roll, pitch, heading)
 
 
 def leg_accelerations(length_m: float, style: FlightStyle) -> Array:
-    """Accelerations (N,) along a leg from stop to stop, every :data:`STEP_S`: up, cruise, down."""
+    """Acceleration along a leg from stop to stop: speed up, cruise, slow down.
+
+    Args:
+        length_m: of the leg, above 0.
+        style: cruise speed, acceleration and ramp.
+
+    Returns:
+        (N,) m/s^2 along the leg, every :data:`COURSE_STEP_S`.
+    """
     # Speeding up to v takes v / a + ramp at a mean speed of v / 2, and slowing down mirrors it; short legs
     # have no cruise, and their top speed solves v (v / a + ramp) = length.
     a, ramp = style.acceleration_mps2, style.ramp_s
     top = min(style.cruise_mps, 0.5 * a * (math.sqrt(ramp**2 + 4.0 * length_m / a) - ramp))
     change = top / a + ramp
     total = change + length_m / top
-    time = np.arange(0.0, total, STEP_S)
+    time = np.arange(0.0, total, COURSE_STEP_S)
 
     def pulse(since: Array) -> Array:
         return np.clip(np.minimum(since, change - since) / ramp, 0.0, 1.0)
@@ -134,7 +152,17 @@ def leg_accelerations(length_m: float, style: FlightStyle) -> Array:
 
 
 def smooth_noise(rng: np.random.Generator, count: int, step_s: float, time_s: float) -> Array:
-    """A Gauss-Markov process (N,) of unit variance with the given correlation time."""
+    """A first-order Gauss-Markov process of unit variance.
+
+    Args:
+        rng: of the process.
+        count: number of samples N.
+        step_s: time between two of them.
+        time_s: correlation time; 0 is white noise.
+
+    Returns:
+        (N,) samples.
+    """
     keep = math.exp(-step_s / time_s) if time_s > 0 else 0.0
     value, values = float(rng.standard_normal()), np.empty(count)
     for k, kick in enumerate(rng.standard_normal(count) * math.sqrt(1.0 - keep**2)):
@@ -144,7 +172,7 @@ def smooth_noise(rng: np.random.Generator, count: int, step_s: float, time_s: fl
 
 
 def _wander(rng: np.random.Generator, time_s: Array, period_s: float) -> Array:
-    """A smooth curve of about unit variance that turns every ``period_s``."""
+    """A smooth curve (N,) of about unit variance with a knot every ``period_s``."""
     knots = np.arange(-period_s, time_s[-1] + 2 * period_s, period_s)
     values = rng.standard_normal(knots.size) * 1.25
     at = (time_s - knots[0]) / period_s
@@ -175,13 +203,17 @@ def _scaled_to_peak(steady_deg: Array, swing: Array, peak_deg: float) -> Array:
 
 
 def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[float]]:
-    """Legs from stop to stop through waypoints (N, 2), every :data:`STEP_S`.
+    """Legs from stop to stop through waypoints, every :data:`COURSE_STEP_S`.
+
+    Args:
+        waypoints_m: (M, 2) east and north, neighbours apart.
+        style: speed, acceleration and pauses.
 
     Returns:
-        Acceleration (N, 2) in east and north, nose direction (N,) unwrapped in degrees, and the times at which
-        speeding up, braking and stopping shake the vehicle.
+        Acceleration (N, 2) to the east and north in m/s^2, heading (N,) unwrapped in degrees, and the times in
+        seconds at which speeding up, braking and stopping shake the vehicle.
     """
-    pause = round(style.pause_s / STEP_S)
+    pause = round(style.pause_s / COURSE_STEP_S)
     turn = 0.5 - 0.5 * np.cos(math.pi * np.clip(np.linspace(-0.25, 1.25, pause), 0.0, 1.0))
     pushes, noses, kicks = [], [], []
     nose, count = None, 0
@@ -195,25 +227,28 @@ def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[f
         noses += [before + turn * (nose - before), np.full(push.size, nose)]
         # Speeding up begins, braking begins, and the stop: where the paper sees its large disturbances.
         braking = int(np.argmax(push < 0))
-        kicks += [(count + pause + k) * STEP_S for k in (0, braking, push.size)]
+        kicks += [(count + pause + k) * COURSE_STEP_S for k in (0, braking, push.size)]
         count += pause + push.size
     pushes.append(np.zeros((pause, 2)))
     noses.append(np.full(pause, nose))
     return np.concatenate(pushes), np.concatenate(noses), kicks
 
 
-def fly(waypoints_m: Array, style: FlightStyle, rng: np.random.Generator) -> Motion:
-    """Fly from waypoint to waypoint, with a stop at each where the nose turns to the next.
+def fly_waypoints(waypoints_m: Array, style: FlightStyle, rng: np.random.Generator) -> Motion:
+    """Fly from waypoint to waypoint, with a stop at each in which the vehicle yaws to the next.
 
     Args:
         waypoints_m: (N, 2) east and north, neighbours apart.
         style: speed, tilt and height.
-        rng: source of vibration and wander.
+        rng: of vibration and wander.
+
+    Returns:
+        The motion every :data:`COURSE_STEP_S`, up above the flat ground.
     """
     push, nose, kicks = course(waypoints_m, style)
-    time = np.arange(len(push), dtype=np.float64) * STEP_S
-    velocity = np.cumsum(push, axis=0) * STEP_S
-    position = waypoints_m[0] + np.cumsum(velocity, axis=0) * STEP_S
+    time = np.arange(len(push), dtype=np.float64) * COURSE_STEP_S
+    velocity = np.cumsum(push, axis=0) * COURSE_STEP_S
+    position = waypoints_m[0] + np.cumsum(velocity, axis=0) * COURSE_STEP_S
     nose = nose + 0.4 * _wander(rng, time, 3.0)
     sin, cos = np.sin(np.radians(nose)), np.cos(np.radians(nose))
     forward, right = push[:, 0] * sin + push[:, 1] * cos, push[:, 0] * cos - push[:, 1] * sin
@@ -221,26 +256,37 @@ def fly(waypoints_m: Array, style: FlightStyle, rng: np.random.Generator) -> Mot
     breeze = 0.15 * np.column_stack([_wander(rng, time, 1.5), _wander(rng, time, 1.5)])
     tilt = _scaled_to_peak(steady + breeze, _vibration(rng, time, kicks), style.peak_tilt_deg)
     up = style.height_agl_m + style.height_sd_m * _wander(rng, time, 8.0)
-    place = np.column_stack(
+    position_m = np.column_stack(
         [position + 0.3 * np.column_stack([_wander(rng, time, 6.0), _wander(rng, time, 6.0)]), up]
     )
-    return Motion(time, place, np.gradient(place, STEP_S, axis=0), tilt[:, 0], tilt[:, 1], nose % 360.0)
+    return Motion(
+        time, position_m, np.gradient(position_m, COURSE_STEP_S, axis=0), tilt[:, 0], tilt[:, 1], nose % 360.0
+    )
 
 
-def measure(motion: Motion, noise: SensorNoise, rng: np.random.Generator) -> Motion:
-    """What the sensors say of a motion; the position keeps its truth but for the height, which is measured."""
+def simulate_telemetry(motion: Motion, noise: SensorNoise, rng: np.random.Generator) -> Motion:
+    """The telemetry of a motion: attitude, velocity and height with noise; east and north stay exact.
+
+    Args:
+        motion: the truth at N times, one per frame.
+        noise: standard deviations, bias and drift.
+        rng: of the noise.
+
+    Returns:
+        The motion as measured, at the same times.
+    """
     count = motion.time_s.size
     step = float(motion.time_s[1] - motion.time_s[0]) if count > 1 else 1.0
     # Two streams, drawn frame by frame: a shortened flight has the telemetry of the whole one's beginning.
     slow, fast = rng.spawn(2)
     white = fast.standard_normal((count, 6)).T
     drift = noise.height_drift_sd_m * smooth_noise(slow, count, step, noise.height_drift_time_s)
-    place, velocity = motion.position_m.copy(), motion.velocity_mps.copy()
-    place[:, 2] += noise.height_sd_m * white[0] + drift
+    position_m, velocity = motion.position_m.copy(), motion.velocity_mps.copy()
+    position_m[:, 2] += noise.height_sd_m * white[0] + drift
     velocity[:, :2] += noise.velocity_sd_mps * white[1:3].T
     return Motion(
         motion.time_s,
-        place,
+        position_m,
         velocity,
         motion.roll_deg + noise.tilt_sd_deg * white[3],
         motion.pitch_deg + noise.tilt_sd_deg * white[4],

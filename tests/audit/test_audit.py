@@ -11,9 +11,9 @@ from pyproj import Transformer
 
 from bench.accuracy.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
-from engine.audit.availability import Flag, audit_map, predict, probability
+from engine.audit.availability import Flag, audit_map, fix_probability, predict_route
 from engine.audit.plan import AuditOptions, plan_audit
-from engine.audit.self_match import measure
+from engine.audit.self_match import measure_self_match
 from engine.cli.app import run
 from engine.errors import OptionError, TelemetryError
 from engine.formats.geotiff import write_geotiff
@@ -60,7 +60,7 @@ def well_inside(found, x0, y0):
     """The places whose whole window lies in one quarter of the map."""
     reach = 0.8 * found.plan.view.footprint_px[0]
     low = np.array([x0, y0]) + reach
-    inside = ((found.plan.places_px > low) & (found.plan.places_px < low + HALF - 2 * reach)).all(axis=-1)
+    inside = ((found.plan.centers_px > low) & (found.plan.centers_px < low + HALF - 2 * reach)).all(axis=-1)
     assert inside.sum() >= 4
     return inside
 
@@ -83,19 +83,19 @@ def test_probabilities_are_probabilities_and_nan_is_nodata_alone(found):
 def test_texture_of_water_is_its_noise(found):
     """Smoothed by 1-2-1 in both directions, white noise keeps 6/16 of its deviation."""
     water = well_inside(found, HALF, 0)
-    assert found.evidence.texture[water] == pytest.approx(np.full(water.sum(), NOISE * 6 / 16), rel=0.08)
+    assert found.statistics.texture[water] == pytest.approx(np.full(water.sum(), NOISE * 6 / 16), rel=0.08)
 
 
 def test_a_field_that_repeats_is_its_own_rival(found):
-    assert (found.evidence.rival[well_inside(found, 0, HALF)] > 0.95).all()
-    assert (found.evidence.rival[well_inside(found, 0, 0)] < 0.9).all()
+    assert (found.statistics.rival[well_inside(found, 0, HALF)] > 0.95).all()
+    assert (found.statistics.rival[well_inside(found, 0, 0)] < 0.9).all()
 
 
 def test_more_lead_and_more_score_never_make_a_fix_less_probable():
     ladder = np.linspace(0.0, 40.0, 100)
-    assert (np.diff(probability(20.0, 15.0, ladder)) >= 0).all()
-    assert (np.diff(probability(20.0, ladder, 3.0)) >= 0).all()
-    assert np.isnan(probability(20.0, 15.0, np.nan))
+    assert (np.diff(fix_probability(20.0, 15.0, ladder)) >= 0).all()
+    assert (np.diff(fix_probability(20.0, ladder, 3.0)) >= 0).all()
+    assert np.isnan(fix_probability(20.0, 15.0, np.nan))
 
 
 def test_fine_random_texture_is_less_stable_than_a_town(town_gray):
@@ -104,7 +104,7 @@ def test_fine_random_texture_is_less_stable_than_a_town(town_gray):
     values = []
     for gray in (leaves, np.ascontiguousarray(town_gray[:600, :600])):
         plan = plan_audit(OrthoMap.from_arrays(gray, GRID, "EPSG:32614"), CAMERA, HEIGHT_M)
-        values.append(np.array([one.stability for one in measure(plan)]))
+        values.append(np.array([one.stability for one in measure_self_match(plan)]))
     assert np.nanmax(values[0]) < np.nanmin(values[1])
 
 
@@ -115,7 +115,7 @@ def test_another_date_finds_what_changed(town_gray):
     sites = [OrthoMap.from_arrays(gray, GRID, "EPSG:32614") for gray in (town_gray, later)]
     found = audit_map(sites[0], CAMERA, HEIGHT_M, other=sites[1])
     alone = audit_map(sites[0], CAMERA, HEIGHT_M)
-    x = found.plan.places_px[..., 0]
+    x = found.plan.centers_px[..., 0]
     known = ~np.isnan(found.availability)
     reach = found.plan.view.footprint_px[0]
     same, changed = known & (x < HALF - reach), known & (x > HALF + reach)
@@ -151,8 +151,8 @@ def lat_lon(site, xy_px):
 
 
 def test_a_route_over_the_town_is_better_than_one_over_water(site, found):
-    town = predict(found, *lat_lon(site, [[130, 225], [310, 225]]))
-    water = predict(found, *lat_lon(site, [[600, 225], [780, 225]]))
+    town = predict_route(found, *lat_lon(site, [[130, 225], [310, 225]]))
+    water = predict_route(found, *lat_lon(site, [[600, 225], [780, 225]]))
     assert town.availability > 0.5  # the least that is flagged good
     assert town.stretches == ()
     assert water.availability < 0.3
@@ -162,7 +162,7 @@ def test_a_route_over_the_town_is_better_than_one_over_water(site, found):
 
 
 def test_a_poor_stretch_begins_and_ends_where_the_water_does(site, found):
-    route = predict(found, *lat_lon(site, [[130, 225], [780, 225]]))
+    route = predict_route(found, *lat_lon(site, [[130, 225], [780, 225]]))
     (stretch,) = route.stretches
     start = site.pixel_from_geodetic(stretch.start_lat_deg, stretch.start_lon_deg)
     assert abs(start[0] - HALF) < found.plan.view.footprint_px[0]
@@ -172,7 +172,7 @@ def test_a_poor_stretch_begins_and_ends_where_the_water_does(site, found):
 
 
 def test_off_the_map_nothing_is_available(site, found):
-    route = predict(found, *lat_lon(site, [[-3000, -3000], [-2000, -3000]]))
+    route = predict_route(found, *lat_lon(site, [[-3000, -3000], [-2000, -3000]]))
     assert route.availability == 0.0
     assert route.stretches[0].flag == "edge"
 
@@ -182,16 +182,16 @@ def test_where_a_forward_camera_looks_counts_not_where_it_is(site):
     turn = cv2.Rodrigues(np.array([0.0, np.radians(20.0), 0.0]))[0]
     ahead = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
     found = audit_map(site, ahead, HEIGHT_M)
-    east = predict(found, *lat_lon(site, [[HALF, 250], [HALF + 20, 250]]))
-    west = predict(found, *lat_lon(site, [[HALF + 20, 250], [HALF, 250]]))
+    east = predict_route(found, *lat_lon(site, [[HALF, 250], [HALF + 20, 250]]))
+    west = predict_route(found, *lat_lon(site, [[HALF + 20, 250], [HALF, 250]]))
     assert abs(east.availability - west.availability) > 0.1
     assert (turn @ CAMERA.mount)[0, 2] > 0  # the axis points ahead
     assert east.availability < west.availability
 
 
 def test_a_route_without_a_way_is_refused(found):
-    with pytest.raises(OptionError, match="route: expected two or more places"):
-        predict(found, [40.0, 40.0], [-100.0, -100.0])
+    with pytest.raises(OptionError, match="route: expected two or more waypoints"):
+        predict_route(found, [40.0, 40.0], [-100.0, -100.0])
 
 
 LINE = {"type": "LineString", "coordinates": [[8.0, 47.0, 500.0], [8.1, 47.2]]}
@@ -321,7 +321,7 @@ def test_the_raster_lies_where_the_map_does(map_file, found, tmp_path):
     assert ((values == -1.0) == np.isnan(found.availability)).mean() > 0.97
     lon, lat = Transformer.from_crs("EPSG:32614", "EPSG:4326", always_xy=True).transform(x, y)
     place = found.plan.site.pixel_from_geodetic(lat, lon)
-    assert place == pytest.approx(found.plan.places_px[3, 4], abs=0.02)
+    assert place == pytest.approx(found.plan.centers_px[3, 4], abs=0.02)
 
 
 def test_people_get_a_table_and_a_pipe_no_escapes(map_file, route_file, tmp_path, capsys):

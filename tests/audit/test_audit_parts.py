@@ -13,7 +13,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
 from engine import Camera, OrthoMap
-from engine.audit.availability import Flag, audit_map, predict
+from engine.audit.availability import Flag, audit_map, predict_route
 from engine.audit.plan import AuditOptions, MapPart, plan_audit
 from engine.cli.app import run
 from engine.errors import OptionError
@@ -71,8 +71,8 @@ def around(site, xy_px, radius_m):
 
 def test_around_a_place_all_within_the_radius_is_looked_at_and_nothing_else(site):
     plan = plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [450, 300], 100.0)))
-    off_m = np.hypot(*np.moveaxis(plan.places_px - [450, 300], -1, 0)) * site.gsd_m_per_px
-    np.testing.assert_array_equal(plan.looked, off_m <= 100.0)
+    off_m = np.hypot(*np.moveaxis(plan.centers_px - [450, 300], -1, 0)) * site.gsd_m_per_px
+    np.testing.assert_array_equal(plan.audited, off_m <= 100.0)
     assert plan.area_px * site.gsd_m_per_px**2 == pytest.approx(np.pi * 100.0**2, rel=0.1)
     whole = plan_audit(site, CAMERA, HEIGHT_M)
     assert plan.spacing_px == pytest.approx(whole.spacing_px, rel=0.1)
@@ -81,7 +81,7 @@ def test_around_a_place_all_within_the_radius_is_looked_at_and_nothing_else(site
 
 def test_a_radius_below_the_spacing_is_one_place_there(site):
     plan = plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [450, 300], 1.0)))
-    assert plan.places_px[plan.looked] == pytest.approx(np.array([[450, 300]]), abs=3.0)
+    assert plan.centers_px[plan.audited] == pytest.approx(np.array([[450, 300]]), abs=3.0)
 
 
 def test_a_part_at_the_edge_ends_with_the_map(site):
@@ -94,13 +94,13 @@ def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(site):
     whole = audit_map(site, CAMERA, HEIGHT_M)
     part = audit_map(site, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
     assert len(part.plan) < 0.5 * len(whole.plan)
-    told, expected = (predict(one, *route.T) for one in (part, whole))
+    told, expected = (predict_route(one, *route.T) for one in (part, whole))
     assert told.length_m == expected.length_m
     assert told.availability == pytest.approx(expected.availability, abs=0.05)
     assert Flag.OUTSIDE not in part.flag_at(told.xy_px)
     assert (part.flags == Flag.OUTSIDE).any()
-    np.testing.assert_array_equal(part.flags == Flag.OUTSIDE, ~part.plan.looked)
-    assert np.isnan(part.availability[~part.plan.looked]).all()
+    np.testing.assert_array_equal(part.flags == Flag.OUTSIDE, ~part.plan.audited)
+    assert np.isnan(part.availability[~part.plan.audited]).all()
     assert sum(part.shares.values()) == pytest.approx(1.0)
 
 
@@ -111,7 +111,7 @@ def test_the_corridor_is_of_what_the_camera_sees_not_of_where_it_flies(site):
     route = lat_lon(site, [[200, 450], [700, 450]])
     fine = AuditOptions(spacing=0.05)
     plan = plan_audit(site, aside, HEIGHT_M, fine, part=MapPart(route=route, corridor_m=5.0))
-    beside_m = abs(plan.places_px[plan.looked][:, 1].mean() - 450) * site.gsd_m_per_px
+    beside_m = abs(plan.centers_px[plan.audited][:, 1].mean() - 450) * site.gsd_m_per_px
     assert beside_m == pytest.approx(HEIGHT_M * np.tan(np.radians(30.0)), abs=3.0)
 
 
@@ -128,7 +128,7 @@ def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_me
     route = lat_lon(huge, [[10, 10], [23_990, 23_990], [23_990, 10]])
     plan = plan_audit(huge, CAMERA, 20.0, AuditOptions(max_cells=500), part=MapPart(route=route, corridor_m=5.0))
     assert 100 < len(plan) <= 500
-    assert plan.looked.size < 200_000
+    assert plan.audited.size < 200_000
 
 
 @pytest.mark.parametrize(

@@ -309,7 +309,7 @@ def test_alto_is_followed_on_the_map_of_its_aerial_pictures(plan, frames, truth,
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["mars", "."], 2, "KIND: expected one of uav-visloc, wildnav, vpair, alto, got 'mars'"),
+        (["mars", "."], 2, "NAME: expected one of uav-visloc, wildnav, vpair, alto, got 'mars'"),
         (["uav-visloc", "."], 2, "--part: expected one with uav-visloc"),
         (["vpair", ".", "--part=1"], 2, "--part: expected none with vpair, got 1"),
         (["vpair", ".", "--gsd-m=1"], 2, "--gsd-m: expected with alto only"),

@@ -260,7 +260,7 @@ def test_a_list_of_frames_stamps_them(pictures, tmp_path):
     assert [row.heading_deg for row in flight.rows] == pytest.approx([350.0, 355.0])
     message = refusal(open_flight, pictures, log, clock=LogClock(stamps))
     assert "expected frames taken from 60.000 to 70.000 s of the log, got frames from 0.000 to 2.500 s" in message
-    assert "--log-offset-s" in message
+    assert "`log_offset_s`" in message
 
 
 def test_a_video_has_its_own_times(tmp_path):
@@ -280,7 +280,7 @@ def test_a_video_has_its_own_times(tmp_path):
 
 def test_where_nothing_stamps_the_frames_the_message_says_how(pictures, tmp_path):
     log = dataflash_flight(tmp_path / "1.BIN")
-    assert "no --frame-stamps was given" in refusal(open_flight, pictures, log)
+    assert "no `frame_stamps` was given" in refusal(open_flight, pictures, log)
     two = dataflash_flight(tmp_path / "2.BIN", more=cams(61.0, 62.0))
     message = refusal(open_flight, pictures, two)
     assert "expected a camera message for each of 3 pictures, got 2" in message

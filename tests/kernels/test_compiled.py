@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from engine.features import sift
-from engine.kernels import compiled, jit
+from engine.kernels import jit, sift_descriptors
 from engine.sift import descriptors, keypoints, scale_space
 
 CPU = torch.device("cpu")
@@ -44,7 +44,7 @@ def both(plan, contrast_threshold=0.02):
     image = picture(*plan.octaves[0].source)
     gaussians = scale_space.gaussian_levels(image, plan)
     buffer, points = keypoints.detect(image, plan, contrast_threshold)
-    return (gaussians, keypoints.search(gaussians, plan, contrast_threshold)), (buffer.clone(), points)
+    return (gaussians, keypoints.find_points(gaussians, plan, contrast_threshold)), (buffer.clone(), points)
 
 
 def test_levels_are_those_of_the_banded_matrices(plan):
@@ -88,10 +88,10 @@ def test_angles_and_descriptors_are_those_of_the_tensor_ops(plan):
 
 def test_directions_are_the_arc_tangents():
     angle = np.linspace(0, 2 * np.pi, 4001)[:-1]
-    got = [compiled._turn(np.float32(np.cos(a)), np.float32(np.sin(a))) for a in angle]
+    got = [sift_descriptors._turn(np.float32(np.cos(a)), np.float32(np.sin(a))) for a in angle]
     error = np.abs((np.array(got) - angle / math.tau + 0.5) % 1 - 0.5)
     assert error.max() < 3e-6
-    assert compiled._turn(np.float32(0), np.float32(0)) == 0
+    assert sift_descriptors._turn(np.float32(0), np.float32(0)) == 0
 
 
 def test_more_threads_give_the_same():

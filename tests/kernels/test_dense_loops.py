@@ -26,7 +26,7 @@ def scene():
 def look(scene, *, center_m=None, rotation=None, slope=None, gradients=None):
     picture, offset_m, turned, center, leaning = scene
     count = offset_m.shape[1]
-    return dense_loops.seen(
+    return dense_loops.project(
         picture, MATRIX, turned if rotation is None else rotation, center if center_m is None else center_m,
         leaning if slope is None else slope, offset_m, np.zeros(3),
         np.zeros((count, 2)) if gradients is None else gradients, np.ones(count), EDGE_PX, CELLS,
@@ -88,14 +88,14 @@ def test_comparing_is_a_robust_regression_of_the_picture_on_the_map():
     levels = 3.0 * values - 7.0 + rng.normal(0, 0.1, 900)
     wrong = rng.random(900) < 0.05
     levels[wrong] += rng.uniform(30, 60, wrong.sum())
-    differences, robust, correlation, gain = dense_loops.compare(levels, values, weights)
+    differences, robust, correlation, gain = dense_loops.compare_levels(levels, values, weights)
     assert gain == pytest.approx(3.0, abs=0.15)
     assert not robust[wrong].any()
     assert robust[~wrong].sum() > 0.8 * weights[~wrong].sum()
     assert np.average(differences, weights=robust + 1e-30) == pytest.approx(0.0, abs=0.2)
     covariance = np.cov(levels, values, aweights=weights, ddof=0)
     assert correlation == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
-    exact = dense_loops.compare(3.0 * values - 7.0, values, weights)
+    exact = dense_loops.compare_levels(3.0 * values - 7.0, values, weights)
     assert exact[2] == pytest.approx(1.0)
     assert exact[3] == pytest.approx(3.0)
     assert np.abs(exact[0]).max() < 1e-9

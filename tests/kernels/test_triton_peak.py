@@ -165,7 +165,7 @@ def compile_for(capability):
 
     from engine.kernels import triton_peak
 
-    pointers = {"products": "*fp32", "inverse_norms": "*fp32", "best": "*fp32", "places": "*i64"}
+    pointers = {"products": "*fp32", "inverse_norms": "*fp32", "best": "*fp32", "indices": "*i64"}
     optional = {"winner": "*i64"}
     sizes = dict.fromkeys(triton_peak._SIZES, "i64") | {"width": "i32"}
     found = []

@@ -350,7 +350,7 @@ def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, t
 
 
 def test_a_large_file_is_hashed_again_when_it_changes(tmp_path, monkeypatch):
-    monkeypatch.setattr(metric_copy, "_REMEMBERED_BYTES", 10)
+    monkeypatch.setattr(metric_copy, "_CACHED_HASH_BYTES", 10)
     path = tmp_path / "file"
     path.write_bytes(b"a" * 100)
     first = metric_copy._file_hash(path, tmp_path)

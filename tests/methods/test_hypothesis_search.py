@@ -9,7 +9,7 @@ import pytest
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.methods.ncc import Ncc
 from engine.methods.options import NccOptions
-from engine.sim import FlightStyle, SensorNoise, paper_flight
+from engine.sim import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_town, site_of
 
 EXACT = SensorNoise(
@@ -31,7 +31,8 @@ KNOWN = pytest.mark.parametrize(
 @pytest.fixture(scope="module")
 def flight():
     """A flight whose telemetry is the truth: what is off, the tests put there."""
-    return paper_flight(3, town=drawn_town(3), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    plan = plan_flight(3, town=drawn_town(3), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    return plan.draw()
 
 
 @pytest.fixture(scope="module")

@@ -202,7 +202,7 @@ def test_a_run_is_a_flight_by_a_method_in_the_order_of_the_file(place, tmp_path)
     (place / "deep" / "fine.toml").write_text("[ncc]\nmargin = 2\n", encoding="utf-8")
     file.write_text(FILE.replace('["ncc"]', '["sift/paper", "deep/fine.toml"]'), encoding="utf-8")
     plan = plan_campaign(file, tmp_path)
-    assert [job.name for job in plan.drawn] == ["town-1-noon"]
+    assert [job.name for job in plan.simulated] == ["town-1-noon"]
     flights = ("town-1-noon", "good", "bad")
     assert [job.name for job in plan.runs] == [
         f"{flight}/{run}" for flight in flights for run in ("sift-paper", "fine")
@@ -247,8 +247,8 @@ def test_an_input_that_changed_on_disk_changes_its_print(place, tmp_path):
     file.write_text(FILE.replace('surface = "none"', logged), encoding="utf-8")
     (run,) = (job for job in plan_campaign(file, tmp_path).runs if job.name == "good/ncc")
     stamps = tmp_path.resolve() / "flight" / "stamps.csv"
-    assert run.task.inputs.clock == LogClock(stamps, -0.5)
-    assert run.task.inputs.image_topic == "/down"
+    assert run.task.files.clock() == LogClock(stamps, -0.5)
+    assert run.task.files.image_topic == "/down"
     changed = {name for name, value in run.inputs.items() if before["good/ncc"].get(name) != value}
     assert changed == {"frames", "telemetry", "frame_stamps", "log_offset_s", "image_topic"}
     file.write_text(FILE.replace('surface = "none"', "log_offset_s = 2"), encoding="utf-8")

@@ -20,13 +20,13 @@ from engine.sim.ekf import (
     TURN,
     VELOCITY,
     FilterState,
-    begin,
     correct,
     fix_chi_square,
     fuse_fix,
     fuse_gps,
     fuse_heading,
     fuse_height,
+    initial_state,
     predict,
 )
 from engine.sim.history import History
@@ -167,7 +167,7 @@ def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
 
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     state, rng = hovering(np.array([0.0, 0.0, 100.0]), 200.0), np.random.default_rng(9)
-    belief = replace(begin(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
+    belief = replace(initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
     air = WindField(Wind(), rng)
     for k in range(500):
         state, felt = advance(
@@ -190,7 +190,7 @@ def fly(seed, seconds, gps_until_s=math.inf):
     off = start.standard_normal(8)
     state = replace(state, velocity_mps=0.1 * off[:3])
     believed = Attitude(0.5 * off[3], 0.5 * off[4], carried.heading_deg(state))
-    history = History(begin(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
+    history = History(initial_state(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
     kicks, receiver, rows = list(route.kicks_s), [], []
     for k in range(1, round(seconds / STEP_S) + 1):
         target, belief = route.at(k * STEP_S), history.now

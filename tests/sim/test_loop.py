@@ -11,9 +11,9 @@ from engine.errors import OptionError
 from engine.navigator import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.sim.faults import Fault, ShiftedMap
-from engine.sim.loop import START_NS, LoopOptions, Mode, fly_closed_loop
+from engine.sim.loop import LoopOptions, Mode, fly_closed_loop
 from engine.sim.pilot import plan_rounds
-from engine.sim.vehicle import FlightStyle
+from engine.sim.vehicle import START_NS, FlightStyle
 from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 SIGMA_M = 0.3
@@ -92,7 +92,7 @@ def test_it_flies_its_plan_by_fixes_alone(undisturbed):
 def test_its_estimate_is_better_than_its_fixes_and_says_so(undisturbed):
     errors = undisturbed.estimate_error_m[50:]
     assert math.sqrt(np.mean(distance(errors) ** 2)) < SIGMA_M
-    sigma = np.array([row.belief.sigma_m for row in undisturbed.record[50:]])
+    sigma = np.array([row.estimate.sigma_m for row in undisturbed.record[50:]])
     assert (distance(errors) < 4.0 * sigma).all()
     assert sigma.max() < 0.6
 
@@ -111,7 +111,7 @@ def test_the_engine_is_told_what_the_filter_believes():
         row = next(r for r in flown.record if START_NS + round(r.time_s * 1e9) == answer.timestamp_ns)
         assert frame.timestamp_ns == answer.timestamp_ns
         assert prior is not None
-        assert frame.height_agl_m == pytest.approx(row.belief.position_m[2], abs=0.5)
+        assert frame.height_agl_m == pytest.approx(row.estimate.position_m[2], abs=0.5)
         true = answer.truth.attitude
         assert frame.roll_deg == pytest.approx(true.roll_deg, abs=2.0)
         assert frame.pitch_deg == pytest.approx(true.pitch_deg, abs=2.0)
@@ -144,8 +144,8 @@ def test_an_engine_that_is_killed_for_ten_seconds_is_coasted_over():
     assert all(row.healthy for row in rows_between(flown, 23.0, 99.0))
     assert modes(flown) == {Mode.FOLLOW}
     for row in rows_between(flown, 12.0, 22.0):
-        error = row.belief.position_m - row.truth.position_m
-        assert math.hypot(error[0], error[1]) < 4.0 * row.belief.sigma_m
+        error = row.estimate.position_m - row.truth.position_m
+        assert math.hypot(error[0], error[1]) < 4.0 * row.estimate.sigma_m
     assert distance(flown.plan_error_m[-20:]).max() < 2.0
 
 
@@ -154,7 +154,7 @@ def test_beyond_its_limit_it_holds_and_when_fixes_return_it_flies_on():
     flown = fly(50.0, Fault(kind="killed", start_s=12.0, duration_s=18.0))
     held = [row for row in flown.record if row.mode is Mode.HOLD]
     assert held
-    assert held[0].belief.sigma_m > 5.0
+    assert held[0].estimate.sigma_m > 5.0
     assert 20.0 < held[0].time_s < 30.0
     stopped = rows_between(flown, held[0].time_s + 4.1, 30.0)
     assert all(np.array_equal(row.plan_m, stopped[0].plan_m) for row in stopped)  # the route waits
@@ -170,7 +170,7 @@ def test_without_an_engine_the_flight_is_handed_over_before_nothing_is_known():
     assert last.time_s < 57.0
     assert [a.timestamp_ns for a in flown.answers][-1] <= START_NS + round(last.time_s * 1e9)
     assert flown.record[-2].mode is Mode.HOLD
-    assert flown.record[-2].belief.sigma_m < 20.0
+    assert flown.record[-2].estimate.sigma_m < 20.0
 
 
 def test_a_shifted_map_is_never_followed():
@@ -182,9 +182,9 @@ def test_a_shifted_map_is_never_followed():
     assert last.time_s < 57.0
     assert last.mode is Mode.HANDED_OVER
     # It believes in no place that is 40 m to the east: its error is what its own sigma allows for.
-    error = last.belief.position_m - last.truth.position_m
-    assert math.hypot(error[0], error[1]) < 4.0 * last.belief.sigma_m
-    assert last.belief.sigma_m < 12.0
+    error = last.estimate.position_m - last.truth.position_m
+    assert math.hypot(error[0], error[1]) < 4.0 * last.estimate.sigma_m
+    assert last.estimate.sigma_m < 12.0
 
 
 def test_a_frozen_camera_is_refused_and_survived():
@@ -195,8 +195,8 @@ def test_a_frozen_camera_is_refused_and_survived():
     assert not any(row.healthy for row in rows_between(flown, 10.0, 17.0))
     assert not [s for s in flown.used if START_NS + 8_000_000_000 < s < START_NS + 17_000_000_000]
     for row in rows_between(flown, 7.0, 17.0):  # nothing but coasting: the frozen place pulls at nothing
-        error = row.belief.position_m - row.truth.position_m
-        assert math.hypot(error[0], error[1]) < 4.0 * row.belief.sigma_m
+        error = row.estimate.position_m - row.truth.position_m
+        assert math.hypot(error[0], error[1]) < 4.0 * row.estimate.sigma_m
     assert distance(flown.plan_error_m[-20:]).max() < 2.0
     assert modes(flown, 26.0) == {Mode.FOLLOW}
 

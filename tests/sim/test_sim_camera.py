@@ -49,7 +49,7 @@ def test_an_ideal_camera_changes_nothing(town):
 
 def test_motion_blur_is_as_long_as_the_way_flown():
     world = patch_world(600, 600, 0.0)
-    sharp, optics = snap(world), Optics(exposure_ms=50.0, looks=15)
+    sharp, optics = snap(world), Optics(exposure_ms=50.0, exposure_samples=15)
     blurred = snap(world, optics=optics, sway=ExposureMotion((50.0, 0.0, 0.0)))  # 2.5 m east: 4.33 px
     np.testing.assert_allclose(centre_of_bright(blurred), centre_of_bright(sharp), atol=0.05)
     length = 259.81 * 2.5 / 150.0
@@ -122,8 +122,8 @@ def test_optics_are_checked():
         Optics(exposure_ms=-1.0)
     with pytest.raises(OptionError, match="gain: expected"):
         Optics(gain=0.0)
-    with pytest.raises(OptionError, match="looks"):
-        Optics(looks=0)
+    with pytest.raises(OptionError, match="exposure_samples"):
+        Optics(exposure_samples=0)
     matrix = np.array([[60.0, 0.0, 149.5], [0.0, 60.0, 149.5], [0.0, 0.0, 1.0]])
     wide = Camera(300, 300, matrix, "equidistant", np.zeros(4))
     with pytest.raises(OptionError, match="camera: expected a lens"):

@@ -25,7 +25,7 @@ from engine.sim import (
     world_from_map,
 )
 from engine.sim.canvas import ASPHALT, CANOPY, GRASS
-from engine.sim.conditions import dress
+from engine.sim.conditions import apply_season
 from engine.sim.light import LIGHTS, illuminate
 from engine.sim.raster_world import bare_ground
 from engine.sim.render import Atmosphere, Glint
@@ -49,7 +49,8 @@ def hilly():
 
 @pytest.mark.parametrize("light", LIGHTS)
 def test_a_condition_of_light_alone_is_that_light(light):
-    plain, named = build_town(5, **SMALL, light=light), build_town(5, **SMALL, condition=light)
+    own = Condition(light=LIGHTS[light])
+    plain, named = build_town(5, **SMALL, condition=own), build_town(5, **SMALL, condition=light)
     for name in ("rgb", "sides", "height_m"):
         assert getattr(plain.world, name).tobytes() == getattr(named.world, name).tobytes()
     assert plain.ortho.tobytes() == named.ortho.tobytes()
@@ -109,13 +110,13 @@ def test_snow_lies_on_lawns_and_bare_trees_are_as_thin_as_told():
     albedo = np.full((*kind.shape, 3), 90, np.uint8)
     height = np.where(kind == CANOPY, 6.0, 0.0).astype(np.float32)
     day = Condition(light=LIGHTS["noon"], snow=1.0, leaves=0.3)
-    rgb, stands = dress(albedo, height, kind, None, day, 0.265, np.random.default_rng(1))
+    rgb, stands = apply_season(albedo, height, kind, None, day, 0.265, np.random.default_rng(1))
     lawn, street = rgb[:, :200].mean(), rgb[:, 200:400].mean()
     assert lawn > 180.0
     assert street < 110.0
     assert np.mean(stands[:, 400:] > 0) == pytest.approx(0.3, abs=0.06)
     assert albedo.max() == 90  # what came in is left alone
-    summer = dress(albedo, height, kind, None, CONDITIONS["noon"], 0.265, np.random.default_rng(1))
+    summer = apply_season(albedo, height, kind, None, CONDITIONS["noon"], 0.265, np.random.default_rng(1))
     assert summer[0] is albedo
     assert summer[1] is height
 

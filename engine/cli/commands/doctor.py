@@ -13,6 +13,7 @@ import typer
 from engine.cli import console
 from engine.cli.options import JsonOption
 
+_DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
 """Extras that add nothing to the engine."""
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
@@ -31,7 +32,7 @@ def examine() -> tuple[dict[str, Any], bool]:
     import torch
 
     facts: dict[str, Any] = {
-        "scenematch": _version("scenematch"),
+        "scenematch": _version(_DISTRIBUTION),
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
@@ -55,7 +56,7 @@ def requirements() -> tuple[list[str], dict[str, list[str]]]:
     """The packages that the engine needs, and by extra those that it can use, as its installation states them."""
     needed: list[str] = []
     extras: dict[str, list[str]] = {}
-    for text in metadata.requires("scenematch") or ():
+    for text in metadata.requires(_DISTRIBUTION) or ():
         name, extra = _NAME.match(text), _EXTRA.search(text)
         if name is None:
             continue

@@ -1,0 +1,66 @@
+"""Docstrings of public functions that take or return arrays: they say what goes in and what comes out."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ENGINE = Path(__file__).parents[1] / "engine"
+ARRAYS = re.compile(
+    r"\b(NDArray|ArrayLike|Tensor|(?:Any)?Array|NamedArrays|FloatImage|Image|Mask|Gray|Float32|Heights|Pixels|Pictures)\b"
+)
+"""Types of numpy and torch, and their names in the engine."""
+FOLDERS = ("", "audit", "indexes", "kernels", "maps", "sift", "sim")
+MODULES = sorted(path for folder in FOLDERS for path in (ENGINE / folder).glob("*.py"))
+
+
+def public_functions(path: Path) -> list[tuple[str, ast.FunctionDef]]:
+    """Functions, and methods that are no properties, by name."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
+    owners = [("", tree.body), *((f"{node.name}.", node.body) for node in classes)]
+    return [
+        (prefix + node.name, node)
+        for prefix, body in owners
+        for node in body
+        if isinstance(node, ast.FunctionDef)
+        and not node.name.startswith("_")
+        and not any("property" in ast.unparse(decorator) for decorator in node.decorator_list)
+    ]
+
+
+def missing_sections(function: ast.FunctionDef) -> list[str]:
+    """Sections that the docstring of a function lacks, where its signature has arrays."""
+    arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    taken = [one for one in arguments if one.arg not in ("self", "cls")]
+    returned = "None" if function.returns is None else ast.unparse(function.returns)
+    types = " ".join([*(ast.unparse(one.annotation) for one in taken if one.annotation is not None), returned])
+    if not ARRAYS.search(types):
+        return []
+    sections = ["Args:"] * bool(taken) + ["Returns:"] * (returned != "None")
+    return [section for section in sections if section not in (ast.get_docstring(function) or "")]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ENGINE)))
+def test_array_functions_document_arguments_and_result(path):
+    found = {name: missing_sections(function) for name, function in public_functions(path)}
+    assert {name: sections for name, sections in found.items() if sections} == {}
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ('def f(x: Array) -> Array:\n    """Args:\n    Returns:"""', []),
+        ('def f(x: NDArray[np.uint8]) -> float:\n    """Args:"""', ["Returns:"]),
+        ("def f(x: Tensor | None, y: int) -> None: ...", ["Args:"]),
+        ("def f(self) -> tuple[ArrayLike, int]: ...", ["Returns:"]),
+        ("def f(x: int) -> float: ...", []),
+    ],
+)
+def test_the_check_finds_what_is_missing(source, expected):
+    function = ast.parse(source).body[0]
+    assert isinstance(function, ast.FunctionDef)
+    assert missing_sections(function) == expected
