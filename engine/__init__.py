@@ -3,6 +3,7 @@
 from engine import features, ncc_fft
 from engine.budget import Budget
 from engine.camera import Camera
+from engine.device import set_threads
 from engine.errors import (
     BackendError,
     CalibrationError,
@@ -13,15 +14,21 @@ from engine.errors import (
     MissingExtraError,
     OptionError,
     ShapeError,
+    StateError,
     TelemetryError,
 )
+from engine.integrity import AssumedErrors, PeakRule
+from engine.live import Answer, Live, LiveOptions
 from engine.matcher import SceneMatcher
-from engine.methods.options import MatcherOptions
+from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
 from engine.navigator import Navigator, NavigatorOptions, NavigatorState
 from engine.orthomap import OrthoMap
+from engine.pose import PoseOptions
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 __all__ = [
+    "Answer",
+    "AssumedErrors",
     "Attitude",
     "BackendError",
     "Budget",
@@ -32,22 +39,30 @@ __all__ = [
     "EngineError",
     "Fix",
     "Frame",
+    "Live",
+    "LiveOptions",
     "MapError",
     "MatcherOptions",
     "MissingExtraError",
     "Navigator",
     "NavigatorOptions",
     "NavigatorState",
+    "NccOptions",
     "NoFix",
     "OptionError",
     "OrthoMap",
+    "PeakRule",
+    "PoseOptions",
     "Prior",
     "Reason",
     "SceneMatcher",
     "ShapeError",
+    "SiftOptions",
+    "StateError",
     "TelemetryError",
     "Timings",
     "Window",
     "features",
     "ncc_fft",
+    "set_threads",
 ]

@@ -30,6 +30,8 @@ from torch.nn.functional import pad
 from engine import device as devices
 from engine.errors import DtypeError, OptionError, ShapeError
 
+__all__ = ["DiskLightGlue", "Loftr", "PairMatcher", "load_disk_lightglue", "load_loftr"]
+
 _WRAPPERS = ("state_dict", "extractor", "model")  # under which checkpoints keep their tensors
 _DERIVED = ("num_batches_tracked", "confidence_thresholds")  # computed anew where a file lacks them
 _LISTED = 3  # names in a message

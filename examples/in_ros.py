@@ -3,10 +3,8 @@
 import sys
 from importlib import import_module
 
-from engine import Camera, Navigator, OrthoMap, SceneMatcher
-from engine.adapters.ros import RosBridge, Topics
-from engine.adapters.ros_out import RosOptions
-from engine.device import set_threads
+from engine import Camera, Navigator, OrthoMap, SceneMatcher, set_threads
+from engine.adapters.ros import RosBridge, RosOptions, RosTopics
 
 set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
@@ -14,9 +12,11 @@ matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()
 node = import_module(f"engine.adapters.ros{sys.argv[1]}").Node("scenematch")
 bridge = RosBridge(node, site, lambda prior: Navigator(matcher, prior), RosOptions())
-topics = Topics(image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt")  # "" leaves one out
+topics = RosTopics(
+    image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt"
+)  # "" leaves one out
 try:
-    node.spin(bridge.handlers(topics), bridge.beat, None)  # until ROS ends it
+    node.spin(bridge.handlers(topics), bridge.check_input, None)  # until ROS ends it
 finally:
     bridge.close()
 print(bridge.status)

@@ -7,7 +7,6 @@ from collections import Counter
 import pytest
 from typer.main import get_command
 
-import engine
 from docs.draw_architecture import drawn, members, picture
 from docs.site_roles import on_page_content
 from engine.cli.app import app
@@ -100,11 +99,9 @@ def test_every_page_is_reached_from_the_readme():
     assert {page.resolve() for page in PAGES} - {ROOT / "README.md"} <= linked
 
 
-def test_the_site_shows_every_page_and_every_public_name():
+def test_the_site_shows_every_page():
     nav = re.findall(r": (\S+\.md)$", read("mkdocs.yml"), re.MULTILINE)
     assert sorted(nav) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
-    told = re.findall(r"^::: engine\.(\w+)$", read("docs/api.md"), re.MULTILINE)
-    assert sorted(told) == sorted(engine.__all__)
 
 
 def test_pages_fit_the_line():

@@ -91,14 +91,14 @@ class NodeOfNoRos:
 
         from engine.formats.ros.messages import MessageFactory
 
-        self.maker = MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
+        self.messages = MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
         self.published, self.topics = [], None
         type(self).made = self
 
     def now_ns(self):
         return 1_000_000_000
 
-    def is_wanted(self, output):
+    def has_subscribers(self, output):
         return False
 
     def publish(self, output, message):
@@ -106,7 +106,7 @@ class NodeOfNoRos:
 
     def spin(self, handlers, beat, seconds):
         self.topics = {topic: kind for topic, (kind, _) in handlers.items()}
-        picture = self.maker.image(1_000_000_000, "camera", np.zeros((300, 300), np.uint8))
+        picture = self.messages.image(1_000_000_000, "camera", np.zeros((300, 300), np.uint8))
         handlers["/down/image_raw"][1](picture)
         end = time.monotonic() + 10.0
         while not self.published and time.monotonic() < end:

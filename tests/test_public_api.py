@@ -1,9 +1,12 @@
-"""What ``import engine`` gives, what it does not load, and that every public name is described."""
+"""What ``import engine`` gives and does not load; every public name is described, and documents use no other."""
 
 from __future__ import annotations
 
+import ast
+import importlib
 import inspect
 import json
+import re
 import subprocess
 import sys
 
@@ -13,6 +16,8 @@ import engine
 from tests.support.paths import ROOT
 
 PUBLIC = [
+    "Answer",
+    "AssumedErrors",
     "Attitude",
     "BackendError",
     "Budget",
@@ -23,25 +28,53 @@ PUBLIC = [
     "EngineError",
     "Fix",
     "Frame",
+    "Live",
+    "LiveOptions",
     "MapError",
     "MatcherOptions",
     "MissingExtraError",
     "Navigator",
     "NavigatorOptions",
     "NavigatorState",
+    "NccOptions",
     "NoFix",
     "OptionError",
     "OrthoMap",
+    "PeakRule",
+    "PoseOptions",
     "Prior",
     "Reason",
     "SceneMatcher",
     "ShapeError",
+    "SiftOptions",
+    "StateError",
     "TelemetryError",
     "Timings",
     "Window",
     "features",
     "ncc_fft",
+    "set_threads",
 ]
+MODULES = {
+    "adapters.mavlink": "pymavlink",
+    "adapters.pictures": None,
+    "adapters.ros": None,
+    "adapters.ros1": None,
+    "adapters.ros2": None,
+    "adapters.vehicle": None,
+    "formats.flight": None,
+    "formats.telemetry": None,
+    "formats.track": None,
+    "formats.truth": None,
+    "learned": None,
+    "runs": None,
+    "sim": None,
+    "sim.loop": None,
+    "sim.pilot": None,
+    "sim.quadrotor": None,
+}
+"""The named public modules, whose ``__all__`` counts, and the optional package that importing one needs."""
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
 UNUSED = (
     "matplotlib",
     "rasterio",
@@ -149,3 +182,59 @@ def test_public_functions_are_described(module):
     for name, value in vars(getattr(engine, module)).items():
         if inspect.isfunction(value) and not name.startswith("_") and value.__module__ == f"engine.{module}":
             assert inspect.getdoc(value), name
+
+
+def public_module(name):
+    """A named public module, skipped where the optional package that it needs is missing."""
+    if MODULES[name] is not None:
+        pytest.importorskip(MODULES[name])
+    return importlib.import_module(f"engine.{name}")
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_a_public_module_names_what_it_promises_sorted_and_described(name):
+    module = public_module(name)
+    constants_first = sorted(module.__all__, key=lambda word: (not word.isupper(), not word[0].isupper(), word))
+    assert module.__all__ == constants_first
+    assert len(set(module.__all__)) == len(module.__all__)
+    for public in module.__all__:
+        value = getattr(module, public)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert inspect.getdoc(value), f"{name}.{public}"
+
+
+def engine_imports(path):
+    """Module and name of every import of the engine in a Python file or in a page's Python blocks."""
+    text = path.read_text(encoding="utf-8")
+    blocks = (
+        [text] if path.suffix == ".py" else re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    )
+    for block in blocks:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "engine":
+                yield from ((node.module, alias.name) for alias in node.names)
+            elif isinstance(node, ast.Import):
+                yield from ((alias.name, None) for alias in node.names if alias.name.split(".")[0] == "engine")
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_documents_and_examples_import_public_names_only(path):
+    for module, name in engine_imports(path):
+        if module == "engine":
+            assert name is None or name in engine.__all__, f"{path.name}: engine.{name}"
+            continue
+        assert module.removeprefix("engine.") in MODULES, f"{path.name}: {module} is no public module"
+        assert name in public_module(module.removeprefix("engine.")).__all__, f"{path.name}: {module}.{name}"
+
+
+def test_documents_mention_public_modules_only():
+    """A module that a page tells users to call, as in ``engine.device.set_threads(1)``, is a public one."""
+    public = {*MODULES, *(name for name in engine.__all__ if inspect.ismodule(getattr(engine, name)))}
+    for path in TEXTS:
+        for module in re.findall(r"\bengine\.((?:\w+\.)*\w+)\.\w+\(", path.read_text(encoding="utf-8")):
+            assert module in public or module.split(".")[0] in engine.__all__, f"{path.name}: engine.{module}"
+
+
+def test_the_reference_lists_every_public_name_and_module():
+    listed = re.findall(r"^::: engine\.(\w+(?:\.\w+)*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert sorted(listed) == sorted([*engine.__all__, *MODULES])

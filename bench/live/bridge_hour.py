@@ -22,9 +22,9 @@ from bench.live.bridge_minutes import minutes_real
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import machine, paragraph, table
 from engine.adapters.links import Connection
-from engine.adapters.mavlink import MIN_RATE_HZ, Bridge
-from engine.adapters.mavlink_out import Outgoing
-from engine.adapters.vehicle import Origin
+from engine.adapters.mavlink import MIN_RATE_HZ, MavlinkBridge
+from engine.adapters.mavlink_out import MavlinkOptions
+from engine.adapters.vehicle import NedOrigin
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 
@@ -131,8 +131,8 @@ def hour(minutes: float, flood_pieces: int = 20_000) -> dict[str, Any]:
     door = Door(Connection("udpin", "127.0.0.1", port := free_port()))
     back: dict[str, float] = {}
     begin, begin_ns, submitted = time.perf_counter(), clock(), 0
-    with clock.reigns(), Bridge(
-        door, lambda _: Scripted(script, received), Outgoing(), origin=Origin(33.643, 72.993, 500.0)
+    with clock.reigns(), MavlinkBridge(
+        door, lambda _: Scripted(script, received), MavlinkOptions(), origin=NedOrigin(33.643, 72.993, 500.0)
     ) as bridge:  # fmt: skip
 
         def on_fix(message: Any, arrived_ns: int) -> None:

@@ -14,8 +14,8 @@ from bench.live.endless import Course, draw, there_and_back, warm
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
 from engine import Navigator
 from engine.adapters.links import Connection
-from engine.adapters.mavlink import Bridge
-from engine.adapters.mavlink_out import Outgoing
+from engine.adapters.mavlink import MavlinkBridge
+from engine.adapters.mavlink_out import MavlinkOptions
 
 
 def minutes_real(minutes: float, method: str) -> dict[str, Any]:
@@ -40,9 +40,8 @@ def minutes_real(minutes: float, method: str) -> dict[str, Any]:
             ages.append((arrived_ns - received.captured_ns(number)) * 1e-6)
             errors.append(place_off_m(message, replace(told(0.0), **_true_place(course, number)), pilot))
 
-    with Bridge(
-        Connection("udpin", "127.0.0.1", port), lambda prior: Navigator(matcher, prior), Outgoing(), course.start
-    ) as bridge:  # fmt: skip
+    connection, options = Connection("udpin", "127.0.0.1", port), MavlinkOptions()
+    with MavlinkBridge(connection, lambda prior: Navigator(matcher, prior), options, course.start) as bridge:
         pilot = Standin(agenda, port, told, course.site.frame, on_fix, lambda _: None)
         agenda.every(2 * MS, pilot.poll, clock())
 

@@ -92,7 +92,7 @@ def _worker(tasks: multiprocessing.Queue, answers: multiprocessing.Queue) -> Non
 
 def fuzz(count: int, seed: int) -> tuple[Counter[str], float, list[float]]:
     """So many damaged bags, read in a process that is ended where it hangs; outcomes, and processor times."""
-    from engine.formats.ros.bag_writer import KINDS
+    from engine.formats.ros.bag_writer import BAG_KINDS
 
     context = multiprocessing.get_context("spawn")
     rng, outcomes, times = np.random.default_rng(seed), Counter[str](), []
@@ -106,14 +106,14 @@ def fuzz(count: int, seed: int) -> tuple[Counter[str], float, list[float]]:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        sources = {kind: folder / ("source.bag" if kind == "ros1" else kind) for kind in KINDS}
+        sources = {kind: folder / ("source.bag" if kind == "ros1" else kind) for kind in BAG_KINDS}
         for kind, source in sources.items():
             small_bag(source, kind)
         tasks, answers, worker = start()
         tasks.put(sources["ros1"])
         assert answers.get(timeout=60)[0] == "flight"  # imports are not the bags' fault
         for k in range(count):
-            kind = KINDS[k % len(KINDS)]
+            kind = BAG_KINDS[k % len(BAG_KINDS)]
             target = folder / ("damaged.bag" if kind == "ros1" else "damaged")
             damaged(sources[kind], target, rng)
             tasks.put(target)

@@ -23,7 +23,7 @@ from engine.errors import EngineError
 from engine.formats.export import WRITERS
 from engine.formats.flight import _frame
 from engine.formats.logs.readers import open_log
-from engine.formats.resampling import EPOCH_NS, telemetry_at, truth_of
+from engine.formats.resampling import UTC_FROM_NS, telemetry_at, truth_from_log
 from engine.formats.route import read_route
 from engine.formats.telemetry import TelemetryRow, ground_amsl_m, read_telemetry, write_telemetry
 from engine.formats.track import read_track
@@ -59,9 +59,9 @@ def use_log(path: Path) -> None:
         use_rows(rows)
     for utc in (False, True):
         with suppress(EngineError):
-            truth_of(log, utc=utc)
+            truth_from_log(log, utc=utc)
     with suppress(EngineError):
-        log.clock_shift_ns(EPOCH_NS)
+        log.clock_shift_ns(UTC_FROM_NS)
 
 
 def use_rows(rows: list[TelemetryRow]) -> None:

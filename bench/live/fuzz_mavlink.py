@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.mavlink_in import WANTED, Telemetry
-from engine.adapters.packets import Decoder
+from engine.adapters.mavlink_in import HANDLED_MESSAGES, MavlinkTelemetry
+from engine.adapters.packets import PacketDecoder
 from engine.errors import EngineError
 
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -27,7 +27,7 @@ class Fuzzed:
 
 def packet(rng: random.Random) -> bytes:
     """A well-formed message of the autopilot with any content."""
-    kind = mavlink.mavlink_map[rng.choice(sorted(WANTED))]
+    kind = mavlink.mavlink_map[rng.choice(sorted(HANDLED_MESSAGES))]
     message = kind.__new__(kind)
     mavlink.MAVLink_message.__init__(message, kind.id, kind.msgname)
     payload = bytearray(rng.randbytes(kind.unpacker.size))
@@ -57,8 +57,8 @@ def mutated(rng: random.Random) -> bytes:
 
 def fuzz(count: int, seed: int) -> Fuzzed:
     """So many pieces into a stream, a datagram and a signed decoder; what is heard goes on to a frame."""
-    rng, result, telemetry = random.Random(seed), Fuzzed(), Telemetry()
-    decoders = [Decoder(1, WANTED, is_stream=stream, key=key) for stream, key in
+    rng, result, telemetry = random.Random(seed), Fuzzed(), MavlinkTelemetry()
+    decoders = [PacketDecoder(1, HANDLED_MESSAGES, is_stream=stream, key=key) for stream, key in
                 ((True, None), (False, None), (True, bytes(32)))]  # fmt: skip
     makers = (packet, mutated, lambda r: r.randbytes(r.randrange(600)), lambda r: b"\xfd" * r.randrange(3000))
     now_ns = 10**12
@@ -84,14 +84,14 @@ def fuzz(count: int, seed: int) -> Fuzzed:
 def growth_bytes(hours: float) -> int:
     """By how much memory grew from the first tenth of so many hours of an autopilot's traffic to their end."""
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    decoder, telemetry = Decoder(1, WANTED, is_stream=True), Telemetry()
+    decoder, telemetry = PacketDecoder(1, HANDLED_MESSAGES, is_stream=True), MavlinkTelemetry()
     early = 0
     tracemalloc.start()
     for tick in range(round(hours * 3600 * 50)):
         now_ns, ms = tick * 20_000_000, tick * 20
         messages = [mavlink.MAVLink_attitude_message(ms, 0.1, 0.0, 0.5, 0, 0, 0)]
         if tick % 5 == 0:
-            telemetry.sync_asked(now_ns)
+            telemetry.add_timesync_request(now_ns)
             messages.append(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -100.0, 1, 2, 0))
             messages.append(mavlink.MAVLink_timesync_message(now_ns + 1, now_ns))
         for message in messages:

@@ -17,7 +17,7 @@ from unittest import mock
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.links import Connection, Sender
+from engine.adapters.links import Connection, PeerAddress
 from engine.geo import LocalFrame
 
 S, MS = 1_000_000_000, 1_000_000
@@ -105,7 +105,7 @@ class Door:
         self.is_stream, self.send, self.close = self._link.is_stream, self._link.send, self._link.close
         return self
 
-    def receive(self, timeout_s: float) -> list[tuple[bytes, Sender]]:
+    def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
         """Whoever asks for more is done with what came before."""
         self.handled = self.taken
         got = self._link.receive(timeout_s)

@@ -1,4 +1,4 @@
-"""Links: bytes to and from a vehicle over UDP, TCP or a serial port. Listens on loopback only, unless told."""
+"""Byte links to a vehicle over UDP, TCP or a serial port. UDP listens on loopback unless allowed otherwise."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from typing import Any, Protocol
 
 from engine.errors import OptionError, require
 
-Sender = tuple[str, int] | None
-"""Who sent a datagram; None on a link with one other end."""
+PeerAddress = tuple[str, int] | None
+"""Host and port that sent a datagram; None on a point-to-point link."""
 
 _DATAGRAM_BYTES = 65535
-_MAX_AT_ONCE = 256  # datagrams, so that a flood cannot keep the reader from its other work
-_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+_MAX_DATAGRAMS = 256  # per call, so that a flood cannot starve the reader's other work
+_SYNTAX = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
 class Link(Protocol):
-    """One way to a vehicle. Opened by its constructor; what fails later raises OSError.
+    """A byte link to a vehicle. The constructor opens it; later failures raise OSError.
 
     Attributes:
-        is_stream: whether packets may be cut anywhere; a datagram holds whole ones.
+        is_stream: whether a packet may be split between reads; a datagram holds whole packets.
     """
 
     is_stream: bool
 
-    def receive(self, timeout_s: float) -> list[tuple[bytes, Sender]]:
-        """What has come, waiting at most so long for it."""
+    def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
+        """Return the received (bytes, sender) pairs, waiting at most ``timeout_s``."""
 
-    def send(self, data: bytes, to: Sender) -> None:
-        """Send one packet; dropped where there is nobody to send to."""
+    def send(self, data: bytes, to: PeerAddress) -> None:
+        """Send one packet; it is dropped while no peer is known."""
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """Where a link leads.
+    """The endpoint of a link.
 
     Attributes:
         kind: udpin, udpout, tcp or serial.
-        host: name, address, or path of the serial device.
-        number: port, or baud.
+        host: host name, IP address, or path of the serial device.
+        number: port, or baud rate.
     """
 
     kind: str
@@ -57,19 +57,19 @@ class Connection:
         """Open the link.
 
         Raises:
-            OSError: it cannot be opened now.
-            MissingExtraError: a serial port is asked for and pyserial is not installed.
+            OSError: the link cannot be opened now.
+            MissingExtraError: a serial port is requested and pyserial is not installed.
         """
-        makers: dict[str, Callable[[str, int], Link]] = {
+        factories: dict[str, Callable[[str, int], Link]] = {
             "udpin": lambda host, port: _Udp(host, port, listens=True),
             "udpout": lambda host, port: _Udp(host, port, listens=False),
             "tcp": _Tcp,
             "serial": _Serial,
         }
         try:
-            return makers[self.kind](self.host, self.number)
-        except UnicodeError:  # names are encoded before they are looked up
-            raise OSError(f"{self.host!r} cannot be the name of a host") from None
+            return factories[self.kind](self.host, self.number)
+        except UnicodeError:  # host names are encoded before the lookup
+            raise OSError(f"{self.host!r} is not a valid host name") from None
 
 
 def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
@@ -77,18 +77,18 @@ def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
 
     Args:
         text: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
-        listen_anywhere: allows to listen on addresses that other machines reach.
+        listen_anywhere: permits listening on addresses that other machines can reach.
 
     Raises:
-        OptionError: the text is of another form, or would listen off loopback.
+        OptionError: the syntax is wrong, or the address is not loopback and ``listen_anywhere`` is off.
     """
     kind, _, rest = text.partition(":")
     host, _, number_text = rest.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     number = int(number_text) if number_text.isascii() and number_text.isdecimal() else 0
-    most = 10_000_000 if kind == "serial" else 65535
-    if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not 0 < number <= most:
-        raise OptionError(f"connect: expected {_FORMS}, got {text!r}")
+    max_number = 10_000_000 if kind == "serial" else 65535
+    if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not 0 < number <= max_number:
+        raise OptionError(f"connect: expected {_SYNTAX}, got {text!r}")
     if kind == "udpin" and not listen_anywhere and not _is_loopback(host):
         raise OptionError(
             f"connect: expected a loopback address to listen on, got {host!r}; "
@@ -98,7 +98,7 @@ def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
 
 
 def _is_loopback(host: str) -> bool:
-    """Whether only this machine reaches it; a name other than localhost may mean anything."""
+    """Whether only this machine can reach the host; no name but localhost is trusted."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -120,23 +120,23 @@ class _Udp:
             if listens:
                 self._socket.bind(found[4])
             else:
-                self._socket.connect(found[4])  # datagrams of others never arrive
+                self._socket.connect(found[4])  # the kernel drops datagrams from other peers
         except OSError:
             self._socket.close()
             raise
         self._listens = listens
 
-    def receive(self, timeout_s: float) -> list[tuple[bytes, Sender]]:
-        got: list[tuple[bytes, Sender]] = []
+    def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
+        received: list[tuple[bytes, PeerAddress]] = []
         if _wait(self._socket, timeout_s):
-            # Refused means that nobody listens there yet.
+            # Connection refused: the peer does not listen yet.
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
-                while len(got) < _MAX_AT_ONCE:
+                while len(received) < _MAX_DATAGRAMS:
                     data, sender = self._socket.recvfrom(_DATAGRAM_BYTES)
-                    got.append((data, sender[:2] if self._listens else None))
-        return got
+                    received.append((data, sender[:2] if self._listens else None))
+        return received
 
-    def send(self, data: bytes, to: Sender) -> None:
+    def send(self, data: bytes, to: PeerAddress) -> None:
         with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
             if not self._listens:
                 self._socket.send(data)
@@ -154,7 +154,7 @@ class _Tcp:
         self._socket = socket.create_connection((host, port), timeout=2.0)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def receive(self, timeout_s: float) -> list[tuple[bytes, Sender]]:
+    def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
         if not _wait(self._socket, timeout_s):
             return []
         data = self._socket.recv(_DATAGRAM_BYTES)
@@ -162,7 +162,7 @@ class _Tcp:
             raise ConnectionResetError("the other end closed the connection")
         return [(data, None)]
 
-    def send(self, data: bytes, to: Sender) -> None:
+    def send(self, data: bytes, to: PeerAddress) -> None:
         self._socket.sendall(data)
 
     def close(self) -> None:
@@ -176,12 +176,12 @@ class _Serial:
         serial = require("serial", "mavlink", "pyserial")
         self._port: Any = serial.Serial(device, baud, timeout=0, write_timeout=1.0)
 
-    def receive(self, timeout_s: float) -> list[tuple[bytes, Sender]]:
+    def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
         self._port.timeout = timeout_s
         data = self._port.read(max(1, min(self._port.in_waiting, _DATAGRAM_BYTES)))
         return [(data, None)] if data else []
 
-    def send(self, data: bytes, to: Sender) -> None:
+    def send(self, data: bytes, to: PeerAddress) -> None:
         self._port.write(data)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""What the autopilot says: MAVLink messages in, and what the vehicle knew at the moment of a capture out.
+"""The autopilot's telemetry: MAVLink messages in, the vehicle state at the time of a capture out.
 
-Radians, NED, centidegrees and millimetres end here. Times are ``time.monotonic_ns``, the clock of the captures.
+Radians, NED, centidegrees and millimetres are converted here. Times are on ``time.monotonic_ns``, as captures are.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.vehicle import ANGLES, Origin, RecentValues, Vehicle, only
+from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
 
-FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
-STREAMS_HZ = {
+MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
+"""MAV_AUTOPILOT of each firmware, as its heartbeat states it."""
+REQUESTED_RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 50,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 10,
@@ -24,112 +25,124 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_RANGEFINDER: 10,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
 }
-"""What the bridge asks the autopilot to send, and how often."""
-WANTED = frozenset(
+"""Messages that the bridge requests from the autopilot, and their rates."""
+HANDLED_MESSAGES = frozenset(
     {
-        *STREAMS_HZ,
+        *REQUESTED_RATES_HZ,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
     }
 )
-"""Numbers of the messages that are understood."""
+"""Ids of the messages that are handled."""
 
 _CLOCK_SAMPLES = 64
-_CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot has started again
-_STALE_IN_A_ROW = 20  # stamps that far back, after which the same is taken to be so
-_UNKNOWN_BELOW_M = -1000.0  # of ALTITUDE, by MAVLink's definition
-_UNIX_USEC = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100; others mean that it has no date
+_CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot must have rebooted
+_MAX_STALE_STAMPS = 20  # consecutive stamps that far back, after which it must have rebooted too
+_UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
+_UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 
 
-class Clock:
-    """Translates the autopilot's time since boot to ours.
+class AutopilotClock:
+    """Maps the autopilot's time since boot to the local monotonic clock.
 
-    By TIMESYNC where it is answered, by the quickest message otherwise: none arrives before it was sent.
+    The offset is that of the TIMESYNC exchange with the shortest round trip; without TIMESYNC it is bounded by the
+    message with the shortest delay, since none arrives before it was sent.
     """
 
     def __init__(self) -> None:
         self._by_arrival: deque[int] = deque(maxlen=_CLOCK_SAMPLES)
         self._by_sync: deque[tuple[int, int]] = deque(maxlen=_CLOCK_SAMPLES)  # round trip, offset
-        self._asked: deque[int] = deque(maxlen=8)
+        self._requests: deque[int] = deque(maxlen=8)
 
     @property
     def offset_ns(self) -> int | None:
-        """The autopilot's clock less ours."""
+        """The autopilot's clock minus the local one, in nanoseconds; None before the first message."""
         if self._by_sync:
             return min(self._by_sync)[1]
         return max(self._by_arrival, default=None)
 
-    def asked(self, now_ns: int) -> None:
-        """A TIMESYNC request with this stamp was sent."""
-        self._asked.append(now_ns)
+    def add_request(self, now_ns: int) -> None:
+        """Remember the stamp of a TIMESYNC request that was sent."""
+        self._requests.append(now_ns)
 
-    def answered(self, stamp_ns: int, theirs_ns: int, now_ns: int) -> bool:
-        """Take an answer; one that nobody asked for is ignored.
+    def accept_response(self, stamp_ns: int, remote_ns: int, now_ns: int) -> bool:
+        """Use the response to a TIMESYNC request; unsolicited ones are ignored.
+
+        Args:
+            stamp_ns: stamp of the request.
+            remote_ns: the autopilot's time in the response.
+            now_ns: local time of arrival.
 
         Returns:
-            False where it is another clock than in the answers before: the autopilot has started again.
+            False where the offset jumped against earlier responses: the autopilot has rebooted.
         """
-        if stamp_ns not in self._asked:
+        if stamp_ns not in self._requests:
             return True
-        self._asked.remove(stamp_ns)
-        trip_ns, offset_ns = now_ns - stamp_ns, theirs_ns - (stamp_ns + now_ns) // 2
-        if self._by_sync and abs(offset_ns - min(self._by_sync)[1]) > _CLOCK_JUMP_NS + trip_ns // 2:
+        self._requests.remove(stamp_ns)
+        round_trip_ns, offset_ns = now_ns - stamp_ns, remote_ns - (stamp_ns + now_ns) // 2
+        if self._by_sync and abs(offset_ns - min(self._by_sync)[1]) > _CLOCK_JUMP_NS + round_trip_ns // 2:
             return False
-        self._by_sync.append((trip_ns, offset_ns))
+        self._by_sync.append((round_trip_ns, offset_ns))
         return True
 
-    def ours_ns(self, theirs_ns: int, arrival_ns: int) -> int | None:
-        """When it was on our clock, never after it arrived; None where that lies a second or more back."""
-        self._by_arrival.append(theirs_ns - arrival_ns)
+    def local_ns(self, remote_ns: int, arrival_ns: int) -> int | None:
+        """Local time of a remote stamp, never after its arrival; None where it is a second old or more."""
+        self._by_arrival.append(remote_ns - arrival_ns)
         offset_ns = self.offset_ns
         assert offset_ns is not None  # one was just added
-        ours_ns = min(theirs_ns - offset_ns, arrival_ns)
-        return ours_ns if arrival_ns - ours_ns < _CLOCK_JUMP_NS else None
+        local_ns = min(remote_ns - offset_ns, arrival_ns)
+        return local_ns if arrival_ns - local_ns < _CLOCK_JUMP_NS else None
 
 
-class Telemetry:
-    """What one autopilot said lately. May be read from another thread than the one that fills it."""
+class MavlinkTelemetry:
+    """Recent telemetry of one autopilot. May be read from another thread than the one that updates it.
+
+    Attributes:
+        origin: NED origin of the autopilot; None where it has reported none.
+        firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
+        heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._clock = Clock()
+        self._clock = AutopilotClock()
         self._attitude, self._velocity = RecentValues(ANGLES), RecentValues()
         self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
         self._alt_amsl, self._down = RecentValues(), RecentValues()
         self._unix_offset_ns: int | None = None
         self._stale_stamps = 0
-        self.origin: Origin | None = None
+        self.origin: NedOrigin | None = None
         self.firmware: int | None = None
         self.heard_ns: int | None = None
 
     def update(self, message: Any, arrival_ns: int) -> None:
-        """Take one message."""
+        """Process one message."""
         with self._lock:
             self._update(message, arrival_ns)
 
-    def forget(self) -> None:
-        """Forget everything but the last heartbeat: the autopilot may have started again."""
+    def reset(self) -> None:
+        """Discard everything but the last heartbeat: the autopilot may have rebooted."""
         with self._lock:
-            self._start_again()
+            self._reset()
 
-    def sync_asked(self, now_ns: int) -> None:
-        """A TIMESYNC request with this stamp is being sent."""
+    def add_timesync_request(self, now_ns: int) -> None:
+        """Remember the stamp of a TIMESYNC request that is about to be sent."""
         with self._lock:
-            self._clock.asked(now_ns)
+            self._clock.add_request(now_ns)
 
     def unix_offset_ns(self) -> int | None:
-        """Nanoseconds since 1970 less our clock, as the autopilot has it; None where it does not know."""
+        """The autopilot's UTC in nanoseconds since 1970 minus the local clock; None where it has no date."""
         return self._unix_offset_ns
 
-    def vehicle(self, time_ns: int) -> Vehicle:
-        """What the vehicle knew at a moment."""
+    def vehicle(self, time_ns: int) -> VehicleState:
+        """The vehicle state at a local time; what is not known is None."""
         with self._lock:
             attitude, velocity = self._attitude.at(time_ns), self._velocity.at(time_ns)
             roll, pitch, heading = attitude or (None, None, None)
             east, north, up = velocity or (None, None, None)
-            return Vehicle(
+            return VehicleState(
                 roll_deg=roll,
                 pitch_deg=pitch,
                 heading_deg=None if heading is None else heading % 360.0 % 360.0,
@@ -137,15 +150,15 @@ class Telemetry:
                 north_velocity_mps=north,
                 up_velocity_mps=up,
                 height_agl_m=self._height_agl_m(time_ns, roll or 0.0, pitch or 0.0),
-                alt_amsl_m=only(self._alt_amsl.at(time_ns)),
-                down_m=only(self._down.at(time_ns)),
+                alt_amsl_m=scalar(self._alt_amsl.at(time_ns)),
+                down_m=scalar(self._down.at(time_ns)),
             )
 
     def _height_agl_m(self, time_ns: int, roll_deg: float, pitch_deg: float) -> float | None:
-        slant_m = only(self._range.at(time_ns))
-        if slant_m is not None:  # the beam is fixed to the body
+        slant_m = scalar(self._range.at(time_ns))
+        if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
             slant_m *= math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg))
-        heights = (slant_m, only(self._clearance.at(time_ns)), only(self._relative.at(time_ns)))
+        heights = (slant_m, scalar(self._clearance.at(time_ns)), scalar(self._relative.at(time_ns)))
         return next((height for height in heights if height is not None and height > 0.0), None)
 
     def _update(self, message: Any, arrival_ns: int) -> None:
@@ -154,35 +167,35 @@ class Telemetry:
             if message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
                 self.firmware, self.heard_ns = message.autopilot, arrival_ns
         elif kind == "TIMESYNC":
-            if message.tc1 != 0 and not self._clock.answered(message.ts1, message.tc1, arrival_ns):
-                self._start_again()
+            if message.tc1 != 0 and not self._clock.accept_response(message.ts1, message.tc1, arrival_ns):
+                self._reset()
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._set_origin(message)
         elif kind == "RANGEFINDER":  # has no stamp
-            self._range_m(arrival_ns, message.distance)
+            self._add_range(arrival_ns, message.distance)
         elif kind == "ALTITUDE":
-            self._sample(message, self._time_ns(message.time_usec * 1000, arrival_ns))
+            self._add_sample(message, self._time_ns(message.time_usec * 1000, arrival_ns))
         else:
-            self._sample(message, self._time_ns(message.time_boot_ms * 1_000_000, arrival_ns))
+            self._add_sample(message, self._time_ns(message.time_boot_ms * 1_000_000, arrival_ns))
 
-    def _time_ns(self, theirs_ns: int, arrival_ns: int) -> int | None:
-        """When a sample was taken; an autopilot whose clock went back has started again."""
-        time_ns = self._clock.ours_ns(theirs_ns, arrival_ns)
+    def _time_ns(self, remote_ns: int, arrival_ns: int) -> int | None:
+        """Local time of a sample; an autopilot whose clock went back has rebooted."""
+        time_ns = self._clock.local_ns(remote_ns, arrival_ns)
         self._stale_stamps = 0 if time_ns is not None else self._stale_stamps + 1
-        if self._stale_stamps > _STALE_IN_A_ROW:
-            self._start_again()
-            time_ns = self._clock.ours_ns(theirs_ns, arrival_ns)
+        if self._stale_stamps > _MAX_STALE_STAMPS:
+            self._reset()
+            time_ns = self._clock.local_ns(remote_ns, arrival_ns)
         return time_ns
 
-    def _start_again(self) -> None:
-        self._clock = Clock()
+    def _reset(self) -> None:
+        self._clock = AutopilotClock()
         self.origin, self._unix_offset_ns, self._stale_stamps = None, None, 0
         for series in (self._attitude, self._velocity, self._range, self._clearance, self._relative):
             series.clear()
         self._alt_amsl.clear()
         self._down.clear()
 
-    def _sample(self, message: Any, time_ns: int | None) -> None:
+    def _add_sample(self, message: Any, time_ns: int | None) -> None:
         if time_ns is None:
             return
         kind = message.get_type()
@@ -203,18 +216,18 @@ class Telemetry:
         elif kind == "DISTANCE_SENSOR":
             valid = message.min_distance < message.current_distance < message.max_distance
             if message.orientation == _DOWN and valid:
-                self._range_m(time_ns, message.current_distance * 1e-2)
+                self._add_range(time_ns, message.current_distance * 1e-2)
         elif kind == "SYSTEM_TIME":
-            dated = _UNIX_USEC[0] < message.time_unix_usec < _UNIX_USEC[1]
+            dated = _UNIX_RANGE_US[0] < message.time_unix_usec < _UNIX_RANGE_US[1]
             if dated and self._unix_offset_ns is None:
                 self._unix_offset_ns = message.time_unix_usec * 1000 - time_ns
 
-    def _range_m(self, time_ns: int, range_m: float) -> None:
+    def _add_range(self, time_ns: int, range_m: float) -> None:
         if range_m > 0.0:
             self._range.add(time_ns, range_m)
 
     def _set_origin(self, message: Any) -> None:
-        """Take the autopilot's origin; all zeros mean that it has none."""
+        """Store the autopilot's origin; zero latitude and longitude mean that it has none."""
         lat_deg, lon_deg = message.latitude * 1e-7, message.longitude * 1e-7
         if (message.latitude, message.longitude) != (0, 0) and abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0:
-            self.origin = Origin(lat_deg, lon_deg, message.altitude * 1e-3)
+            self.origin = NedOrigin(lat_deg, lon_deg, message.altitude * 1e-3)

@@ -1,6 +1,6 @@
-"""What the autopilot is told: a fix in, the fields of a MAVLink message out, as each firmware reads them.
+"""Messages to the autopilot: a fix in, the fields of a MAVLink message out, as each firmware interprets them.
 
-Radians, NED and 1e-7 degrees begin here. Stamps are of capture.
+Converts to radians, NED and 1e-7 degrees. Stamps are of capture.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.mavlink_in import FIRMWARES
-from engine.adapters.packets import AUTOPILOT
+from engine.adapters.mavlink_in import MAV_AUTOPILOTS
+from engine.adapters.packets import AUTOPILOT_COMPONENT
 from engine.adapters.parameters import MAX_DELAY_MS
-from engine.adapters.vehicle import ANGLE_VARIANCE, Origin, Vehicle, north_east_m
+from engine.adapters.vehicle import ANGLE_VARIANCE, NedOrigin, VehicleState, north_east_m
 from engine.errors import OptionError
 from engine.geo import enu_from_body
 from engine.values import Fix, check_positive
@@ -25,29 +25,29 @@ MESSAGES = {
     "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
     "px4": ("global_position_sensor", "odometry"),
 }
-"""What each firmware takes; the first is the default."""
+"""Messages that each firmware accepts; the first is the default."""
 
 SENSOR_ID = 1
-"""Of GLOBAL_POSITION_SENSOR; PX4 takes the sensor that its EKF2_AGP0_ID names, and 0 names none."""
+"""Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
 _GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
-_VELOCITY_S = (0.4, 1.5)  # how far apart two fixes are that give a velocity
-_ACCELERATION_MPS2 = 3.0  # such a velocity is that of half the time before
-_SATELLITES = 10  # an arming check of ArduPilot's counts them; GPS_INPUT cannot say that there are none
+_VELOCITY_BASELINE_S = (0.4, 1.5)  # interval between two fixes from which a velocity is computed
+_ACCELERATION_MPS2 = 3.0  # assumed 1 sigma: the velocity is that of the middle of the interval
+_SATELLITES = 10  # ArduPilot's arming check needs a count; GPS_INPUT has no value for unknown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outgoing:
-    """What is sent, and what is withheld.
+class MavlinkOptions:
+    """Which MAVLink message carries the fixes, and which fixes are withheld.
 
     Attributes:
         firmware: ardupilot or px4.
-        message: one of ``MESSAGES``; empty for the firmware's default.
-        max_sigma_m: a fix that is known worse is not sent; ArduPilot would clamp its sigma and believe it.
-        max_age_ms: a fix whose capture is longer ago is not sent; ArduPilot's estimator looks back no further.
+        message: one of :data:`MESSAGES` of the firmware; empty for its default.
+        max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
+        max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no more.
 
     Raises:
-        OptionError: a name is unknown, or a number out of range.
+        OptionError: a name is unknown, or a number is out of range.
     """
 
     firmware: str = "ardupilot"
@@ -57,8 +57,8 @@ class Outgoing:
 
     def __post_init__(self) -> None:
         check_positive(self, "max_sigma_m", "max_age_ms")
-        if self.firmware not in FIRMWARES:
-            raise OptionError(f"firmware: expected one of {', '.join(FIRMWARES)}, got {self.firmware!r}")
+        if self.firmware not in MAV_AUTOPILOTS:
+            raise OptionError(f"firmware: expected one of {', '.join(MAV_AUTOPILOTS)}, got {self.firmware!r}")
         if self.message and self.message not in MESSAGES[self.firmware]:
             known = ", ".join(MESSAGES[self.firmware])
             raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
@@ -71,18 +71,18 @@ class Outgoing:
 
     @property
     def kind(self) -> str:
-        """The message that is sent."""
+        """Name of the message that is sent, in lower case."""
         return self.message or MESSAGES[self.firmware][0]
 
     @property
     def needs_origin(self) -> bool:
-        """Whether positions are sent about the autopilot's origin."""
+        """Whether the message carries positions relative to the autopilot's origin."""
         return self.kind in ("vision_position_estimate", "odometry")
 
 
 @dataclass(frozen=True, slots=True)
-class Velocity:
-    """Velocity over ground by two fixes, and its standard deviation per axis."""
+class GroundVelocity:
+    """Velocity over ground from two fixes, and its standard deviation per axis."""
 
     east_mps: float
     north_mps: float
@@ -90,114 +90,117 @@ class Velocity:
 
 
 @dataclass(frozen=True, slots=True)
-class Sending:
-    """All that a message is made of.
+class FixReport:
+    """A fix with everything else that a message carries.
 
     Attributes:
-        fix: what the engine found.
-        captured_ns: when its frame was captured, on our clock.
-        age_ms: since then.
-        vehicle: what it knew at that moment.
-        origin: of the autopilot's NED; None where it has none.
-        velocity: by the last fixes; None where they do not tell.
-        reset_counter: steps once where the position was taken up anew.
-        unix_ns: the capture in nanoseconds since 1970.
+        fix: the position fix.
+        captured_ns: capture time of its frame on ``time.monotonic_ns``.
+        age_ms: time since capture.
+        vehicle: vehicle state at capture.
+        origin: origin of the autopilot's NED frame; None where it has none.
+        velocity: velocity from the last fixes; None where they do not give one.
+        reset_counter: steps by one where the position was acquired afresh, modulo 256.
+        unix_ns: capture time in nanoseconds since 1970.
     """
 
     fix: Fix
     captured_ns: int
     age_ms: float
-    vehicle: Vehicle
-    origin: Origin | None
-    velocity: Velocity | None
+    vehicle: VehicleState
+    origin: NedOrigin | None
+    velocity: GroundVelocity | None
     reset_counter: int
     unix_ns: int
 
 
-class FixVelocity:
-    """The velocity by the last fixes; an adapter's stand-in where the vehicle's own would be fed back to it."""
+class VelocityFromFixes:
+    """Velocity from the last fixes: sending the vehicle its own estimate back would be circular."""
 
     def __init__(self) -> None:
         self._fixes: deque[tuple[int, Fix]] = deque(maxlen=64)
         self._resets: int | None = None
 
-    def add(self, fix: Fix, captured_ns: int, resets: int) -> Velocity | None:
-        """The velocity up to this fix; None after a reset, and where no other fix is near enough in time."""
+    def add(self, fix: Fix, captured_ns: int, resets: int) -> GroundVelocity | None:
+        """Add a fix; returns the velocity up to it, None after a reset or without a recent earlier fix."""
         if resets != self._resets or (self._fixes and captured_ns <= self._fixes[-1][0]):
             self._fixes.clear()
         self._resets = resets
         self._fixes.append((captured_ns, fix))
-        while (captured_ns - self._fixes[0][0]) * 1e-9 > _VELOCITY_S[1]:
+        while (captured_ns - self._fixes[0][0]) * 1e-9 > _VELOCITY_BASELINE_S[1]:
             self._fixes.popleft()
         before_ns, before = self._fixes[0]
         interval_s = (captured_ns - before_ns) * 1e-9
-        if interval_s < _VELOCITY_S[0]:
+        if interval_s < _VELOCITY_BASELINE_S[0]:
             return None
         noise_mps = math.hypot(fix.sigma_m, before.sigma_m) / interval_s
         sigma_mps = math.hypot(noise_mps, 0.5 * interval_s * _ACCELERATION_MPS2)
         east_mps, north_mps = (fix.east_m - before.east_m), (fix.north_m - before.north_m)
-        return Velocity(east_mps / interval_s, north_mps / interval_s, sigma_mps)
+        return GroundVelocity(east_mps / interval_s, north_mps / interval_s, sigma_mps)
 
 
-def why_withheld(sending: Sending, options: Outgoing) -> str | None:
-    """Why a fix is not sent, or None where it is."""
-    vehicle, fix = sending.vehicle, sending.fix
+def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
+    """Reason for which a fix is not sent, or None where it is sent."""
+    vehicle, fix = report.vehicle, report.fix
     if not all(map(math.isfinite, (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel()))):
         return "not finite"
     if fix.sigma_m > options.max_sigma_m:
         return "too uncertain"
-    if sending.age_ms > options.max_age_ms:
+    if report.age_ms > options.max_age_ms:
         return "too old"
     if options.needs_origin:
-        if sending.origin is None:
+        if report.origin is None:
             return "no origin"
         if vehicle.down_m is None:
             return "no height"
         if None in (vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg):
             return "no attitude"
-    # ArduPilot reads these velocities whatever they say: where none is known, zero would be believed.
+    # ArduPilot uses these velocities unconditionally: with none known, it would use zero.
     reads_velocity = options.firmware == "ardupilot" and options.kind != "vision_position_estimate"
-    return "no velocity" if reads_velocity and sending.velocity is None else None
+    return "no velocity" if reads_velocity and report.velocity is None else None
 
 
-def make_message(sending: Sending, options: Outgoing) -> Any:
-    """The message of a fix that is not withheld."""
+def fix_message(report: FixReport, options: MavlinkOptions) -> Any:
+    """The MAVLink message of a fix that is not withheld."""
     if options.kind == "vision_position_estimate":
-        return _vision_position_estimate(sending, options.firmware)
+        return _vision_position_estimate(report, options.firmware)
     if options.kind == "odometry":
-        return _odometry(sending, options.firmware)
-    return _gps_input(sending) if options.kind == "gps_input" else _global_position_sensor(sending)
+        return _odometry(report, options.firmware)
+    return _gps_input(report) if options.kind == "gps_input" else _global_position_sensor(report)
 
 
 def heartbeat_message() -> Any:
-    """That the bridge is there: a companion computer, no autopilot."""
-    kind, nobody = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
-    return mavlink.MAVLink_heartbeat_message(kind, nobody, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
+    """Heartbeat of an onboard computer that is no autopilot."""
+    kind, no_autopilot = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+    return mavlink.MAVLink_heartbeat_message(kind, no_autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
 
 
-def timesync_message(now_ns: int, asked_ns: int | None = None) -> Any:
-    """A question for the time now, or the answer to one with the stamp ``asked_ns``."""
-    return mavlink.MAVLink_timesync_message(*((0, now_ns) if asked_ns is None else (now_ns, asked_ns)))
+def timesync_message(now_ns: int, request_ns: int | None = None) -> Any:
+    """A TIMESYNC request stamped ``now_ns``, or the response to the request stamped ``request_ns``."""
+    return mavlink.MAVLink_timesync_message(*((0, now_ns) if request_ns is None else (now_ns, request_ns)))
 
 
-def set_origin_message(system_id: int, origin: Origin, now_ns: int) -> Any:
-    """The origin for an autopilot that has none."""
+def set_origin_message(system_id: int, origin: NedOrigin, now_ns: int) -> Any:
+    """SET_GPS_GLOBAL_ORIGIN for an autopilot without an origin."""
     lat_1e7, lon_1e7 = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
     alt_mm = round(origin.alt_amsl_m * 1e3)
     return mavlink.MAVLink_set_gps_global_origin_message(system_id, lat_1e7, lon_1e7, alt_mm, now_ns // 1000)
 
 
 def command_message(system_id: int, command: int, *values: float) -> Any:
-    """A command to the autopilot, its other values 0."""
+    """COMMAND_LONG to the autopilot; missing parameters are 0."""
     padded = (*values, *(0.0,) * (7 - len(values)))
-    return mavlink.MAVLink_command_long_message(system_id, AUTOPILOT, command, 0, *padded)
+    return mavlink.MAVLink_command_long_message(system_id, AUTOPILOT_COMPONENT, command, 0, *padded)
 
 
 def pose_covariance(fix: Fix) -> list[float]:
-    """Upper triangle of the covariance of north, east, down, roll, pitch and yaw, row by row.
+    """Upper triangle, row by row, of the (6, 6) covariance of north, east, down, roll, pitch and yaw.
 
-    ArduPilot makes one scalar of the position's three variances. That of the height is of another sensor, and a
-    large one would drown the others: it is given the horizontal one.
+    ArduPilot combines the three position variances into one scalar. The height comes from another sensor, and a
+    large variance of it would dominate: it gets the horizontal one.
+
+    Returns:
+        21 values in m^2, rad^2 and their products.
     """
     c = fix.covariance_m2
     pose = np.zeros((6, 6))
@@ -207,68 +210,69 @@ def pose_covariance(fix: Fix) -> list[float]:
     return [float(v) for v in pose[np.triu_indices(6)]]
 
 
-def _angles(vehicle: Vehicle) -> tuple[float, float, float]:
+def _angles(vehicle: VehicleState) -> tuple[float, float, float]:
     """Roll, pitch and yaw in radians, yaw in [-pi, pi]."""
-    assert vehicle.roll_deg is not None  # why_withheld has looked
+    assert vehicle.roll_deg is not None  # checked by withhold_reason
     assert vehicle.pitch_deg is not None
     assert vehicle.heading_deg is not None
     yaw = math.remainder(math.radians(vehicle.heading_deg), 2.0 * math.pi)
     return math.radians(vehicle.roll_deg), math.radians(vehicle.pitch_deg), yaw
 
 
-def _ned(s: Sending, firmware: str) -> tuple[float, float, float]:
-    """About the origin; the height is the vehicle's own, since a map's height has another zero."""
-    assert s.origin is not None  # why_withheld has looked
-    assert s.vehicle.down_m is not None
-    return (*north_east_m(s.fix.lat_deg, s.fix.lon_deg, s.origin, firmware), s.vehicle.down_m)
+def _ned(report: FixReport, firmware: str) -> tuple[float, float, float]:
+    """North, east and down of the origin in metres; down is the vehicle's, since a map's datum differs."""
+    assert report.origin is not None  # checked by withhold_reason
+    assert report.vehicle.down_m is not None
+    return (*north_east_m(report.fix.lat_deg, report.fix.lon_deg, report.origin, firmware), report.vehicle.down_m)
 
 
-def _vision_position_estimate(s: Sending, firmware: str) -> Any:
+def _vision_position_estimate(report: FixReport, firmware: str) -> Any:
     return mavlink.MAVLink_vision_position_estimate_message(
-        s.captured_ns // 1000,
-        *_ned(s, firmware),
-        *_angles(s.vehicle),
-        pose_covariance(s.fix),
-        s.reset_counter,
+        report.captured_ns // 1000,
+        *_ned(report, firmware),
+        *_angles(report.vehicle),
+        pose_covariance(report.fix),
+        report.reset_counter,
     )
 
 
-def _odometry(s: Sending, firmware: str) -> Any:
-    # North is known, which PX4 calls NED; ArduPilot takes FRD only, and means the same.
+def _odometry(report: FixReport, firmware: str) -> Any:
+    # Aligned to north, which is NED for PX4; ArduPilot accepts only FRD, and reads it as NED.
     frame = mavlink.MAV_FRAME_LOCAL_FRD if firmware == "ardupilot" else mavlink.MAV_FRAME_LOCAL_NED
     nan = math.nan
-    velocity, spread = [nan, nan, nan], [nan] * 21
-    if s.velocity is not None:
-        velocity = _body_velocity(s.velocity, s.vehicle)
-        spread = [0.0] * 21
-        spread[0] = spread[6] = spread[11] = s.velocity.sigma_mps**2
+    velocity, covariance = [nan, nan, nan], [nan] * 21
+    if report.velocity is not None:
+        velocity = _body_velocity(report.velocity, report.vehicle)
+        covariance = [0.0] * 21
+        covariance[0] = covariance[6] = covariance[11] = report.velocity.sigma_mps**2
     return mavlink.MAVLink_odometry_message(
-        s.captured_ns // 1000,
+        report.captured_ns // 1000,
         frame,
         mavlink.MAV_FRAME_BODY_FRD,
-        *_ned(s, firmware),
-        _quaternion(*_angles(s.vehicle)),
+        *_ned(report, firmware),
+        _quaternion(*_angles(report.vehicle)),
         *velocity,
         *(nan, nan, nan),
-        pose_covariance(s.fix),
-        spread,
-        s.reset_counter,
+        pose_covariance(report.fix),
+        covariance,
+        report.reset_counter,
         mavlink.MAV_ESTIMATOR_TYPE_VISION,
-        0,  # quality unknown: the covariance says it
+        0,  # quality unknown: the covariance expresses it
     )
 
 
-def _body_velocity(velocity: Velocity, vehicle: Vehicle) -> list[float]:
-    assert vehicle.roll_deg is not None  # why_withheld has looked
+def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[float]:
+    """Velocity in m/s along the body's forward, right and down axes."""
+    assert vehicle.roll_deg is not None  # checked by withhold_reason
     assert vehicle.pitch_deg is not None
     assert vehicle.heading_deg is not None
     enu_mps = np.array([velocity.east_mps, velocity.north_mps, vehicle.up_velocity_mps or 0.0])
-    turn = enu_from_body(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg)
-    return [float(v) for v in turn.T @ enu_mps]
+    rotation = enu_from_body(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg)
+    return [float(v) for v in rotation.T @ enu_mps]
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
-    """w, x, y, z of the turn from the body to north-east-down."""
+    """Quaternion w, x, y, z that rotates the body to north-east-down; angles in radians."""
     cr, cp, cy = (math.cos(0.5 * v) for v in (roll, pitch, yaw))
     sr, sp, sy = (math.sin(0.5 * v) for v in (roll, pitch, yaw))
     return [
@@ -279,47 +283,47 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
     ]
 
 
-def _gps_input(s: Sending) -> Any:
-    assert s.velocity is not None  # why_withheld has looked
-    week, week_ms = divmod(s.unix_ns // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
-    alt_m, up_mps = s.vehicle.alt_amsl_m, s.vehicle.up_velocity_mps
+def _gps_input(report: FixReport) -> Any:
+    assert report.velocity is not None  # checked by withhold_reason
+    week, week_ms = divmod(report.unix_ns // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
+    alt_m, up_mps = report.vehicle.alt_amsl_m, report.vehicle.up_velocity_mps
     ignored = 0 if alt_m is not None else mavlink.GPS_INPUT_IGNORE_FLAG_ALT
     ignored |= 0 if up_mps is not None else mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
     return mavlink.MAVLink_gps_input_message(
-        s.captured_ns // 1000,
+        report.captured_ns // 1000,
         0,
         ignored,
         week_ms,
         week,
         3,  # a 3D fix
-        *_degrees_1e7(s.fix),
+        *_degrees_1e7(report.fix),
         alt_m or 0.0,
-        *(1.0, 1.0),  # dilution of precision, which checks look at; the accuracies say how good the fix is
-        s.velocity.north_mps,
-        s.velocity.east_mps,
+        *(1.0, 1.0),  # dilution of precision, which arming checks read; the accuracies carry the sigma
+        report.velocity.north_mps,
+        report.velocity.east_mps,
         -(up_mps or 0.0),
-        s.velocity.sigma_mps,
-        s.fix.sigma_m,
-        s.fix.sigma_m,
+        report.velocity.sigma_mps,
+        report.fix.sigma_m,
+        report.fix.sigma_m,
         _SATELLITES,
     )
 
 
-def _global_position_sensor(s: Sending) -> Any:
-    age_us = round(s.age_ms * 1000.0)
+def _global_position_sensor(report: FixReport) -> Any:
+    age_us = round(report.age_ms * 1000.0)
     return mavlink.MAVLink_global_position_sensor_message(
         0,
         0,
         SENSOR_ID,
-        # By MAVLink's definition this one stamp is of sending, and the time since the capture stands beside it.
-        s.captured_ns // 1000 + age_us,
+        # By MAVLink's definition this stamp is of sending; the time since capture is a field of its own.
+        report.captured_ns // 1000 + age_us,
         age_us,
         mavlink.GLOBAL_POSITION_SRC_VISION,
         0,
-        *_degrees_1e7(s.fix),
+        *_degrees_1e7(report.fix),
         math.nan,
-        math.nan,  # of a height the fix says nothing
-        s.fix.sigma_m,
+        math.nan,  # the fix has no height
+        report.fix.sigma_m,
         math.nan,
     )
 

@@ -1,4 +1,4 @@
-"""Packets: MAVLink out of anybody's bytes; what is malformed, wrongly signed or a stranger's is dropped."""
+"""MAVLink packets from untrusted bytes; malformed, wrongly signed and unrelated ones are dropped."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from engine.errors import OptionError
 
 V1, V2 = 0xFE, 0xFD
-AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
-BRIDGE = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
+BRIDGE_COMPONENT = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
-_MAX_BYTES = 65536  # of a stream that never makes a packet
-_MAX_FAILED = 64  # beginnings in a datagram that are none, after which the rest is noise: a flood must stay cheap
-_SIGNING_EPOCH_S = 1420070400  # 1 January 2015, from which signatures count
-_STREAM_AGE = 60 * 100_000  # how far behind our clock a new signed stream may begin, in 10 us
+_MAX_BUFFER_BYTES = 65536  # of a stream that never completes a packet
+_MAX_FAILED = 64  # false start bytes in a datagram after which the rest is discarded: a flood must stay cheap
+_SIGNING_EPOCH_S = 1420070400  # 1 January 2015, the epoch of signature time stamps
+_MAX_STREAM_AGE = 60 * 100_000  # of a new signed stream's first stamp, in units of 10 us
 
 
 def read_key(path: str | Path) -> bytes:
-    """The secret of MAVLink's signing: 32 bytes, or 64 hexadecimal digits, in a file.
+    """Read the key of MAVLink signing from a file: 32 bytes, or 64 hexadecimal digits.
 
     Raises:
-        OptionError: the file holds something else.
+        OptionError: the file has other content.
+        OSError: the file cannot be read.
     """
     content = Path(path).read_bytes()
     if len(content) == 32:
@@ -42,20 +43,20 @@ def read_key(path: str | Path) -> bytes:
 
 
 def signing_time() -> int:
-    """Now, as signatures count it: 10 microseconds since 2015."""
+    """Current time as signatures count it, in units of 10 us since 2015."""
     return max(0, int((time.time() - _SIGNING_EPOCH_S) * 1e5))
 
 
-class Encoder:
-    """Makes packets of messages, signed where there is a key.
+class PacketEncoder:
+    """Encodes messages as packets, signed where there is a key.
 
     Args:
-        system_id: of the vehicle, which the bridge is a part of.
-        key: the secret, or None.
+        system_id: MAVLink system id of the vehicle, of which the bridge is a component.
+        key: 32-byte signing key, or None.
     """
 
     def __init__(self, system_id: int, key: bytes | None = None) -> None:
-        self._mavlink: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=BRIDGE)
+        self._mavlink: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=BRIDGE_COMPONENT)
         if key is not None:
             self._mavlink.signing.secret_key = key
             self._mavlink.signing.sign_outgoing = True
@@ -63,33 +64,37 @@ class Encoder:
     def encode(self, message: Any) -> bytes:
         """The packet of a message."""
         signing = self._mavlink.signing
-        signing.timestamp = max(signing.timestamp, signing_time())  # pymavlink's own clock stands still
+        signing.timestamp = max(signing.timestamp, signing_time())  # pymavlink does not advance its own clock
         packet = bytes(message.pack(self._mavlink))
         self._mavlink.seq = (self._mavlink.seq + 1) % 256
         return packet
 
 
-class Decoder:
-    """Finds the messages of one autopilot among bytes.
+class PacketDecoder:
+    """Extracts the messages of one autopilot from bytes.
 
     Args:
-        system_id: whose messages are taken.
-        wanted: numbers of the messages that are taken.
+        system_id: MAVLink system id whose messages are kept.
+        message_ids: ids of the messages that are kept.
         is_stream: whether a packet may continue in the next bytes.
-        key: the secret; where it is given, what is not signed with it is dropped.
+        key: 32-byte signing key; where given, packets that are not signed with it are dropped.
+
+    Attributes:
+        dropped: number of malformed or wrongly signed packets so far.
     """
 
     def __init__(
-        self, system_id: int, wanted: frozenset[int], *, is_stream: bool, key: bytes | None = None
+        self, system_id: int, message_ids: frozenset[int], *, is_stream: bool, key: bytes | None = None
     ) -> None:
-        self._system_id, self._wanted, self._is_stream, self._key = system_id, wanted, is_stream, key
+        self._system_id, self._message_ids = system_id, message_ids
+        self._is_stream, self._key = is_stream, key
         self._mavlink: Any = mavlink.MAVLink(None)
         self._buffer = bytearray()
-        self._newest: dict[int, int] = {}  # of each signed stream, the time of its last packet
+        self._last_stamps: dict[int, int] = {}  # by signing link id
         self.dropped = 0
 
     def feed(self, data: bytes) -> list[Any]:
-        """The messages that these bytes complete."""
+        """Add bytes; returns the messages that they complete."""
         self._buffer += data
         messages: list[Any] = []
         at = failed = 0
@@ -99,7 +104,7 @@ class Decoder:
                 if size is not None and not self._is_stream:
                     at += 1
                     continue
-                break  # the rest is still to come
+                break  # the rest has not arrived yet
             packet = bytes(self._buffer[at : at + size])
             message = self._decode(packet)
             if message is None:
@@ -107,26 +112,26 @@ class Decoder:
                 failed += 1
                 if failed > _MAX_FAILED and not self._is_stream:
                     break
-                at += 1  # no packet begins here, or none of which anybody knows where it ends
+                at += 1  # no packet begins here, or one of unknown length
                 continue
             at += size
-            if self._is_wanted(packet):
+            if self._is_addressed(packet):
                 if self._key is None or self._is_signed(packet, self._key):
                     messages.append(message)
                 else:
                     self.dropped += 1
         del self._buffer[: at if self._is_stream else None]
-        if len(self._buffer) > _MAX_BYTES:
+        if len(self._buffer) > _MAX_BUFFER_BYTES:
             self._buffer.clear()
         return messages
 
     def _start(self, at: int) -> int:
-        """The next byte that may begin a packet."""
+        """Offset of the next byte that may begin a packet."""
         found = [i for i in (self._buffer.find(V2, at), self._buffer.find(V1, at)) if i >= 0]
         return min(found, default=len(self._buffer))
 
     def _size(self, at: int) -> int | None:
-        """Length of the packet that begins here; None where too little of it has come."""
+        """Length in bytes of the packet that begins here; None where its header is incomplete."""
         if at + 3 > len(self._buffer):
             return None
         payload = self._buffer[at + 1]
@@ -134,35 +139,35 @@ class Decoder:
             return 8 + payload
         return 12 + payload + (_SIGNATURE_BYTES if self._buffer[at + 2] & _SIGNED else 0)
 
-    def _is_wanted(self, packet: bytes) -> bool:
+    def _is_addressed(self, packet: bytes) -> bool:
         if packet[0] == V1:
             system, component, number = packet[3], packet[4], packet[5]
         else:
             system, component, number = packet[5], packet[6], int.from_bytes(packet[7:10], "little")
-        return (system, component) == (self._system_id, AUTOPILOT) and number in self._wanted
+        return (system, component) == (self._system_id, AUTOPILOT_COMPONENT) and number in self._message_ids
 
     def _decode(self, packet: bytes) -> Any:
-        """The message, or None where the packet is not sound or its kind unknown."""
+        """The message, or None where the packet is invalid or its type unknown."""
         if packet[0] == V2 and packet[2] & ~_SIGNED:
-            return None  # flags that must be understood and are not
+            return None  # incompatibility flags that this decoder does not support
         try:
             message = self._mavlink.decode(bytearray(packet))
-        except Exception:  # the bytes are anybody's: whatever the decoder says of them, they are no message
+        except Exception:  # untrusted bytes: whatever the decoder raises, they are no message
             return None
         return None if isinstance(message, mavlink.MAVLink_unknown) else message
 
     def _is_signed(self, packet: bytes, key: bytes) -> bool:
-        """Whether the signature is right, and not one that was seen before.
+        """Whether the signature is valid and newer than the last one of its stream.
 
-        pymavlink notes a packet's time before it has looked at the signature, so that a forged one would silence
-        the stream; here the signature comes first.
+        pymavlink stores a packet's time stamp before it checks the signature, so that a forged packet could block
+        the stream; here the signature is checked first.
         """
         if packet[0] != V2 or not packet[2] & _SIGNED:
             return False
         if not hmac.compare_digest(hashlib.sha256(key + packet[:-6]).digest()[:6], packet[-6:]):
             return False
-        stream, stamp = packet[-13], int.from_bytes(packet[-12:-6], "little")
-        if stamp <= self._newest.get(stream, signing_time() - _STREAM_AGE):
+        link_id, stamp = packet[-13], int.from_bytes(packet[-12:-6], "little")
+        if stamp <= self._last_stamps.get(link_id, signing_time() - _MAX_STREAM_AGE):
             return False
-        self._newest[stream] = stamp
+        self._last_stamps[link_id] = stamp
         return True

@@ -1,15 +1,15 @@
-"""Parameter files that tell an autopilot to fly by the bridge's fixes: ArduPilot's and PX4's."""
+"""Parameter files that configure ArduPilot and PX4 to use the bridge's fixes."""
 
 from __future__ import annotations
 
 from engine.errors import OptionError
 
 MAX_DELAY_MS = 250.0
-"""The most that ArduPilot's VISO_DELAY_MS takes."""
+"""Upper bound of ArduPilot's VISO_DELAY_MS."""
 
-_INT, _FLOAT = 6, 9  # MAVLink's types, as QGroundControl writes them
+_INT, _FLOAT = 6, 9  # MAV_PARAM_TYPE, as QGroundControl writes it
 Parameter = tuple[str, float, str]
-"""Name, value, why."""
+"""Name, value, purpose."""
 
 
 def parameter_file(firmware: str, message: str, *, delay_ms: int, max_sigma_m: float) -> str:
@@ -17,9 +17,9 @@ def parameter_file(firmware: str, message: str, *, delay_ms: int, max_sigma_m: f
 
     Args:
         firmware: ardupilot or px4.
-        message: what the bridge sends.
-        delay_ms: from capture to arrival at the autopilot.
-        max_sigma_m: a fix worse than this is not sent.
+        message: the message that the bridge sends.
+        delay_ms: time from capture to arrival at the autopilot.
+        max_sigma_m: upper bound of the sigma of the fixes that are sent.
 
     Raises:
         OptionError: the delay is out of range.

@@ -1,4 +1,4 @@
-"""Pictures as they are captured: by a camera or stream, or by a flight that is played at its own pace."""
+"""Images with their capture times: from a camera or stream, or from a recorded flight replayed in real time."""
 
 from __future__ import annotations
 
@@ -11,25 +11,30 @@ from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.formats.flight import open_flight
-from engine.formats.telemetry import shown
+from engine.formats.tables import quoted
 
-Picture = tuple[NDArray[np.uint8], int]
-"""(H, W, 3) RGB, and when it was captured on ``time.monotonic_ns``."""
+__all__ = ["CapturedImage", "capture", "replay"]
+
+CapturedImage = tuple[NDArray[np.uint8], int]
+"""Image (H, W, 3) RGB uint8, and its capture time on ``time.monotonic_ns``."""
 
 
 def replay(
     frames: Path, telemetry: Path | None, *, rate_hz: float, wait: Callable[[], None] | None = None
-) -> Iterator[Picture]:
-    """A folder or video again, each picture when its turn has come.
+) -> Iterator[CapturedImage]:
+    """Replay a folder of images or a video in real time.
 
     Args:
-        frames: pictures or video.
-        telemetry: telemetry.csv, whose stamps set the pace; without it ``rate_hz`` does.
-        rate_hz: pictures a second where there are no stamps.
-        wait: called when the first picture is at hand; the pace begins when it returns.
+        frames: folder of images, or video.
+        telemetry: telemetry.csv, whose stamps set the pace; None uses ``rate_hz``.
+        rate_hz: images per second where there are no stamps.
+        wait: called when the first image has been read; the replay starts when it returns.
+
+    Yields:
+        :data:`CapturedImage`, each at its time.
 
     Raises:
-        TelemetryError: it cannot be read.
+        TelemetryError: an image or the telemetry cannot be read.
     """
     begin_ns, first_ns = 0, 0
     for index, item in enumerate(open_flight(frames, telemetry)):
@@ -45,25 +50,28 @@ def replay(
         yield np.asarray(item.frame.image, np.uint8), captured_ns
 
 
-def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Iterator[Picture]:
-    """A camera by its number, or a stream by its URL or pipeline, until it ends.
+def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Iterator[CapturedImage]:
+    """Capture images from a camera or stream until it ends.
 
     Args:
-        source: a number, or what ``cv2.VideoCapture`` opens.
-        exposure_to_grab_ms: how much earlier than its arrival here a picture was exposed; a camera's own figure.
+        source: number of a camera, or a URL or pipeline that ``cv2.VideoCapture`` opens.
+        exposure_to_grab_ms: time from exposure to arrival, a property of the camera.
+
+    Yields:
+        :data:`CapturedImage` as they arrive.
 
     Raises:
-        TelemetryError: it cannot be opened.
+        TelemetryError: the camera or stream cannot be opened.
     """
     import cv2
 
     try:
         camera = cv2.VideoCapture(int(source) if source.isdecimal() else source)
         opened = camera.isOpened()
-    except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python takes
+    except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python accepts
         opened = False
     if not opened:
-        raise TelemetryError(f"camera_source: expected a camera or stream that opens, got {shown(source)}")
+        raise TelemetryError(f"camera_source: expected a camera or stream that opens, got {quoted(source)}")
     camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     try:
         while camera.grab():

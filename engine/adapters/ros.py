@@ -1,7 +1,7 @@
-"""The core of the ROS nodes: pictures and telemetry into the engine, poses, fixes and diagnostics out of it.
+"""The ROS bridge: images and telemetry go into the engine, poses, fixes and diagnostics come out.
 
-Knows no ROS but by the fields of its messages: ros1.py and ros2.py carry them. A pose never travels without its
-covariance, and a refusal is never one: it is told in the diagnostics. Stamps are of capture.
+Imports no ROS: it accesses only the fields of messages, which ros1.py and ros2.py transport. A pose is never
+published without its covariance; a refusal is published in the diagnostics only. Stamps are of capture.
 """
 
 from __future__ import annotations
@@ -16,14 +16,22 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from engine.adapters.ros_out import RosOptions, diagnostics, is_finite, pose, window_picture
-from engine.adapters.vehicle import ANGLES, RecentValues, Vehicle, only
+from engine.adapters.vehicle import ANGLES, RecentValues, VehicleState, scalar
 from engine.errors import EngineError
 from engine.formats.ros import bags
-from engine.formats.ros.messages import MessageFactory, attitude_of, picture_of, range_of, stamp_ns
+from engine.formats.ros.messages import (
+    MessageFactory,
+    attitude_from_message,
+    image_from_message,
+    range_from_message,
+    stamp_ns,
+)
 from engine.live import Answer, Counts, Live, LiveOptions
 from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Prior
+
+__all__ = ["RosBridge", "RosNode", "RosOptions", "RosStatus", "RosTopics"]
 
 OUTPUTS = {
     "pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -31,50 +39,54 @@ OUTPUTS = {
     "window": "sensor_msgs/msg/Image",
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
-"""What is published."""
+"""Message type of each topic that is published."""
 
-_BACK_NS = 1_000_000_000  # a stamp so much older than the last: a simulator or a bag began again
-_SILENT_S = 2.0  # without a picture, after which the diagnostics say so
+_RESTART_NS = 1_000_000_000  # a stamp that much older than the last: a simulator or a bag was restarted
+_MAX_SILENCE_S = 2.0  # without an image, before the diagnostics report it
 _OK, _WARN, _ERROR = 0, 1, 2
 
 Handler = Callable[[Any], None]
 
 
 class RosNode(Protocol):
-    """What a node of either ROS does for the bridge."""
+    """A node of ROS 1 or ROS 2, as the bridge uses it.
 
-    maker: MessageFactory
+    Attributes:
+        messages: constructs the messages of this ROS.
+    """
+
+    messages: MessageFactory
 
     def now_ns(self) -> int:
-        """The time of ROS, simulated where it is."""
+        """ROS time in nanoseconds, simulated where the node is so configured."""
 
     def wait_for(self, topic: str, msgtype: str, timeout_s: float) -> Any:
-        """The next message of a topic; None after the timeout."""
+        """Wait for the next message of a topic; None after the timeout."""
 
     def publish(self, output: str, message: Any) -> None:
         """Publish a message of one of :data:`OUTPUTS`."""
 
-    def is_wanted(self, output: str) -> bool:
-        """Whether anybody subscribes to it."""
+    def has_subscribers(self, output: str) -> bool:
+        """Whether a topic of :data:`OUTPUTS` has subscribers."""
 
     def spin(
-        self, handlers: dict[str, tuple[str, Handler]], beat: Callable[[], None], seconds: float | None
+        self, handlers: dict[str, tuple[str, Handler]], every_second: Callable[[], None], seconds: float | None
     ) -> None:
-        """Subscribe, and call ``beat`` every second until the end."""
+        """Subscribe to the topics and call ``every_second`` once a second until shutdown, or for ``seconds``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Topics:
-    """What is subscribed to; an empty name leaves it out.
+class RosTopics:
+    """Names of the topics that the bridge subscribes to; an empty name disables one.
 
     Attributes:
         image: sensor_msgs/Image.
-        camera_info: sensor_msgs/CameraInfo, where no calibration was given.
+        camera_info: sensor_msgs/CameraInfo, used where no calibration file is given.
         imu: sensor_msgs/Imu, whose orientation is the attitude.
-        compass: std_msgs/Float64, degrees clockwise from north; heard, it outranks the Imu's heading.
+        compass: std_msgs/Float64, degrees clockwise from north; takes precedence over the heading of the Imu.
         height: std_msgs/Float64, metres above take-off.
-        range: sensor_msgs/Range, along the body's down axis; heard, it outranks the height.
-        velocity: geometry_msgs/TwistStamped, east and north in metres a second.
+        range: sensor_msgs/Range along the body's down axis; takes precedence over the height.
+        velocity: geometry_msgs/TwistStamped, east and north in m/s.
     """
 
     image: str = bags.IMAGE
@@ -88,14 +100,14 @@ class Topics:
 
 @dataclass(frozen=True, slots=True)
 class RosStatus:
-    """What a node did so far.
+    """Counters of a ROS bridge since it was created.
 
     Attributes:
-        counts: of the pictures.
-        fixes: that were published.
-        refused: frames without a fix, by reason.
-        unusable: pictures that could not be read.
-        restarts: how often the time went back, and everything began again.
+        counts: of the images submitted, dropped and answered.
+        fixes: number of fixes published.
+        refused: number of frames without a fix, by reason.
+        unusable: number of images that could not be read or came out of order.
+        restarts: number of times that ROS time went back and the bridge started over.
     """
 
     counts: Counts
@@ -106,7 +118,7 @@ class RosStatus:
 
 
 class RosTelemetry:
-    """What the topics said lately, on the time of ROS. May be read from another thread than those that fill it."""
+    """Recent telemetry on ROS time. May be read from another thread than those that update it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -114,43 +126,43 @@ class RosTelemetry:
         self._range, self._height = RecentValues(), RecentValues()
 
     def imu(self, message: Any) -> None:
-        """Take a sensor_msgs/Imu."""
-        attitude = attitude_of(message)
+        """Store the attitude of a sensor_msgs/Imu."""
+        attitude = attitude_from_message(message)
         if attitude is not None:
             self._add(self._attitude, stamp_ns(message), *attitude)
 
     def compass(self, heading_deg: float, now_ns: int) -> None:
-        """Take a heading that came without a stamp."""
+        """Store a heading that has no stamp."""
         self._add(self._compass, now_ns, heading_deg)
 
     def height(self, height_m: float, now_ns: int) -> None:
-        """Take a height above take-off that came without a stamp."""
+        """Store a height above take-off that has no stamp."""
         self._add(self._height, now_ns, height_m)
 
     def range(self, message: Any) -> None:
-        """Take a sensor_msgs/Range."""
-        range_m = range_of(message)
+        """Store the distance of a sensor_msgs/Range."""
+        range_m = range_from_message(message)
         if range_m is not None:
             self._add(self._range, stamp_ns(message), range_m)
 
     def velocity(self, message: Any) -> None:
-        """Take a geometry_msgs/TwistStamped in east-north-up."""
+        """Store the velocity of a geometry_msgs/TwistStamped in east-north-up."""
         linear = message.twist.linear
         self._add(self._velocity, stamp_ns(message), linear.x, linear.y)
 
-    def vehicle(self, time_ns: int) -> Vehicle:
-        """What the vehicle knew at a moment."""
+    def vehicle(self, time_ns: int) -> VehicleState:
+        """The vehicle state at a ROS time; what is not known is None."""
         with self._lock:
             roll_deg, pitch_deg, yaw_deg = self._attitude.at(time_ns) or (None, None, None)
-            heading_deg = only(self._compass.at(time_ns))
+            heading_deg = scalar(self._compass.at(time_ns))
             heading_deg = yaw_deg if heading_deg is None else heading_deg
             east_mps, north_mps = self._velocity.at(time_ns) or (None, None)
-            slant_m, height_m = only(self._range.at(time_ns)), only(self._height.at(time_ns))
+            slant_m, height_m = scalar(self._range.at(time_ns)), scalar(self._height.at(time_ns))
         above_m = height_m
-        if slant_m is not None:  # the beam is fixed to the body
-            lean = math.cos(math.radians(roll_deg or 0.0)) * math.cos(math.radians(pitch_deg or 0.0))
-            above_m = slant_m * lean
-        return Vehicle(
+        if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
+            cos_tilt = math.cos(math.radians(roll_deg or 0.0)) * math.cos(math.radians(pitch_deg or 0.0))
+            above_m = slant_m * cos_tilt
+        return VehicleState(
             roll_deg=roll_deg,
             pitch_deg=pitch_deg,
             heading_deg=None if heading_deg is None else heading_deg % 360.0 % 360.0,
@@ -162,22 +174,22 @@ class RosTelemetry:
 
     def _add(self, series: RecentValues, time_ns: int, *values: float) -> None:
         with self._lock:
-            if series.last_ns is not None and time_ns < series.last_ns - _BACK_NS:
+            if series.last_ns is not None and time_ns < series.last_ns - _RESTART_NS:
                 series.clear()
             series.add(time_ns, *values)
 
 
 class RosBridge:
-    """Between the topics of one vehicle and one navigator.
+    """Connects the topics of one vehicle to one navigator.
 
     Args:
-        node: publishes, and knows the time.
+        node: publishes messages and gives the time.
         site: the map.
-        make_navigator: as of :class:`engine.live.Live`.
-        options: how fixes are told.
-        start: where the flight begins.
+        make_navigator: as in :class:`engine.live.Live`.
+        options: frame and origin of the poses.
+        start: prior position at the start of the flight.
         live: deadlines of the frames.
-        watch: is told every answer, and must not take long; None tells nobody.
+        watch: called with every answer; must return quickly.
     """
 
     def __init__(
@@ -197,76 +209,76 @@ class RosBridge:
         self._make_navigator, self._live_options = make_navigator, live
         self._live = Live(make_navigator, self.deliver, start, live)
         self._last_ns: int | None = None
-        self._pictured_s = time.monotonic()
+        self._last_image_s = time.monotonic()
         self._fixes = self._unusable = self._restarts = 0
         self._refused: Counter[str] = Counter()
-        self._before = Counts()  # of pipelines that were replaced
+        self._counts_before = Counts()  # of pipelines that have been replaced
 
     def close(self) -> None:
-        """Answer the frame in work."""
+        """Answer the frame in progress and stop."""
         self._live.close()
 
     @property
     def status(self) -> RosStatus:
-        """What was done so far."""
-        now, before = self._live.counts, self._before
+        """Counters since the bridge was created."""
+        now, before = self._live.counts, self._counts_before
         counts = Counts(**{name: getattr(now, name) + getattr(before, name) for name in Counts.__slots__})
         return RosStatus(counts, self._fixes, dict(self._refused), self._unusable, self._restarts)
 
-    def handlers(self, topics: Topics) -> dict[str, tuple[str, Handler]]:
-        """Type and handler of every topic that is subscribed to."""
-        heard, now_ns = self.telemetry, self._node.now_ns
-        every: dict[str, tuple[str, Handler]] = {
+    def handlers(self, topics: RosTopics) -> dict[str, tuple[str, Handler]]:
+        """Type and handler of every topic to subscribe to, by name."""
+        telemetry, now_ns = self.telemetry, self._node.now_ns
+        handlers: dict[str, tuple[str, Handler]] = {
             topics.image: ("sensor_msgs/msg/Image", self.on_image),
-            topics.imu: ("sensor_msgs/msg/Imu", heard.imu),
-            topics.compass: ("std_msgs/msg/Float64", lambda m: heard.compass(m.data, now_ns())),
-            topics.height: ("std_msgs/msg/Float64", lambda m: heard.height(m.data, now_ns())),
-            topics.range: ("sensor_msgs/msg/Range", heard.range),
-            topics.velocity: ("geometry_msgs/msg/TwistStamped", heard.velocity),
+            topics.imu: ("sensor_msgs/msg/Imu", telemetry.imu),
+            topics.compass: ("std_msgs/msg/Float64", lambda m: telemetry.compass(m.data, now_ns())),
+            topics.height: ("std_msgs/msg/Float64", lambda m: telemetry.height(m.data, now_ns())),
+            topics.range: ("sensor_msgs/msg/Range", telemetry.range),
+            topics.velocity: ("geometry_msgs/msg/TwistStamped", telemetry.velocity),
         }
-        return {name: known for name, known in every.items() if name}
+        return {name: handler for name, handler in handlers.items() if name}
 
     def on_image(self, message: Any) -> None:
-        """Take the newest picture; one without a stamp counts as captured now."""
+        """Submit the newest sensor_msgs/Image; one without a stamp counts as captured now."""
         now_ns = self._node.now_ns()
         captured_ns = stamp_ns(message) or now_ns
-        self._pictured_s = time.monotonic()
-        if self._last_ns is not None and captured_ns < self._last_ns - _BACK_NS:
-            self._begin_again()
+        self._last_image_s = time.monotonic()
+        if self._last_ns is not None and captured_ns < self._last_ns - _RESTART_NS:
+            self._restart()
         if self._last_ns is not None and captured_ns <= self._last_ns:
             self._unusable += 1
             return
         try:
-            frame = self.telemetry.vehicle(captured_ns).frame(picture_of(message), captured_ns)
+            frame = self.telemetry.vehicle(captured_ns).frame(image_from_message(message), captured_ns)
         except EngineError as error:
             self._unusable += 1
             self._diagnose(captured_ns, _ERROR, str(error), {})
             return
         self._last_ns = captured_ns
-        age_ns = max(now_ns - captured_ns, 0)  # a stamp ahead of the clock is taken as now
+        age_ns = max(now_ns - captured_ns, 0)  # a stamp ahead of the clock counts as now
         self._live.submit(frame, captured_ns=time.monotonic_ns() - age_ns)
 
-    def _begin_again(self) -> None:
-        """The time went back: another run of a simulator, or a bag from its beginning."""
+    def _restart(self) -> None:
+        """Start over, since the time went back: another run of a simulator, or a bag from its beginning."""
         self._live.close()
-        self._before = self.status.counts
+        self._counts_before = self.status.counts
         self._restarts += 1
         self._live = Live(self._make_navigator, self.deliver, self._start, self._live_options)
         self._last_ns = None
 
     def deliver(self, answer: Answer) -> None:
-        """Publish what became of a frame."""
+        """Publish the answer to a frame."""
         captured_ns, result = answer.frame.timestamp_ns, answer.result
-        assert captured_ns is not None  # on_image has stamped it
+        assert captured_ns is not None  # set by on_image
         values = {"method": result.method or "", "age_ms": f"{answer.age_ms:.1f}"}
         if result.score is not None:
             values["score"] = f"{result.score:.3f}"
         if isinstance(result, Fix) and is_finite(result):
             vehicle = self.telemetry.vehicle(captured_ns)
-            make = self._node.maker
-            self._node.publish("pose", pose(make, result, vehicle, captured_ns, self._site, self._options))
-            place = result.lat_deg, result.lon_deg, result.covariance_m2
-            self._node.publish("fix", make.position(captured_ns, "base_link", *place))
+            messages = self._node.messages
+            self._node.publish("pose", pose(messages, result, vehicle, captured_ns, self._site, self._options))
+            position = result.lat_deg, result.lon_deg, result.covariance_m2
+            self._node.publish("fix", messages.position(captured_ns, "base_link", *position))
             self._fixes += 1
             values["sigma_m"] = f"{result.sigma_m:.2f}"
             self._diagnose(captured_ns, _OK, "fix", values)
@@ -276,26 +288,28 @@ class RosBridge:
             self._refused[reason] += 1
             values |= {"reason": reason, "detail": "" if refusal is None else refusal.detail}
             self._diagnose(captured_ns, _WARN, f"no fix: {reason}", values)
-        if result.window is not None and self._node.is_wanted("window"):
-            shown = window_picture(self._site, result.window, result if isinstance(result, Fix) else None)
-            self._node.publish("window", self._node.maker.image(captured_ns, self._options.frame_id, shown))
+        if result.window is not None and self._node.has_subscribers("window"):
+            crop = window_picture(self._site, result.window, result if isinstance(result, Fix) else None)
+            self._node.publish("window", self._node.messages.image(captured_ns, self._options.frame_id, crop))
         if self._watch is not None:
             self._watch(answer)
 
-    def beat(self) -> None:
-        """Once a second: say so where no pictures come."""
-        silent_s = time.monotonic() - self._pictured_s
-        if silent_s > _SILENT_S:
-            self._diagnose(self._node.now_ns(), _ERROR, f"no picture for {silent_s:.0f} s", {})
+    def check_input(self) -> None:
+        """Publish an error where no images arrive; to be called once a second."""
+        silence_s = time.monotonic() - self._last_image_s
+        if silence_s > _MAX_SILENCE_S:
+            self._diagnose(self._node.now_ns(), _ERROR, f"no picture for {silence_s:.0f} s", {})
 
     def _diagnose(self, time_ns: int, level: int, text: str, values: dict[str, str]) -> None:
         status = self.status
-        counted = {name: str(count) for name, count in asdict(status.counts).items()}
-        counted |= {"fixes": str(status.fixes), "unusable": str(status.unusable)}
-        self._node.publish("diagnostics", diagnostics(self._node.maker, time_ns, level, text, values | counted))
+        counters = {name: str(count) for name, count in asdict(status.counts).items()}
+        counters |= {"fixes": str(status.fixes), "unusable": str(status.unusable)}
+        self._node.publish(
+            "diagnostics", diagnostics(self._node.messages, time_ns, level, text, values | counters)
+        )
 
 
 def find_class(name: str) -> Any:
-    """The class of a name such as "sensor_msgs/msg/Image", out of rospy's or rclpy's message packages."""
+    """The message class of a name such as "sensor_msgs/msg/Image", imported from ROS."""
     package, _, kind = name.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), kind)

@@ -1,4 +1,4 @@
-"""The ROS 2 node: rclpy's topics to and from the bridge. On loopback, unless the environment says else."""
+"""The ROS 2 node of the bridge, by rclpy. On loopback, unless the environment sets otherwise."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from engine.adapters.ros import OUTPUTS, Handler, find_class
 from engine.errors import BackendError
 from engine.formats.ros.messages import MessageFactory
 
+__all__ = ["Node"]
+
 _LOOPBACK = {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}  # up to Humble; from Iron on
 
 
@@ -19,7 +21,7 @@ class Node:
     """A node; implements :class:`engine.adapters.ros.RosNode`.
 
     Args:
-        name: of the node, under which it publishes.
+        name: name of the node, the prefix of its topics.
 
     Raises:
         BackendError: rclpy is not installed.
@@ -34,9 +36,9 @@ class Node:
         except ImportError as error:
             raise BackendError(f"bridge: expected rclpy to be importable (see docs/ros.md): {error}") from None
         rclpy.init()
-        self._rclpy, self._quality = rclpy, qos_profile_sensor_data
+        self._rclpy, self._qos = rclpy, qos_profile_sensor_data
         self._node = rclpy.create_node(name)
-        self.maker = MessageFactory(
+        self.messages = MessageFactory(
             find_class,
             False,
             octets=lambda values: array.array("B", values.tobytes()),  # a list would be checked byte by byte
@@ -48,41 +50,41 @@ class Node:
         }
 
     def now_ns(self) -> int:
-        """The time of ROS, simulated where it is."""
+        """ROS time in nanoseconds, simulated where the node is so configured."""
         return int(self._node.get_clock().now().nanoseconds)
 
     def wait_for(self, topic: str, msgtype: str, timeout_s: float) -> Any:
-        """The next message of a topic; None after the timeout."""
-        found: list[Any] = []
-        subscription = self._node.create_subscription(find_class(msgtype), topic, found.append, self._quality)
+        """Wait for the next message of a topic; None after the timeout."""
+        received: list[Any] = []
+        subscription = self._node.create_subscription(find_class(msgtype), topic, received.append, self._qos)
         end_s = time.monotonic() + timeout_s
-        while not found and self._rclpy.ok() and time.monotonic() < end_s:
+        while not received and self._rclpy.ok() and time.monotonic() < end_s:
             self._rclpy.spin_once(self._node, timeout_sec=0.2)
         self._node.destroy_subscription(subscription)
-        return found[0] if found else None
+        return received[0] if received else None
 
     def publish(self, output: str, message: Any) -> None:
-        """Publish a message; after the end of the node it goes nowhere."""
+        """Publish a message; after shutdown it is discarded."""
         if self._rclpy.ok():
             self._publishers[output].publish(message)
 
-    def is_wanted(self, output: str) -> bool:
-        """Whether anybody subscribes to it."""
+    def has_subscribers(self, output: str) -> bool:
+        """Whether the topic has subscribers."""
         return bool(self._publishers[output].get_subscription_count())
 
     def spin(
-        self, handlers: dict[str, tuple[str, Handler]], beat: Callable[[], None], seconds: float | None
+        self, handlers: dict[str, tuple[str, Handler]], every_second: Callable[[], None], seconds: float | None
     ) -> None:
-        """Subscribe, and call ``beat`` every second until the node is shut down or the time is over."""
+        """Subscribe, and call ``every_second`` once a second until shutdown or for ``seconds``."""
         for topic, (msgtype, handler) in handlers.items():
-            # Best effort, the newest few: it hears reliable publishers as well, and never waits for an old one.
-            self._node.create_subscription(find_class(msgtype), topic, handler, self._quality)
-        begin_s = beaten_s = time.monotonic()
+            # Best effort with a short queue also hears reliable publishers, and never waits for old messages.
+            self._node.create_subscription(find_class(msgtype), topic, handler, self._qos)
+        begin_s = called_s = time.monotonic()
         while self._rclpy.ok() and (seconds is None or time.monotonic() - begin_s < seconds):
             self._rclpy.spin_once(self._node, timeout_sec=0.2)
-            if time.monotonic() - beaten_s >= 1.0:
-                beaten_s = time.monotonic()
-                beat()
+            if time.monotonic() - called_s >= 1.0:
+                called_s = time.monotonic()
+                every_second()
 
 
 def _topic(output: str) -> str:

@@ -1,4 +1,4 @@
-"""The vehicle as every bridge knows it: what it said of the moment of a capture, and where its metres begin."""
+"""The vehicle state that all bridges share, interpolated at capture times, and the firmwares' projections."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ from numpy.typing import NDArray
 
 from engine.values import Frame
 
-ANGLES = (True, True, True)
-"""Roll, pitch and heading, as :class:`RecentValues` takes them."""
-ANGLE_VARIANCE = math.radians(10.0) ** 2
-"""Square radians that an attitude is sent with: it is the vehicle's own, and nothing to learn from."""
+__all__ = ["NedOrigin", "VehicleState", "north_east_m"]
 
-_STALE_NS = 500_000_000  # further from its neighbour than this a capture is not described by it
-_KEPT = 128  # samples of each series
+ANGLES = (True, True, True)
+"""Roll, pitch and heading are all angles, see :class:`RecentValues`."""
+ANGLE_VARIANCE = math.radians(10.0) ** 2
+"""Variance in rad^2 of the attitude that is sent: large, since it is the vehicle's own estimate."""
+
+_STALE_NS = 500_000_000  # largest distance of a sample in time from a capture that it describes
+_MAX_SAMPLES = 128  # of each quantity
 _ARDUPILOT_M_PER_1E7_DEG = 0.011131884502145034
 _PX4_EARTH_M = 6371000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
-    """Where the autopilot's NED begins."""
+class NedOrigin:
+    """Origin of the autopilot's north-east-down frame, in WGS84 degrees and metres above mean sea level."""
 
     lat_deg: float
     lon_deg: float
@@ -32,15 +34,20 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Vehicle:
-    """What the vehicle knew at one moment; None where it did not say.
+class VehicleState:
+    """State of the vehicle at one time; what is not known is None.
 
     Attributes:
-        height_agl_m: by the rangefinder, else the distance to the ground that the autopilot states, else the
-            height above home.
-        alt_amsl_m: height above mean sea level.
-        down_m: below the autopilot's origin.
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+        heading_deg: clockwise from true north in [0, 360).
+        east_velocity_mps: velocity over ground.
+        north_velocity_mps: velocity over ground.
         up_velocity_mps: positive in a climb.
+        height_agl_m: height above the ground by the rangefinder, else the clearance that the autopilot reports,
+            else the height above home.
+        alt_amsl_m: height above mean sea level.
+        down_m: distance below the autopilot's origin.
     """
 
     roll_deg: float | None = None
@@ -54,7 +61,7 @@ class Vehicle:
     down_m: float | None = None
 
     def frame(self, image: NDArray[np.uint8], captured_ns: int) -> Frame:
-        """The frame of a picture that was taken at this moment."""
+        """The frame of an image (H, W, 3) or (H, W) uint8 that was captured at this time."""
         return Frame(
             image,
             captured_ns,
@@ -68,33 +75,33 @@ class Vehicle:
 
 
 class RecentValues:
-    """Values over time, the newest few.
+    """Ring buffer of the newest samples of one quantity, interpolated in time.
 
     Args:
-        angles: which of the values are degrees and go the shorter way round; empty for none.
+        angles: which of the values are angles in degrees, interpolated along the shorter arc; empty for none.
     """
 
     def __init__(self, angles: tuple[bool, ...] = ()) -> None:
         self._angles = angles
-        self._samples: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_KEPT)
+        self._samples: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MAX_SAMPLES)
 
     def add(self, time_ns: int, *values: float) -> None:
-        """One more sample; dropped where it is not finite or not newer than the last."""
+        """Add a sample; it is dropped where it is not finite or not newer than the last."""
         newer = not self._samples or time_ns > self._samples[-1][0]
         if newer and all(map(math.isfinite, values)):
             self._samples.append((time_ns, values))
 
     @property
     def last_ns(self) -> int | None:
-        """When the newest sample was taken; None where there is none."""
+        """Time of the newest sample; None where there is none."""
         return self._samples[-1][0] if self._samples else None
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Discard all samples."""
         self._samples.clear()
 
     def at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The values at a moment, interpolated; the nearest where one side is missing, None where it is stale."""
+        """Values interpolated at a time; the nearest sample where one side is missing, None beyond 0.5 s."""
         before = next((s for s in reversed(self._samples) if s[0] <= time_ns), None)
         after = next((s for s in self._samples if s[0] >= time_ns), None)
         near = [s for s in (before, after) if s is not None and abs(s[0] - time_ns) <= _STALE_NS]
@@ -107,16 +114,25 @@ class RecentValues:
         return tuple(a + share * d for a, d in zip(first, steps, strict=True))
 
 
-def only(values: tuple[float, ...] | None) -> float | None:
-    """The one value of a series at a moment."""
+def scalar(values: tuple[float, ...] | None) -> float | None:
+    """The value of a one-dimensional sample; None stays None."""
     return None if values is None else values[0]
 
 
-def north_east_m(lat_deg: float, lon_deg: float, origin: Origin, firmware: str) -> tuple[float, float]:
-    """North and east of the origin in the firmware's own projection, so that it finds the latitude again.
+def north_east_m(lat_deg: float, lon_deg: float, origin: NedOrigin, firmware: str) -> tuple[float, float]:
+    """Project a position as the firmware does, so that the firmware's inverse projection recovers it.
 
-    ArduPilot scales degrees as on a sphere of 6,378.1 km, PX4 projects azimuthally from one of 6,371 km. WGS84
-    is neither: a kilometre away its tangent plane is up to metres off what they make of it.
+    ArduPilot scales degrees by a sphere of 6,378.1 km; PX4 uses the azimuthal equidistant projection of a sphere
+    of 6,371 km. At 1 km either differs from the WGS84 tangent plane by up to metres.
+
+    Args:
+        lat_deg: WGS84 latitude.
+        lon_deg: WGS84 longitude.
+        origin: origin of the autopilot's NED frame.
+        firmware: ardupilot or px4.
+
+    Returns:
+        North and east of the origin in metres.
     """
     if firmware == "ardupilot":
         middle = math.radians(0.5 * (lat_deg + origin.lat_deg))
@@ -125,10 +141,10 @@ def north_east_m(lat_deg: float, lon_deg: float, origin: Origin, firmware: str) 
         east_m = east_1e7 * _ARDUPILOT_M_PER_1E7_DEG * max(math.cos(middle), 0.01)
         return north_1e7 * _ARDUPILOT_M_PER_1E7_DEG, east_m
     lat, lat0 = math.radians(lat_deg), math.radians(origin.lat_deg)
-    turn = math.radians(lon_deg - origin.lon_deg)
-    north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(turn)
-    east = math.cos(lat) * math.sin(turn)
-    along = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(turn)
+    delta_lon = math.radians(lon_deg - origin.lon_deg)
+    north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(delta_lon)
+    east = math.cos(lat) * math.sin(delta_lon)
+    along = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(delta_lon)
     sine = math.hypot(north, east)
     factor = math.atan2(sine, along) / sine if sine > 0.0 else 1.0
     return factor * north * _PX4_EARTH_M, factor * east * _PX4_EARTH_M

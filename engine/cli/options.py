@@ -26,7 +26,7 @@ BudgetOption = Annotated[
     float | None,
     typer.Option("--budget-ms", metavar="MS", help="Time that one frame may take; later answers are refused."),
 ]
-OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, made by this run.")]
+OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, created by this run.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace the results in a folder that exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Results as JSON on standard output.")]
 ThreadsOption = Annotated[

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from engine.cli import console
 
 if TYPE_CHECKING:
-    from engine.formats.truth_checks import Finding
+    from engine.formats.truth_checks import TruthFinding
     from engine.runs.map_audit import MapAudit
 
 COLUMNS = ("RMS m", "p50 ms", "p95 ms", "fixed", "false", "NEES", "up m")
@@ -105,7 +105,7 @@ def print_audit(result: MapAudit, title: str) -> None:
     console.print_pairs(f"audit of {title}", pairs)
 
 
-def print_findings(findings: Sequence[Finding], title: str) -> None:
+def print_findings(findings: Sequence[TruthFinding], title: str) -> None:
     """A line a finding."""
     pairs = [(finding.kind, finding.text) for finding in findings] or [("nothing found", "")]
     console.print_pairs(title, pairs)

@@ -1,1 +1,1 @@
-"""Readers and writers of what lies on disk: telemetry, truth, frames, flights, tracks, GeoTIFF."""
+"""Readers and writers of files: flights, frames, telemetry, truth, tracks, logs, bags, data sets, GeoTIFF."""

@@ -1,4 +1,4 @@
-"""A flight: its frames, read one at a time, with what the vehicle knew at each; and the writer of its folder."""
+"""A flight: its frames, read one at a time, with the telemetry of each; and the writer of a flight folder."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ from engine.geo import wrap_heading_deg
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import Frame, Prior, Truth
 
+__all__ = ["Flight", "FlightFrame", "LogClock", "open_flight", "write_flight_folder"]
+
 _JPEG_QUALITY = 95
 
 
@@ -31,10 +33,10 @@ class FlightFrame:
     """One frame of a flight.
 
     Attributes:
-        name: file name of the picture, or the index in a video.
-        frame: the picture, with what its telemetry says.
-        prior: the position in the telemetry, or None.
-        telemetry: the row itself, or None where the flight has no telemetry.
+        name: file name of the image, or its index in a video or bag.
+        frame: the image with its telemetry.
+        prior: the position in the telemetry with its sigma, or None.
+        telemetry: the whole row, or None where the flight has no telemetry.
     """
 
     name: str
@@ -45,14 +47,14 @@ class FlightFrame:
 
 @dataclass
 class Flight:
-    """Frames in order of capture. Iterating reads one picture at a time and may be repeated.
+    """Frames in the order of capture. Iterating reads one image at a time and may be repeated.
 
     Attributes:
-        source: where pictures come from.
-        rows: the telemetry, one row a frame; empty where there is none.
-        heights: how many rows have their height from which source, where a log was read.
-        names: the frames, in order.
-        unused: how many pictures no row names.
+        source: source of the images.
+        rows: the telemetry, one row per frame; empty where there is none.
+        heights: where a log was read, the number of rows whose height comes from each source.
+        names: names of the frames, in order.
+        unused: number of images without a row of telemetry.
     """
 
     source: FrameSource
@@ -73,7 +75,11 @@ class Flight:
             yield self.read(index)
 
     def read(self, index: int) -> FlightFrame:
-        """One frame of the flight; in a video cheap where indices come in ascending order."""
+        """Read one frame; in a video or bag this is fast for ascending indices.
+
+        Raises:
+            TelemetryError: the image is missing or cannot be decoded.
+        """
         name, row = self.names[index], self.rows[index] if self.rows else None
         image = self.source.read(name)
         if row is None:
@@ -104,17 +110,20 @@ def open_flight(
     """Open a flight and check up front that its parts belong together.
 
     Args:
-        frames: a folder of pictures, a video, or a bag of ROS.
-        telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT, a bag) whose quantities are brought to the
-            frames' moments; without it the bag's own, or the photographs' EXIF, and where that has no times the
-            pictures in natural order with nothing known.
-        camera: refuses the flight at once where the first picture has another size than the calibration.
-        clock: when the frames were taken, where the telemetry is a log.
-        image_topic: of a bag's pictures; None for the only one.
+        frames: a folder of images, a video, or a ROS bag.
+        telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT, a bag) that is interpolated at the frames' times.
+            None uses the bag's own telemetry or the EXIF of photographs; without EXIF times the images come in
+            natural order and without telemetry.
+        camera: checked against the size of the first image.
+        clock: capture times of the frames, where the telemetry is a log.
+        image_topic: topic of a bag's images; None where there is only one.
+
+    Returns:
+        The flight; no image but the first has been read.
 
     Raises:
-        TelemetryError: a file cannot be read, or a row names a frame that is not there.
-        CalibrationError: the first picture is of another size than the camera's.
+        TelemetryError: a file cannot be read, or a row names a frame that does not exist.
+        CalibrationError: the first image has another size than the calibration.
     """
     source = BagFrames(Path(frames), image_topic) if is_bag(frames) else open_frames(frames)
     if telemetry is None and isinstance(source, BagFrames):
@@ -124,7 +133,7 @@ def open_flight(
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
-        rows = read_telemetry(telemetry, source, source.described)
+        rows = read_telemetry(telemetry, source, source.description)
     elif isinstance(source, VideoFile):
         rows = []
     else:
@@ -152,17 +161,17 @@ def write_flight_folder(
     """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
 
     Args:
-        directory: created where it does not exist.
+        directory: the folder, created where it does not exist.
         frames: file name (.jpg or .png) and stamped frame, consumed one at a time and before ``truth``.
-        truth: where the vehicle really was, in the order of time.
+        truth: the true states, in the order of time.
         camera: intrinsics and mount.
-        ortho_rgb: (H, W, 3) or grey (H, W) map.
-        pixel_to_crs: (2, 3), takes the map's pixel centres (x, y, 1) to the CRS.
+        ortho_rgb: map, (H, W, 3) or grey (H, W), uint8.
+        pixel_to_crs: (2, 3) affine transform from the map's pixel centres (x, y, 1) to the CRS.
         crs_epsg: EPSG code of the CRS.
-        surface_m: (H, W) heights on the map's grid, or None.
-        start: a prior in latitude and longitude for the first row of the telemetry.
-        georeference_sigma_m: what map.tif says of its accuracy, or None: nothing.
-        slope_sigma_deg: what dsm.tif says of its own, or None: nothing.
+        surface_m: (H, W) heights in metres on the map's grid, or None.
+        start: prior in latitude and longitude for the first row of the telemetry.
+        georeference_sigma_m: georeferencing accuracy that map.tif states, or None.
+        slope_sigma_deg: slope accuracy that dsm.tif states, or None.
 
     Raises:
         TelemetryError: a frame has no stamp, or a file cannot be written.
@@ -172,7 +181,7 @@ def write_flight_folder(
     (directory / "frames").mkdir(parents=True, exist_ok=True)
     rows: list[TelemetryRow] = []
     for name, frame in frames:
-        _write_picture(directory / "frames" / name, frame)
+        _write_image(directory / "frames" / name, frame)
         rows.append(_telemetry_row(name, frame, start if not rows else None))
     write_telemetry(directory / "telemetry.csv", rows)
     write_truth(directory / "truth.csv", list(truth))
@@ -203,7 +212,7 @@ def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow
     )
 
 
-def _write_picture(path: Path, frame: Frame) -> None:
+def _write_image(path: Path, frame: Frame) -> None:
     from PIL import Image
 
     image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
@@ -214,7 +223,7 @@ def _write_picture(path: Path, frame: Frame) -> None:
 
 
 def camera_info(camera: Camera) -> str:
-    """The text of camera.yaml."""
+    """The text of camera.yaml: ROS camera_info and the mount."""
 
     def block(name: str, rows: int, values: NDArray[np.float64]) -> str:
         data = ", ".join(repr(float(value)) for value in values.ravel())

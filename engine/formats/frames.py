@@ -1,8 +1,8 @@
-"""Pictures of a flight: a folder of photographs or a video, read one at a time; and what EXIF says of them.
+"""Images of a flight, read one at a time from a folder or a video; and the telemetry in their EXIF.
 
 Convention:
-    Pictures are RGB uint8 as stored: an EXIF orientation turns nothing, since the camera's calibration
-    counts the stored pixels. The frames of a video are named by their index from 0.
+    Images are RGB uint8 as stored: an EXIF orientation is ignored, since the camera's calibration refers to the
+    stored pixels. The frames of a video are named by their index from 0.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from engine.formats.telemetry import TelemetryRow
 from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-"""Files that count as pictures, in either case."""
+"""Suffixes of image files, in lower or upper case."""
 _GPS_IFD, _EXIF_IFD = 0x8825, 0x8769
 _XMP_BYTES = 512 * 1024
 _XMP_VALUE = re.compile(rb"drone-dji:(\w+)(?:=\"|>)\s*([+-]?[0-9]+(?:\.[0-9]+)?)")
 
 
 class FrameSource(ABC):
-    """Frames that are read by name.
+    """A source of frames that are read by name.
 
     Attributes:
         path: the folder or file.
-        names: what can be read, in the order of the flight.
+        names: names of the frames, in the order of the flight.
     """
 
     path: Path
@@ -54,29 +54,29 @@ class FrameSource(ABC):
 
     @abstractmethod
     def read(self, name: str) -> NDArray[np.uint8]:
-        """One frame as (H, W, 3) RGB.
+        """Read one frame as (H, W, 3) RGB uint8.
 
         Raises:
             TelemetryError: there is no such frame, or it cannot be decoded.
         """
 
-    def check(self, name: str) -> None:
-        """Refuse a name that is not there, without reading it.
+    def check_name(self, name: str) -> None:
+        """Check that a frame exists, without reading it.
 
         Raises:
             TelemetryError: there is no such frame.
         """
         if name not in self:
-            raise TelemetryError(f"{self.path}, frame: expected {self.described}, got {name!r}")
+            raise TelemetryError(f"{self.path}, frame: expected {self.description}, got {name!r}")
 
     @property
-    def described(self) -> str:
-        """The names that there are, in a few words."""
+    def description(self) -> str:
+        """The names of the frames in a few words, for messages."""
         return f"one of {len(self.names)} pictures, {self.names[0]} to {self.names[-1]}"
 
 
 class PictureFolder(FrameSource):
-    """The pictures of a folder, in natural order (2.jpg before 10.jpg); hidden files do not count."""
+    """The images of a folder, in natural order (2.jpg before 10.jpg), without hidden files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -86,13 +86,13 @@ class PictureFolder(FrameSource):
             raise TelemetryError(f"{path}: expected pictures ({', '.join(PICTURE_SUFFIXES)}), got none")
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """One picture as (H, W, 3) RGB."""
-        self.check(name)
+        """Read one image as (H, W, 3) RGB uint8."""
+        self.check_name(name)
         return read_image(self.path / name)
 
 
 class SinglePicture(PictureFolder):
-    """One picture by itself."""
+    """A single image."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.names = path.parent, [path.name]
@@ -101,8 +101,8 @@ class SinglePicture(PictureFolder):
 class VideoFile(FrameSource):
     """The frames of a video, decoded forward.
 
-    An index is counted by decoding, never sought: containers answer a seek with the nearest key frame or
-    round a time stamp. Going back therefore starts again at the first frame.
+    An index is reached by decoding, not by seeking: containers seek to the nearest key frame or round a time
+    stamp. Going back therefore restarts at the first frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,7 +111,7 @@ class VideoFile(FrameSource):
         self.path = path
         self._reset()
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if count < 1:  # a stream that does not say how long it is
+        if count < 1:  # a stream that does not state its length
             while self._capture.grab():
                 self._next += 1
             count = self._next
@@ -121,15 +121,15 @@ class VideoFile(FrameSource):
         self.names = [str(index) for index in range(count)]
 
     @property
-    def described(self) -> str:
-        """The indices that there are."""
+    def description(self) -> str:
+        """The range of indices, for messages."""
         return f"an index from 0 to {len(self.names) - 1} of the video"
 
     def stamps_ns(self) -> list[int]:
-        """When each frame is shown, from the start of the video; where it does not say, by its frame rate.
+        """Presentation time of each frame in nanoseconds from the start, else from the frame rate.
 
         Raises:
-            TelemetryError: the video tells neither.
+            TelemetryError: the video states neither.
         """
         import cv2
 
@@ -142,23 +142,23 @@ class VideoFile(FrameSource):
         if len(stamps_ns) > 1 and all(a < b for a, b in itertools.pairwise(stamps_ns)):
             return stamps_ns
         if not (math.isfinite(rate_hz) and rate_hz > 0.0):
-            raise TelemetryError(f"{self.path}: expected a video that tells its frames' times, got none")
+            raise TelemetryError(f"{self.path}: expected a video with time stamps or a frame rate, got neither")
         return [round(i * 1e9 / rate_hz) for i in range(len(stamps_ns))]
 
     def _reset(self) -> None:
         import cv2
 
         self._capture = cv2.VideoCapture(str(self.path))
-        self._next = 0  # the index that the decoder hands out next
+        self._next = 0  # index of the frame that the decoder returns next
         self._last: tuple[int, NDArray[np.uint8]] | None = None
         if not self._capture.isOpened():
             raise TelemetryError(f"{self.path}: expected a picture folder or a video, got a file that is neither")
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """One frame as (H, W, 3) RGB; cheap where names come in ascending order."""
+        """Read one frame as (H, W, 3) RGB uint8; fast for ascending indices."""
         import cv2
 
-        self.check(name)
+        self.check_name(name)
         index = int(name)
         if self._last is not None and self._last[0] == index:
             return self._last[1].copy()
@@ -166,8 +166,8 @@ class VideoFile(FrameSource):
             self._reset()
         while self._next < index and self._capture.grab():
             self._next += 1
-        good, image = self._capture.read() if self._next == index else (False, None)
-        if not good or image is None:
+        success, image = self._capture.read() if self._next == index else (False, None)
+        if not success or image is None:
             raise TelemetryError(
                 f"{self.path}: frame {index}: expected {len(self.names)} frames as the file says, "
                 f"got no more than {self._next}"
@@ -179,10 +179,10 @@ class VideoFile(FrameSource):
 
 
 def open_frames(path: str | Path) -> FrameSource:
-    """A folder of pictures, one picture, or a video.
+    """Open a folder of images, one image, or a video.
 
     Raises:
-        TelemetryError: there is no such path, the folder holds no pictures, or the file is no video.
+        TelemetryError: there is no such path, the folder holds no images, or the file is no video.
     """
     path = Path(path)
     if path.is_dir():
@@ -195,10 +195,16 @@ def open_frames(path: str | Path) -> FrameSource:
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:
-    """One picture as (H, W, 3) RGB; grey is spread over three channels, 16 bits lose the lower 8.
+    """Read an image file as RGB; grey is copied to three channels, 16 bits are reduced to the upper 8.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (H, W, 3) uint8.
 
     Raises:
-        TelemetryError: the file is missing, empty, truncated or no picture.
+        TelemetryError: the file is missing, empty, truncated or no image.
     """
     from PIL import Image
 
@@ -223,24 +229,24 @@ def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryR
     """Telemetry from photographs' EXIF and DJI's XMP.
 
     ==================================  =====================================================================
-    DateTimeOriginal, SubSec, Offset    timestamp_ns; a clock without offset is taken as UTC
+    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC where there is no offset
     GPSLatitude, GPSLongitude           the prior; GPSHPositioningError its sigma
     GPSAltitude                         alt_amsl_m
     GPSImgDirection                     heading_deg, where its reference is true north
-    drone-dji:RelativeAltitude          height_agl_m, above the place of take-off
-    drone-dji:Gimbal*Degree             heading, roll and pitch of a body that carries the camera looking down
-    drone-dji:FlightYawDegree           heading_deg, where the gimbal says nothing
+    drone-dji:RelativeAltitude          height_agl_m, above the take-off point
+    drone-dji:Gimbal*Degree             heading, roll and pitch of a body with the camera mounted nadir
+    drone-dji:FlightYawDegree           heading_deg, where there are no gimbal angles
     ==================================  =====================================================================
 
     Args:
-        source: a folder, or the pictures.
+        source: a folder, or paths of images.
 
     Returns:
-        Rows in the order of time, named by file name; photographs without a capture time are left out.
-        Photographs of one second without sub-seconds are spread evenly over it.
+        Rows in the order of time, named by file name; photographs without a capture time are omitted.
+        Photographs of the same second without sub-seconds are spaced evenly within it.
 
     Raises:
-        TelemetryError: a picture cannot be opened.
+        TelemetryError: an image cannot be opened.
     """
     if isinstance(source, (str, Path)):
         folder = PictureFolder(Path(source))
@@ -261,12 +267,12 @@ def _exif_row(path: Path) -> TelemetryRow | None:
     try:
         with Image.open(path) as picture:
             exif = picture.getexif()
-            gps, taken = exif.get_ifd(_GPS_IFD), exif.get_ifd(_EXIF_IFD)
+            gps, captured = exif.get_ifd(_GPS_IFD), exif.get_ifd(_EXIF_IFD)
         with path.open("rb") as file:
             xmp = {key.decode(): float(value) for key, value in _XMP_VALUE.findall(file.read(_XMP_BYTES))}
     except (OSError, SyntaxError, ValueError) as error:
         raise TelemetryError(f"{path}: expected a readable picture: {str(error).splitlines()[0]}") from None
-    stamp_ns = _capture_ns(taken)
+    stamp_ns = _capture_ns(captured)
     if stamp_ns is None:
         return None
     attitude = _gimbal_attitude(xmp) or {"heading_deg": _heading_deg(gps, xmp)}
@@ -281,16 +287,16 @@ def _exif_row(path: Path) -> TelemetryRow | None:
     )
 
 
-def _capture_ns(taken: Mapping[int, Any]) -> int | None:
+def _capture_ns(exif: Mapping[int, Any]) -> int | None:
     """Nanoseconds since 1970 of DateTimeOriginal (0x9003), its sub-seconds (0x9291) and offset (0x9011)."""
-    offset = str(taken.get(0x9011, "")).strip("\0 ") or "+00:00"
+    offset = str(exif.get(0x9011, "")).strip("\0 ") or "+00:00"
     try:
-        moment = datetime.strptime(f"{str(taken[0x9003]).strip(chr(0) + ' ')} {offset}", "%Y:%m:%d %H:%M:%S %z")
+        time = datetime.strptime(f"{str(exif[0x9003]).strip(chr(0) + ' ')} {offset}", "%Y:%m:%d %H:%M:%S %z")
     except (KeyError, ValueError):
         return None
-    fraction = re.match(r"[0-9]*", str(taken.get(0x9291, "")).strip())
+    fraction = re.match(r"[0-9]*", str(exif.get(0x9291, "")).strip())
     nanoseconds = int(fraction.group().ljust(9, "0")[:9]) if fraction else 0
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    since = time - datetime(1970, 1, 1, tzinfo=UTC)
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + nanoseconds
 
 
@@ -304,7 +310,7 @@ def _finite(value: Any) -> float | None:
 
 def _position(gps: Mapping[int, Any]) -> dict[str, float | None]:
     lat_deg, lon_deg = _degrees(gps.get(2), gps.get(1) == "S"), _degrees(gps.get(4), gps.get(3) == "W")
-    # A receiver without a fix writes zeros.
+    # Receivers without a fix write zeros.
     if lat_deg is None or lon_deg is None or (lat_deg == 0.0 and lon_deg == 0.0):
         return {}
     if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
@@ -347,20 +353,25 @@ def _gimbal_attitude(xmp: Mapping[str, float]) -> dict[str, float | None] | None
 def nadir_attitude(
     gimbal_roll_deg: float, gimbal_pitch_deg: float, gimbal_yaw_deg: float
 ) -> tuple[float, float, float]:
-    """Attitude of the body on which the gimbal's camera would be mounted looking down, top to the nose.
+    """Attitude of a body on which the gimbal's camera would be mounted nadir, the image's top to the nose.
 
-    DJI's angles turn the camera's own forward, right and down, in which a pitch of -90 degrees looks at the
-    ground. Its forward is that body's down, and its up the body's forward; with a roll of 180 degrees, as
-    some models write it, the same rotation comes out.
+    DJI's angles rotate the camera's forward, right and down axes; a pitch of -90 degrees is nadir. The camera's
+    forward is the body's down, its up the body's forward. The result is the same with a roll of 180 degrees, as
+    some models write it.
+
+    Args:
+        gimbal_roll_deg: roll in degrees.
+        gimbal_pitch_deg: pitch in degrees, -90 looks straight down.
+        gimbal_yaw_deg: yaw in degrees, clockwise from true north.
 
     Returns:
-        tuple[float, float, float]: roll, pitch and heading.
+        Roll, pitch and heading in degrees.
     """
     forward, right, down = enu_from_body(gimbal_roll_deg, gimbal_pitch_deg, gimbal_yaw_deg).T
     return attitude_from_rotation(np.stack([-down, right, forward], axis=1))
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key under which digits count as numbers."""
+    """Sort key in which runs of digits compare as numbers."""
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
     return [(0, int(part), part) if part[0] in "0123456789" else (1, 0, part) for part in parts]

@@ -1,4 +1,4 @@
-"""Writes a GeoTIFF from an array and where its pixels lie."""
+"""Writer of GeoTIFF files from an array and its affine transform."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def write_geotiff(
     """Write a tiled, losslessly compressed GeoTIFF.
 
     Convention:
-        ``pixel_to_crs`` (2, 3) takes (x, y, 1), with centres at integers, to the CRS. GeoTIFF counts from the
-        corner of the top-left pixel; the half pixel is moved here.
+        ``pixel_to_crs`` (2, 3) maps (x, y, 1), with pixel centres at integers, to the CRS. GeoTIFF's origin is the
+        corner of the top-left pixel; the offset of half a pixel is applied here.
 
     Args:
         path: the file, overwritten where it exists.
-        array: (H, W) or (H, W, 3).
-        pixel_to_crs: affine map, (2, 3).
+        array: (H, W) or (H, W, 3) of uint8, uint16, int16, float32 or float64.
+        pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs_epsg: EPSG code of the CRS.
-        nodata: the value that stands for nothing.
-        tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG` and what it says.
+        nodata: the value of pixels without data, or None.
+        tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG`.
 
     Raises:
         ShapeError: an argument has another shape.
-        DtypeError: the array is of a type that readers do not share.
-        OptionError: the affine map is not finite, or its pixels have no area.
+        DtypeError: the element type is not one of those above.
+        OptionError: the affine transform is not finite, or is singular.
         MapError: the EPSG code is unknown, or the file cannot be written.
     """
     array, affine = np.asarray(array), np.asarray(pixel_to_crs, dtype=np.float64)
@@ -51,7 +51,7 @@ def write_geotiff(
     if affine.shape != (2, 3):
         raise ShapeError(f"pixel_to_crs: expected (2, 3), got {affine.shape}")
     if not np.isfinite(affine).all() or np.linalg.det(affine[:, :2]) == 0.0:
-        raise OptionError(f"pixel_to_crs: expected a finite, invertible affine map, got {affine.tolist()}")
+        raise OptionError(f"pixel_to_crs: expected a finite, invertible affine transform, got {affine.tolist()}")
     corner = affine.copy()
     corner[:, 2] -= 0.5 * (affine[:, 0] + affine[:, 1])
     _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs_epsg, nodata, tags or {})

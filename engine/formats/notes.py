@@ -1,4 +1,4 @@
-"""notes.csv: what a run knew of each frame beside its row of track.csv, so that the report can be drawn again."""
+"""notes.csv: details of each frame that track.csv lacks, so that a report can be drawn again."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from engine.formats.telemetry import cell_text, read_table, write_table
+from engine.formats.tables import cell_text, read_table, write_table
 from engine.values import Fix, NoFix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Note:
+class FrameNote:
     """One row of notes.csv; what is unknown is None. The fields are the columns, in their order.
 
     Attributes:
         frame: name of the frame.
-        state: of the navigator after the frame, see :class:`engine.navigator.NavigatorState`.
-        window_x0_px: first column of the map that was searched.
-        window_y0_px: first row of the map that was searched.
-        heading_deg: that the match measured or was found at.
-        stage: how far the budget went.
-        confidence: probability of being right.
-        detail: of a refusal, one sentence with its figures.
+        state: state of the navigator after the frame, see :class:`engine.navigator.NavigatorState`.
+        window_x0_px: first column of the map window that was searched.
+        window_y0_px: first row of the map window that was searched.
+        heading_deg: heading of the match, clockwise from true north.
+        stage: last stage of the search that the budget allowed.
+        confidence: probability that the fix is correct.
+        detail: one sentence with figures on why the frame was refused.
     """
 
     frame: str
@@ -35,22 +35,22 @@ class Note:
     detail: str | None = None
 
 
-COLUMNS = tuple(f.name for f in fields(Note))
+COLUMNS = tuple(f.name for f in fields(FrameNote))
 """The header of notes.csv."""
 
 
-def note_of(name: str, result: Fix | NoFix, state: str) -> Note:
-    """What there is to note of one frame's result.
+def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
+    """The note of one frame's result.
 
     Args:
-        name: the frame's name.
+        name: name of the frame.
         result: the fix or the refusal.
-        state: of the navigator after it.
+        state: state of the navigator after it.
     """
     x0, y0 = (None, None) if result.window is None else (result.window.x0, result.window.y0)
     if isinstance(result, NoFix):
-        return Note(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
-    return Note(
+        return FrameNote(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
+    return FrameNote(
         frame=name,
         state=state,
         window_x0_px=x0,
@@ -61,7 +61,7 @@ def note_of(name: str, result: Fix | NoFix, state: str) -> Note:
     )
 
 
-def write_notes(path: str | Path, notes: Iterable[Note]) -> None:
+def write_notes(path: str | Path, notes: Iterable[FrameNote]) -> None:
     """Write notes.csv.
 
     Raises:
@@ -70,22 +70,22 @@ def write_notes(path: str | Path, notes: Iterable[Note]) -> None:
     write_table(path, COLUMNS, ([cell_text(getattr(note, name), 4) for name in COLUMNS] for note in notes))
 
 
-def read_notes(path: str | Path) -> list[Note]:
+def read_notes(path: str | Path) -> list[FrameNote]:
     """Read notes.csv.
 
     Raises:
         TelemetryError: the file cannot be read, or a cell is not what its column holds.
     """
     return [
-        Note(
-            frame=cells.text("frame"),
-            state=cells.text("state"),
-            window_x0_px=cells.integer("window_x0_px"),
-            window_y0_px=cells.integer("window_y0_px"),
-            heading_deg=cells.number("heading_deg"),
-            stage=cells.values["stage"] or None,
-            confidence=cells.number("confidence"),
-            detail=cells.values["detail"] or None,
+        FrameNote(
+            frame=csv_row.text("frame"),
+            state=csv_row.text("state"),
+            window_x0_px=csv_row.integer("window_x0_px"),
+            window_y0_px=csv_row.integer("window_y0_px"),
+            heading_deg=csv_row.number("heading_deg"),
+            stage=csv_row.values["stage"] or None,
+            confidence=csv_row.number("confidence"),
+            detail=csv_row.values["detail"] or None,
         )
-        for cells in read_table(path, COLUMNS)
+        for csv_row in read_table(path, COLUMNS)
     ]

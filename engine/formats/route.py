@@ -1,4 +1,4 @@
-"""Planned routes: a LineString of GeoJSON, or the waypoints of a QGroundControl plan."""
+"""Reader of planned routes: a GeoJSON LineString, or the waypoints of a QGroundControl plan."""
 
 from __future__ import annotations
 
@@ -11,21 +11,26 @@ from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 
-_PLACES = (16, 17, 18, 19, 21, 22, 31, 82)  # MAVLink commands that go to the latitude and longitude they carry
-_RETURN = 20
-_DEGREES_BELOW = 1e9
+_WAYPOINT_COMMANDS = (16, 17, 18, 19, 21, 22, 31, 82)  # MAV_CMD_NAV_* that fly to a latitude and longitude
+_RETURN_COMMAND = 20
+_MAX_NUMBER = 1e9
 _MAX_FILE_BYTES = 64 << 20
 
 
 def read_route(path: str | Path) -> NDArray[np.float64]:
-    """(N, 2) latitude and longitude in degrees of the waypoints, N at least 2.
+    """Read the waypoints of a route; heights are ignored.
 
-    Heights in the file are not looked at. Of GeoJSON there must be one LineString, alone or in a Feature or a
-    FeatureCollection. Of a plan the mission counts: take-off, waypoints, splines, loiters, surveys, landing, and
-    the return to the planned home position.
+    GeoJSON must contain exactly one LineString, alone or in a Feature or FeatureCollection. Of a plan the mission
+    is read: take-off, waypoints, splines, loiters, surveys, landing, and the return to the planned home position.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (N, 2) WGS84 latitude and longitude in degrees, N at least 2.
 
     Raises:
-        TelemetryError: the file is not one of the two, or holds no route.
+        TelemetryError: the file is neither of the two formats, or contains no route.
     """
     path = Path(path)
     try:
@@ -38,26 +43,26 @@ def read_route(path: str | Path) -> NDArray[np.float64]:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise TelemetryError(f"route: {path} cannot be read as JSON: {reason}") from None
     try:
-        places = _places(content)
+        positions = _positions(content)
     except TelemetryError as error:
         raise TelemetryError(f"route: {path}: {error}") from None
-    if len(places) < 2:
-        raise TelemetryError(f"route: {path}: expected two or more waypoints, got {len(places)}")
-    return np.array(places, dtype=np.float64)
+    if len(positions) < 2:
+        raise TelemetryError(f"route: {path}: expected two or more waypoints, got {len(positions)}")
+    return np.array(positions, dtype=np.float64)
 
 
-def _places(content: Any) -> list[tuple[float, float]]:
+def _positions(content: Any) -> list[tuple[float, float]]:
     if isinstance(content, dict) and content.get("fileType") == "Plan":
-        return _plan_places(content)
+        return _plan_positions(content)
     lines = list(_lines(content))
     if len(lines) != 1:
         kinds = "a GeoJSON LineString or a QGroundControl plan"
         raise TelemetryError(f"expected one route, {kinds}, got {len(lines)}")
-    return [_place(point[1::-1], point) for point in map(_numbers, lines[0])]
+    return [_position(point[1::-1], point) for point in map(_numbers, lines[0])]
 
 
 def _lines(content: Any) -> list[list[Any]]:
-    """The coordinates of all LineStrings."""
+    """Coordinates of all LineStrings, at any depth."""
     if not isinstance(content, dict):
         return []
     kind = content.get("type")
@@ -76,12 +81,12 @@ def _numbers(point: Any) -> list[Any]:
     return point
 
 
-def _place(lat_lon: list[Any], shown: Any) -> tuple[float, float]:
-    """Latitude and longitude that can be on the Earth."""
+def _position(lat_lon: list[Any], source: Any) -> tuple[float, float]:
+    """Check that two values are a latitude and a longitude in degrees."""
     for value in lat_lon:
-        # Compared before it is converted: JSON has whole numbers that no float holds, and Python's reads NaN.
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _DEGREES_BELOW:
-            raise TelemetryError(f"expected a latitude and a longitude in degrees, got {str(shown)[:60]}")
+        # Checked before conversion: JSON allows integers beyond floats, and Python's parser accepts NaN.
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _MAX_NUMBER:
+            raise TelemetryError(f"expected a latitude and a longitude in degrees, got {str(source)[:60]}")
     lat, lon = float(lat_lon[0]), float(lat_lon[1])
     if abs(lat) > 90.0 or abs(lon) > 360.0:
         raise TelemetryError(
@@ -90,34 +95,34 @@ def _place(lat_lon: list[Any], shown: Any) -> tuple[float, float]:
     return lat, lon
 
 
-def _plan_places(plan: dict[str, Any]) -> list[tuple[float, float]]:
+def _plan_positions(plan: dict[str, Any]) -> list[tuple[float, float]]:
     mission = plan.get("mission")
     if not isinstance(mission, dict) or not isinstance(mission.get("items"), list):
         raise TelemetryError("expected a plan with mission.items")
-    places: list[tuple[float, float]] = []
+    positions: list[tuple[float, float]] = []
     for item in _simple_items(mission["items"]):
-        if item.get("command") == _RETURN and isinstance(mission.get("plannedHomePosition"), list):
+        if item.get("command") == _RETURN_COMMAND and isinstance(mission.get("plannedHomePosition"), list):
             home = _numbers(mission["plannedHomePosition"])
-            places.append(_place(home[:2], home))
+            positions.append(_position(home[:2], home))
         params = item.get("params")
-        if item.get("command") not in _PLACES or not isinstance(params, list) or len(params) < 6:
+        if item.get("command") not in _WAYPOINT_COMMANDS or not isinstance(params, list) or len(params) < 6:
             continue
         if params[4] is None or params[5] is None or (params[4] == 0 and params[5] == 0):
-            continue  # at the place where the vehicle is, such as a take-off
-        places.append(_place(params[4:6], params))
-    return places
+            continue  # at the vehicle's current position, such as a take-off
+        positions.append(_position(params[4:6], params))
+    return positions
 
 
 def _simple_items(items: list[Any]) -> list[dict[str, Any]]:
-    """The items that go somewhere, those of surveys among them."""
+    """The simple items of a mission, those within surveys included."""
     found: list[dict[str, Any]] = []
     for item in items:
         if not isinstance(item, dict):
             raise TelemetryError(f"expected mission items that are objects, got {str(item)[:60]}")
-        inside = item.get("TransectStyleComplexItem")
-        inside = inside.get("Items") if isinstance(inside, dict) else item.get("Items")
-        if isinstance(inside, list):
-            found += _simple_items(inside)
+        nested = item.get("TransectStyleComplexItem")
+        nested = nested.get("Items") if isinstance(nested, dict) else item.get("Items")
+        if isinstance(nested, list):
+            found += _simple_items(nested)
         else:
             found.append(item)
     return found

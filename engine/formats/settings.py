@@ -1,8 +1,7 @@
-"""Settings files: options as TOML, written with their meaning and defaults, and read back with every key checked.
+"""Settings files: options as TOML, written with their descriptions and defaults, read back with every key checked.
 
-Options are dataclasses whose docstrings say what each field means and in what unit; a field that is a dataclass
-itself is a table, a tuple is a list, and a dict of dataclasses is one table a name. Nothing is spelled out twice:
-the file is made from the classes.
+Options are dataclasses whose docstrings describe each field and its unit. A field that is a dataclass becomes a
+table, a tuple a list, and a dict of dataclasses one table per name. The file is generated from the classes.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from engine.errors import OptionError
 Options = TypeVar("Options")
 
 NONE = "none"
-"""TOML has no word for nothing; this one stands for it."""
+"""Stands for None, which TOML cannot express."""
 _WIDTH = 110
 _ROLE = re.compile(r":\w+:`([^`]*)`")
 _UNITS = {
@@ -36,9 +35,9 @@ _UNITS = {
 
 
 def settings_text(options: Any) -> str:
-    """A settings file with all that is in ``options``, each key under what its class says of it.
+    """The text of a settings file with all keys of ``options``, each below its description.
 
-    The keys are commented out, so that a file pins only what its user changed and the rest follows the defaults.
+    The keys are commented out, so that a file pins only what its user changes and the rest follows the defaults.
 
     Args:
         options: a dataclass whose docstring has an ``Attributes:`` section.
@@ -47,11 +46,15 @@ def settings_text(options: Any) -> str:
 
 
 def read_settings(path: Path, cls: type[Options]) -> Options:
-    """The options in a file; what it leaves out keeps its default.
+    """Read options from a settings file; missing keys keep their defaults.
+
+    Args:
+        path: the file.
+        cls: dataclass of the options.
 
     Raises:
-        OptionError: the file is no TOML, or a key or value in it is none that ``cls`` has; the message names the
-            file, the key and what is nearest to it.
+        OptionError: the file is not TOML, a key is unknown, or a value has the wrong type or range; the message
+            names the file, the key and the closest known key.
         OSError: the file cannot be read.
     """
     try:
@@ -65,20 +68,20 @@ def read_settings(path: Path, cls: type[Options]) -> Options:
 
 
 def changed(options: Any, within: str = "") -> dict[str, Any]:
-    """What differs from the defaults, by its name in a settings file ("ncc.rule.min_sigmas")."""
-    usual = type(options)()
+    """Settings that differ from their defaults, by dotted name ("ncc.rule.min_sigmas")."""
+    defaults = type(options)()
     out: dict[str, Any] = {}
     for name in _kinds(type(options)):
         value = getattr(options, name)
         if is_dataclass(value):
             out |= changed(value, f"{within}{name}.")
-        elif value != getattr(usual, name):
+        elif value != getattr(defaults, name):
             out[f"{within}{name}"] = value
     return out
 
 
 def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables within tables, as a settings file has them, from what :func:`changed` gives."""
+    """Convert settings by dotted name, as :func:`changed` returns them, to nested tables."""
     out: dict[str, Any] = {}
     for name, value in changes.items():
         *path, last = name.split(".")
@@ -92,25 +95,25 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def options_from_mapping(cls: type[Options], values: Mapping[str, Any], within: str = "") -> Options:
-    """Options from names and values, tables within tables.
+    """Create options from nested mappings of names and values.
 
     Args:
-        cls: the dataclass.
-        values: of its fields, as TOML has them; "none" is None where a field may be.
-        within: the table that they stand in, for messages.
+        cls: dataclass of the options.
+        values: values of its fields as parsed from TOML; "none" is None where a field is optional.
+        within: dotted name of the enclosing table, for messages.
 
     Raises:
-        OptionError: a name is not a field of ``cls``, or a value is not of its kind or out of range.
+        OptionError: a name is not a field of ``cls``, or a value has the wrong type or range.
     """
     kinds = _kinds(cls)
     prefix = f"{within}." if within else ""
-    taken: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for name, value in values.items():
         if name not in kinds:
             raise OptionError(f"{prefix}{name}: not a setting; {_nearest(name, list(kinds))}")
-        taken[name] = _value(kinds[name], value, f"{prefix}{name}")
+        arguments[name] = _value(kinds[name], value, f"{prefix}{name}")
     try:
-        return cls(**taken)
+        return cls(**arguments)
     except OptionError as error:
         raise OptionError(f"{prefix}{error}") from None
 
@@ -121,18 +124,18 @@ def _nearest(name: str, known: list[str]) -> str:
 
 
 def _kinds(cls: type[Any]) -> dict[str, Any]:
-    """The fields that a file can hold, by name, with their types: numbers, words, lists and tables of these."""
+    """Types, by name, of the fields that a file can express: scalars, lists and tables."""
     hints = typing.get_type_hints(cls)
     kinds = {field.name: hints[field.name] for field in fields(cls)}
-    return {name: kind for name, kind in kinds.items() if _can_be_held(kind)}
+    return {name: kind for name, kind in kinds.items() if _is_expressible(kind)}
 
 
-def _can_be_held(kind: Any) -> bool:
+def _is_expressible(kind: Any) -> bool:
     return is_dataclass(kind) or _plain(kind) is not None or typing.get_origin(kind) in (tuple, dict)
 
 
 def _plain(kind: Any) -> type | None:
-    """``kind`` without "or None" where it is a number, a word or a truth value; None where it is not."""
+    """The scalar type of ``kind`` without "or None"; None where it is not a scalar."""
     if isinstance(kind, types.UnionType):
         kinds = [part for part in typing.get_args(kind) if part is not type(None)]
         kind = kinds[0] if len(kinds) == 1 else None
@@ -158,14 +161,14 @@ def _value(kind: Any, value: Any, name: str) -> Any:
     if plain is float and type(value) is int:
         return float(value)
     if type(value) is not plain:
-        words = {bool: "true or false", int: "a whole number", float: "a number", str: "a word in quotes"}
+        words = {bool: "true or false", int: "a whole number", float: "a number", str: "a quoted string"}
         raise OptionError(f"{name}: expected {words[typing.cast('type', plain)]}, got {value!r}")
     return value
 
 
 def _table(options: Any, path: tuple[str, ...]) -> list[str]:
-    """Lines of a table and of those within it, which TOML wants after the table's own keys."""
-    meanings, lines = meanings_of(type(options)), []
+    """Lines of a table and its nested tables, which TOML requires after the table's own keys."""
+    descriptions, lines = field_descriptions(type(options)), []
     if path:
         about = (inspect.getdoc(type(options)) or "").partition("\n")[0]
         lines += ["", "", f"[{'.'.join(path)}]", f"# {about}"]
@@ -176,7 +179,7 @@ def _table(options: Any, path: tuple[str, ...]) -> list[str]:
             tables += _table(value, (*path, name))
             continue
         unit = _UNITS.get(name.rpartition("_")[2])
-        text = textwrap.wrap(f"{meanings[name]} [{unit}]" if unit else meanings[name], _WIDTH)
+        text = textwrap.wrap(f"{descriptions[name]} [{unit}]" if unit else descriptions[name], _WIDTH)
         lines += ["", *(f"# {line}" for line in text), f"#{name} = {_literal(value)}"]
     return lines + tables
 
@@ -184,12 +187,12 @@ def _table(options: Any, path: tuple[str, ...]) -> list[str]:
 def _literal(value: Any) -> str:
     if value is None:
         return f'"{NONE}"'
-    # JSON's strings and truth values are TOML's; numbers are Python's in both, infinity included.
+    # JSON's strings and booleans are valid TOML; so are Python's numbers, infinity included.
     return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
 
 
-def meanings_of(cls: type[Any]) -> dict[str, str]:
-    """What the class's docstring says of each of its fields, in one line each."""
+def field_descriptions(cls: type[Any]) -> dict[str, str]:
+    """The description of each field in the class's docstring, as one line."""
     _, _, section = (inspect.getdoc(cls) or "").partition("Attributes:\n")
     out: dict[str, str] = {}
     for line in section.splitlines():

@@ -1,4 +1,4 @@
-"""track.csv: what a run made of every frame, one row a frame, written as the run goes."""
+"""track.csv: the result of every frame, one row per frame, written while the run proceeds."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from types import TracebackType
 from typing import TextIO
 
 from engine.errors import TelemetryError
-from engine.formats.telemetry import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, Cells, cell_text, read_table
+from engine.formats.tables import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, CsvRow, cell_text, read_table
 from engine.values import Fix, NoFix, Reason
+
+__all__ = ["TrackRow", "TrackWriter", "read_track", "track_row", "write_track"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,12 +34,12 @@ class TrackRow:
         sigma_east_m: standard deviation east.
         sigma_north_m: standard deviation north.
         covariance_en_m2: covariance of east and north.
-        score: NCC, or the share of matches that agree with the pose.
+        score: NCC, or the ratio of inliers for SIFT.
         method: "ncc" or "sift".
-        window_width_px: columns of the map that were searched.
-        window_height_px: rows of the map that were searched.
+        window_width_px: width of the map window that was searched.
+        window_height_px: height of the map window that was searched.
         latency_ms: from the frame's arrival to its result.
-        deadline_met: whether the result came inside the budget; None where there was none.
+        deadline_met: whether the result came within the budget; None without a budget.
     """
 
     timestamp_ns: int | None
@@ -61,7 +63,7 @@ class TrackRow:
 
     @property
     def fixed(self) -> bool:
-        """Whether the frame gave a position."""
+        """Whether the frame has a position fix."""
         return self.status == "fix"
 
 
@@ -77,10 +79,10 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
     """The row of one frame's result.
 
     Args:
-        name: the frame's name.
+        name: name of the frame.
         result: the fix or the refusal.
-        latency_ms: from the frame's arrival to its result.
-        deadline_met: whether that was inside the budget; None where there was none.
+        latency_ms: time from the frame's arrival to its result.
+        deadline_met: whether that was within the budget; None without a budget.
     """
     window = result.window
     row = TrackRow(
@@ -111,7 +113,7 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
 
 
 class TrackWriter:
-    """Appends rows to a track.csv and flushes each, so that an interrupted run keeps what it has.
+    """Appends rows to track.csv and flushes each, so that an interrupted run keeps its rows.
 
     Example:
         >>> with TrackWriter("out/track.csv") as track:  # doctest: +SKIP
@@ -155,7 +157,7 @@ class TrackWriter:
 
 
 def write_track(path: str | Path, rows: Iterable[TrackRow]) -> None:
-    """Write a whole track.csv: 9 decimals of a degree, 1 mm, sigmas and scores to 4 decimals.
+    """Write a complete track.csv: degrees to 9 decimals, metres to 3, sigmas and scores to 4.
 
     Raises:
         TelemetryError: the file cannot be written.
@@ -166,44 +168,43 @@ def write_track(path: str | Path, rows: Iterable[TrackRow]) -> None:
 
 
 def read_track(path: str | Path) -> list[TrackRow]:
-    """Read track.csv; a run that was interrupted before its first frame gives no rows.
+    """Read track.csv; a run that was interrupted before its first frame has no rows.
 
     Raises:
-        TelemetryError: the file cannot be read, or a row is wrong: the message names the line, the column,
-            what was expected and what came.
+        TelemetryError: the file cannot be read, or a row is invalid: the message has line and column.
     """
-    return [_row(cells) for cells in read_table(path, COLUMNS)]
+    return [_row(csv_row) for csv_row in read_table(path, COLUMNS)]
 
 
-def _row(cells: Cells) -> TrackRow:
-    status, reason = cells.text("status"), cells.values["reason"] or None
+def _row(csv_row: CsvRow) -> TrackRow:
+    status, reason = csv_row.text("status"), csv_row.values["reason"] or None
     if status not in ("fix", "no_fix"):
-        raise cells.error("status", "fix or no_fix")
+        raise csv_row.error("status", "fix or no_fix")
     if reason is not None and reason not in {known.value for known in Reason}:
-        raise cells.error("reason", "a known reason or nothing")
-    if cells.values["deadline_met"] not in ("", "true", "false"):
-        raise cells.error("deadline_met", "true, false or nothing")
+        raise csv_row.error("reason", "a known reason or nothing")
+    if csv_row.values["deadline_met"] not in ("", "true", "false"):
+        raise csv_row.error("deadline_met", "true, false or nothing")
     for column in _POSITION:
-        if status == "fix" and not cells.values[column]:
-            raise cells.error(column, "a number, as the row is a fix")
-    met = {"true": True, "false": False}.get(cells.values["deadline_met"])
+        if status == "fix" and not csv_row.values[column]:
+            raise csv_row.error(column, "a number, as the row is a fix")
+    met = {"true": True, "false": False}.get(csv_row.values["deadline_met"])
     return TrackRow(
-        timestamp_ns=cells.integer("timestamp_ns"),
-        frame=cells.text("frame"),
+        timestamp_ns=csv_row.integer("timestamp_ns"),
+        frame=csv_row.text("frame"),
         status=status,
         reason=reason,
-        lat_deg=cells.number("lat_deg", QUARTER_TURN),
-        lon_deg=cells.number("lon_deg", LONGITUDE),
-        east_m=cells.number("east_m"),
-        north_m=cells.number("north_m"),
-        up_m=cells.number("up_m"),
-        sigma_east_m=cells.number("sigma_east_m", NOT_NEGATIVE),
-        sigma_north_m=cells.number("sigma_north_m", NOT_NEGATIVE),
-        covariance_en_m2=cells.number("covariance_en_m2"),
-        score=cells.number("score"),
-        method=cells.values["method"] or None,
-        window_width_px=cells.integer("window_width_px"),
-        window_height_px=cells.integer("window_height_px"),
-        latency_ms=cells.number("latency_ms", NOT_NEGATIVE),
+        lat_deg=csv_row.number("lat_deg", QUARTER_TURN),
+        lon_deg=csv_row.number("lon_deg", LONGITUDE),
+        east_m=csv_row.number("east_m"),
+        north_m=csv_row.number("north_m"),
+        up_m=csv_row.number("up_m"),
+        sigma_east_m=csv_row.number("sigma_east_m", NOT_NEGATIVE),
+        sigma_north_m=csv_row.number("sigma_north_m", NOT_NEGATIVE),
+        covariance_en_m2=csv_row.number("covariance_en_m2"),
+        score=csv_row.number("score"),
+        method=csv_row.values["method"] or None,
+        window_width_px=csv_row.integer("window_width_px"),
+        window_height_px=csv_row.integer("window_height_px"),
+        latency_ms=csv_row.number("latency_ms", NOT_NEGATIVE),
         deadline_met=met,
     )

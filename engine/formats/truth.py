@@ -1,4 +1,4 @@
-"""truth.csv: where the vehicle really was, at fewer moments than there are frames or more."""
+"""truth.csv: the true position, height and attitude of the vehicle, at times of its own."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from engine.errors import TelemetryError
-from engine.formats.telemetry import (
+from engine.formats.tables import (
     ANY,
     HALF_TURN,
     HEADING,
     LONGITUDE,
     QUARTER_TURN,
-    TelemetryRow,
     cell_text,
     check_increasing,
     known_columns,
     read_table,
     write_table,
 )
+from engine.formats.telemetry import TelemetryRow
 from engine.geo import wrap_heading_deg
 from engine.values import Truth
 
-MAX_GAP_NS = 5_000_000_000
-"""Neighbours further apart than this do not say where the vehicle was in between."""
+__all__ = ["Truth", "interpolate_truth", "read_truth", "write_truth"]
+
+MAX_TRUTH_GAP_NS = 5_000_000_000
+"""Largest interval between two rows that is interpolated."""
 
 _REQUIRED = ("timestamp_ns", "lat_deg", "lon_deg")
 _OPTIONAL = {
@@ -38,20 +40,19 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(("roll_deg", "pitch_deg
 
 
 def read_truth(path: str | Path) -> list[Truth]:
-    """Read truth.csv; headings come back in [0, 360).
+    """Read truth.csv; headings are normalised to [0, 360).
 
     Raises:
-        TelemetryError: the file cannot be read, has no rows, or a row is wrong: the message names the line,
-            the column, what was expected and what came.
+        TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
     rows: list[Truth] = []
-    for cells in read_table(path, _REQUIRED, tuple(_OPTIONAL)):
-        stamp_ns = cells.stamp()
-        check_increasing(cells, rows[-1].timestamp_ns if rows else None, stamp_ns)
-        values = {name: cells.number(name, bounds) for name, bounds in _OPTIONAL.items()}
+    for csv_row in read_table(path, _REQUIRED, tuple(_OPTIONAL)):
+        stamp_ns = csv_row.stamp()
+        check_increasing(csv_row, rows[-1].timestamp_ns if rows else None, stamp_ns)
+        values = {name: csv_row.number(name, bounds) for name, bounds in _OPTIONAL.items()}
         if values["heading_deg"] is not None:
             values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
-        lat_deg, lon_deg = cells.known("lat_deg", QUARTER_TURN), cells.known("lon_deg", LONGITUDE)
+        lat_deg, lon_deg = csv_row.required("lat_deg", QUARTER_TURN), csv_row.required("lon_deg", LONGITUDE)
         rows.append(Truth(timestamp_ns=stamp_ns, lat_deg=lat_deg, lon_deg=lon_deg, **values))
     if not rows:
         raise TelemetryError(f"{path}: expected rows of truth, got a header and no rows")
@@ -59,7 +60,7 @@ def read_truth(path: str | Path) -> list[Truth]:
 
 
 def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
-    """Write truth.csv with the columns that some row knows; 9 decimals of position, 5 of angles, 0.1 mm.
+    """Write truth.csv with the columns that any row has: positions to 1e-9 degrees, angles to 1e-5.
 
     Raises:
         TelemetryError: the file cannot be written.
@@ -69,8 +70,8 @@ def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
     write_table(path, columns, table)
 
 
-def truth_at(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
-    """A row of telemetry as truth, at a place in degrees, with its stamp moved."""
+def truth_from_telemetry(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
+    """A row of telemetry as truth, with another position and its stamp shifted by ``shift_ns``."""
     return Truth(
         timestamp_ns=row.timestamp_ns + shift_ns,
         lat_deg=lat_deg,
@@ -83,19 +84,18 @@ def truth_at(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 
     )
 
 
-def interpolate_truth(rows: Sequence[Truth], timestamp_ns: int, max_gap_ns: int = MAX_GAP_NS) -> Truth | None:
-    """Where the vehicle was at one moment, linear between the rows before and after it.
-
-    Headings and longitudes take the short way round their circle.
+def interpolate_truth(
+    rows: Sequence[Truth], timestamp_ns: int, max_gap_ns: int = MAX_TRUTH_GAP_NS
+) -> Truth | None:
+    """Interpolate truth linearly at a time; headings and longitudes along the shorter arc.
 
     Args:
         rows: truth in the order of time.
-        timestamp_ns: the moment, on the same clock.
-        max_gap_ns: how far apart the two rows may be.
+        timestamp_ns: the time, on the same clock.
+        max_gap_ns: largest interval between two rows that is interpolated.
 
     Returns:
-        The truth, without what either neighbour does not know; None before the first row, after the last
-        and in a gap.
+        The truth, with None for what either neighbour lacks; None outside the rows and in a gap.
     """
     after = bisect.bisect_left(rows, timestamp_ns, key=lambda row: row.timestamp_ns)
     if after < len(rows) and rows[after].timestamp_ns == timestamp_ns:
@@ -106,27 +106,27 @@ def interpolate_truth(rows: Sequence[Truth], timestamp_ns: int, max_gap_ns: int 
     gap_ns = b.timestamp_ns - a.timestamp_ns
     if gap_ns > max_gap_ns:
         return None
-    share = (timestamp_ns - a.timestamp_ns) / gap_ns
-    heading_deg = _turned(a.heading_deg, b.heading_deg, share)
+    fraction = (timestamp_ns - a.timestamp_ns) / gap_ns
+    heading_deg = _between_angles(a.heading_deg, b.heading_deg, fraction)
     return Truth(
         timestamp_ns=timestamp_ns,
-        lat_deg=a.lat_deg + share * (b.lat_deg - a.lat_deg),
-        lon_deg=a.lon_deg + share * _short_way(b.lon_deg - a.lon_deg),
-        alt_amsl_m=_between(a.alt_amsl_m, b.alt_amsl_m, share),
-        height_agl_m=_between(a.height_agl_m, b.height_agl_m, share),
-        roll_deg=_between(a.roll_deg, b.roll_deg, share),
-        pitch_deg=_between(a.pitch_deg, b.pitch_deg, share),
+        lat_deg=a.lat_deg + fraction * (b.lat_deg - a.lat_deg),
+        lon_deg=a.lon_deg + fraction * _wrap_180(b.lon_deg - a.lon_deg),
+        alt_amsl_m=_between(a.alt_amsl_m, b.alt_amsl_m, fraction),
+        height_agl_m=_between(a.height_agl_m, b.height_agl_m, fraction),
+        roll_deg=_between(a.roll_deg, b.roll_deg, fraction),
+        pitch_deg=_between(a.pitch_deg, b.pitch_deg, fraction),
         heading_deg=None if heading_deg is None else wrap_heading_deg(heading_deg),
     )
 
 
-def _short_way(difference_deg: float) -> float:
+def _wrap_180(difference_deg: float) -> float:
     return (difference_deg + 180.0) % 360.0 - 180.0
 
 
-def _between(a: float | None, b: float | None, share: float) -> float | None:
-    return None if a is None or b is None else a + share * (b - a)
+def _between(a: float | None, b: float | None, fraction: float) -> float | None:
+    return None if a is None or b is None else a + fraction * (b - a)
 
 
-def _turned(a_deg: float | None, b_deg: float | None, share: float) -> float | None:
-    return None if a_deg is None or b_deg is None else a_deg + share * _short_way(b_deg - a_deg)
+def _between_angles(a_deg: float | None, b_deg: float | None, fraction: float) -> float | None:
+    return None if a_deg is None or b_deg is None else a_deg + fraction * _wrap_180(b_deg - a_deg)

@@ -1,1 +1,1 @@
-"""What a finished track is worth: its figures of merit and its plots."""
+"""Reports on finished tracks: figures of merit, plots, pages and the live view."""

@@ -1,4 +1,4 @@
-"""The picture of an audit: the map, how surely each place is matched, and what the others suffer from."""
+"""The figure of a map audit: the map, the probability of a fix at each position, and the causes of low ones."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from engine.values import Window
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
 
-_MAP_PX = 1600  # longer side of the map as drawn; more would not show
-_WIDTH_IN, _MAX_INTERVAL = 9.0, 11.0
+_MAX_MAP_PX = 1600  # longer side of the map as drawn; more is not visible
+_WIDTH_IN, _MAX_HEIGHT_IN = 9.0, 11.0
 _MAX_MARKS_PX = 7.0
-# Apart by shape, and by colours that stay apart under every common colour blindness (Okabe and Ito).
+# Distinct by shape, and by colours under all common colour vision deficiencies (Okabe and Ito).
 _MARKS = {
     Flag.FLAT: ("o", "#56B4E9", "flat, such as water"),
     Flag.REPEATED: ("s", "#E69F00", "repeated"),
@@ -30,13 +30,16 @@ _MARKS = {
 
 
 def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None = None, *, title: str = "") -> Path:
-    """Draw an audit as a picture file.
+    """Draw an audit as an image file.
 
     Args:
         path: the file, replaced where it exists.
-        audit: what was found.
-        route: drawn where given, in a heavier line where its places are not suitable.
+        audit: the result of the audit.
+        route: drawn where given, with a heavier line where positions are not suitable.
         title: heading.
+
+    Returns:
+        The path of the file.
     """
     from matplotlib.figure import Figure
 
@@ -44,7 +47,7 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
     scale = site.gsd_m_per_px
     right, bottom = part.x0 + part.width_px, part.y0 + part.height_px
     extent = (part.x0 * scale, right * scale, bottom * scale, part.y0 * scale)
-    height_in = float(np.clip((_WIDTH_IN - 2.0) * part.height_px / part.width_px, 3.0, _MAX_INTERVAL))
+    height_in = float(np.clip((_WIDTH_IN - 2.0) * part.height_px / part.width_px, 3.0, _MAX_HEIGHT_IN))
     figure = Figure(figsize=(_WIDTH_IN, height_in + 1.6), layout="constrained")
     ax = figure.subplots()
     ax.imshow(_background(site, part), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
@@ -74,9 +77,9 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
 
 
 def _background(site: OrthoMap, part: Window) -> Any:
-    """A part of the map in grey at the coarsest level that still shows; white where it has no data."""
+    """A part of the map in grey at the coarsest sufficient pyramid level; white where it has no data."""
     level = 0
-    while level + 1 < site.levels and max(part.width_px, part.height_px) >> level > _MAP_PX:
+    while level + 1 < site.levels and max(part.width_px, part.height_px) >> level > _MAX_MAP_PX:
         level += 1
     rows, columns = site.level_shape(level)
     x0, y0 = min(part.x0 >> level, columns - 1), min(part.y0 >> level, rows - 1)
@@ -91,10 +94,16 @@ def _draw_marks(ax: Any, audit: Audit) -> None:
     scale = audit.plan.site.gsd_m_per_px
     size = float(np.clip(220.0 / max(audit.flags.shape), 1.5, _MAX_MARKS_PX))
     for flag, (marker, colour, label) in _MARKS.items():
-        places = (audit.plan.centers_px[audit.flags == flag] + 0.5) * scale
-        if len(places):
+        positions_m = (audit.plan.centers_px[audit.flags == flag] + 0.5) * scale
+        if len(positions_m):
             ax.plot(
-                *places.T, marker, color=colour, markersize=size, markeredgewidth=1.0, linestyle="", label=label
+                *positions_m.T,
+                marker,
+                color=colour,
+                markersize=size,
+                markeredgewidth=1.0,
+                linestyle="",
+                label=label,
             )
 
 
@@ -108,7 +117,7 @@ def _draw_route(ax: Any, route: RouteAvailability, scale: float) -> None:
 
 
 def _figures(audit: Audit, route: RouteAvailability | None) -> str:
-    parts = [f"{audit.shares['good']:.0%} of the places suitable"]
+    parts = [f"{audit.shares['good']:.0%} of the positions suitable"]
     if route is not None:
         parts.append(f"{route.availability:.0%} predicted along {route.length_m:,.0f} m of route")
     return ", ".join(parts)

@@ -1,4 +1,4 @@
-"""The tables of a campaign: a line a run, the flights of a group pooled, and latencies in a file of their own."""
+"""The tables of a campaign: one row per run, pooled figures of each group, and latencies in a separate file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.formats.telemetry import cell_text, write_table
+from engine.formats.tables import cell_text, write_table
 from engine.report.published import COLUMNS, PUBLISHED, published_cells
 
 TABLE, PAGE, LATENCIES = "campaign.csv", "campaign.md", "latencies.csv"
@@ -23,16 +23,16 @@ TABLE_HEAD = (*_NAMES, *_FIGURES, "failure")
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class CampaignRow:
     """One run of a campaign.
 
     Attributes:
-        group: what the flight is pooled with.
-        flight: its name.
+        group: group of flights that are pooled.
+        flight: name of the flight.
         run: the method with its settings.
-        figures: of the summary, without times; None where the run failed.
-        latency_ms: p50, p95, p99 and max of a frame.
-        failure: why the run failed, or None.
+        figures: figures of merit of its summary, without times; None where the run failed.
+        latency_ms: p50, p95, p99 and max of the latency of a frame.
+        failure: reason why the run failed, or None.
     """
 
     group: str
@@ -43,28 +43,28 @@ class Line:
     failure: str | None
 
 
-def write_tables(folder: Path, lines: Sequence[Line]) -> None:
-    """Write campaign.csv and campaign.md, which hold no times, and latencies.csv.
+def write_tables(folder: Path, rows: Sequence[CampaignRow]) -> None:
+    """Write campaign.csv and campaign.md, which have no times, and latencies.csv.
 
-    Equal runs give equal bytes in the first two, on whatever they ran and in whatever order they ended.
+    Equal runs give equal bytes in the first two, independent of machine and order.
     """
-    figures = ([*_named(line), *_cells(line.figures, _FIGURES), line.failure or ""] for line in lines)
+    figures = ([*_key(row), *_cells(row.figures, _FIGURES), row.failure or ""] for row in rows)
     write_table(folder / TABLE, TABLE_HEAD, list(figures))
-    times = ([*_named(line), *_cells(line.latency_ms, _TIMES)] for line in lines)
+    times = ([*_key(row), *_cells(row.latency_ms, _TIMES)] for row in rows)
     write_table(folder / LATENCIES, (*_NAMES, *(f"{name}_ms" for name in _TIMES)), list(times))
-    (folder / PAGE).write_text(_page(lines), encoding="utf-8")
+    (folder / PAGE).write_text(_page(rows), encoding="utf-8")
 
 
-def _named(line: Line) -> tuple[str, str, str]:
-    return line.group, line.flight, line.run
+def _key(row: CampaignRow) -> tuple[str, str, str]:
+    return row.group, row.flight, row.run
 
 
 def _cells(values: Mapping[str, Any] | None, names: Sequence[str]) -> list[str]:
     return [cell_text((values or {}).get(name), 4) for name in names]
 
 
-def are_figures(values: object) -> bool:
-    """Whether a value can be the figures of a :class:`Line`: a summary's, with those that belong together."""
+def are_valid_figures(values: object) -> bool:
+    """Whether a value has the figures of a :class:`CampaignRow`, complete and of the right types."""
     if not isinstance(values, dict) or not all(_is_number(values.get(name)) for name in _FIGURES):
         return False
     needed = ["frames", "fixes"]
@@ -73,31 +73,31 @@ def are_figures(values: object) -> bool:
     return all(type(values.get(name)) is int for name in needed)
 
 
-def are_times(values: object) -> bool:
-    """Whether a value can be the latencies of a :class:`Line`."""
+def are_valid_latencies(values: object) -> bool:
+    """Whether a value has the latencies of a :class:`CampaignRow`."""
     return isinstance(values, dict) and all(_is_number(values.get(name)) for name in _TIMES)
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value is a number whose square is one too, or unknown."""
+    """Whether a value is a number whose square is finite, or None."""
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e100)
 
 
 @dataclass(frozen=True, slots=True)
-class Pool:
-    """The runs of one group by one method, taken together.
+class PooledRuns:
+    """Pooled figures of the runs of one group by one method.
 
     Attributes:
-        group: of the flights.
+        group: group of the flights.
         run: the method with its settings.
-        flights: how many were followed.
-        failed: how many could not be.
-        frames: of all of them.
-        availability: share of the frames that were fixed.
-        rms_m: over all scored fixes.
-        worst_rms_m: of the flight with the largest.
-        false_fixes: more than 10 m and three of their own sigmas off.
-        wrong_over_10m: more than 10 m off, whatever they said.
+        flights: number of flights that were tracked.
+        failed: number of flights whose run failed.
+        frames: number of frames of all flights.
+        availability: ratio of frames with a fix.
+        rms_m: RMS error over all scored fixes.
+        worst_rms_m: largest RMS error of a flight.
+        false_fixes: number of fixes more than 10 m and three of their own sigmas off.
+        wrong_over_10m: number of fixes more than 10 m off, whatever their sigma.
     """
 
     group: str
@@ -112,24 +112,24 @@ class Pool:
     wrong_over_10m: int | None
 
 
-def pooled(lines: Sequence[Line]) -> list[Pool]:
-    """Every group by every run, in the order in which they come; what has no truth is None."""
-    keys = dict.fromkeys((line.group, line.run) for line in lines)
-    return [_pool(*key, [line for line in lines if (line.group, line.run) == key]) for key in keys]
+def pool_runs(rows: Sequence[CampaignRow]) -> list[PooledRuns]:
+    """Pool every group by run, in the order of appearance; figures that need truth are None without."""
+    keys = dict.fromkeys((row.group, row.run) for row in rows)
+    return [_pool(*key, [row for row in rows if (row.group, row.run) == key]) for key in keys]
 
 
-def _pool(group: str, run: str, lines: Sequence[Line]) -> Pool:
-    known = [line.figures for line in lines if line.figures is not None]
+def _pool(group: str, run: str, rows: Sequence[CampaignRow]) -> PooledRuns:
+    known = [row.figures for row in rows if row.figures is not None]
     scored = [figures for figures in known if figures.get("rms_m") is not None]
     judged = [figures for figures in known if "false_fixes" in figures]
     frames, fixes = (sum(figures[name] for figures in known) for name in ("frames", "fixes"))
     fixes_scored = sum(figures["scored_fixes"] for figures in scored)
     squares_m2 = sum(figures["scored_fixes"] * figures["rms_m"] ** 2 for figures in scored)
-    return Pool(
+    return PooledRuns(
         group=group,
         run=run,
         flights=len(known),
-        failed=len(lines) - len(known),
+        failed=len(rows) - len(known),
         frames=frames,
         availability=fixes / frames if frames else None,
         rms_m=math.sqrt(squares_m2 / fixes_scored) if fixes_scored else None,
@@ -142,8 +142,8 @@ def _pool(group: str, run: str, lines: Sequence[Line]) -> Pool:
 POOL_COLUMNS = ("run", "flights", "frames", "fixed", "RMS m", "worst flight", "false", "off > 10 m")
 
 
-def pool_cells(pool: Pool) -> tuple[str, ...]:
-    """The figures of :data:`POOL_COLUMNS`; what is unknown is a dash."""
+def pooled_cells(pool: PooledRuns) -> tuple[str, ...]:
+    """The cells of :data:`POOL_COLUMNS`; what is unknown is a dash."""
     flights = f"{pool.flights}" + (f" ({pool.failed} failed)" if pool.failed else "")
     return (
         pool.run,
@@ -161,27 +161,27 @@ def _shown(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
 
 
-def _page(lines: Sequence[Line]) -> str:
-    """The pooled figures of every group with what was published of it, then every run, then what failed."""
+def _page(rows: Sequence[CampaignRow]) -> str:
+    """Markdown with the pooled figures of every group, published results, every run, and failures."""
     out = ["# Campaign", ""]
-    pools = pooled(lines)
+    pools = pool_runs(rows)
     for group in dict.fromkeys(pool.group for pool in pools):
-        out += [f"## {group}", "", *_table(POOL_COLUMNS, [pool_cells(p) for p in pools if p.group == group]), ""]
+        out += [f"## {group}", "", *_table(POOL_COLUMNS, [pooled_cells(p) for p in pools if p.group == group]), ""]
         if group in PUBLISHED:
-            out += [*_table(COLUMNS, [published_cells(one) for one in PUBLISHED[group]]), ""]
+            out += [*_table(COLUMNS, [published_cells(result) for result in PUBLISHED[group]]), ""]
     columns = ("flight", "run", "frames", "fixed", "RMS m", "median m", "95 % m", "max m", "false", "NEES", "up m")
-    out += ["## Every run", "", *_table(columns, [_run_cells(line) for line in lines if line.figures]), ""]
-    failed = [f"- {line.flight}, {line.run}: {line.failure}" for line in lines if line.failure]
+    out += ["## Every run", "", *_table(columns, [_run_cells(row) for row in rows if row.figures]), ""]
+    failed = [f"- {row.flight}, {row.run}: {row.failure}" for row in rows if row.failure]
     out += ["## Failed", "", *failed, ""] if failed else []
     return "\n".join(out)
 
 
-def _run_cells(line: Line) -> tuple[str, ...]:
-    figures = line.figures or {}
+def _run_cells(row: CampaignRow) -> tuple[str, ...]:
+    figures = row.figures or {}
     metres = (_shown(figures.get(name), "{:.2f}") for name in ("rms_m", "median_m", "r95_m", "max_m"))
     return (
-        line.flight,
-        line.run,
+        row.flight,
+        row.run,
         str(figures["frames"]),
         _shown(figures.get("availability"), "{:.1%}"),
         *metres,

@@ -1,4 +1,4 @@
-"""Charts as SVG: axes with round ticks, and the few marks that the report draws on them."""
+"""Charts as SVG: axes with round ticks, and the marks that the report draws on them."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ Limits = tuple[float, float]
 
 WIDTH, HEIGHT = 720.0, 230.0
 _TOP, _RIGHT, _BOTTOM = 12.0, 14.0, 44.0
-_MAX_POINTS = 4000  # of a line; more would not show
+_MAX_POINTS = 4000  # of a line; more are not visible
 
 
 @dataclass(frozen=True, slots=True)
-class Plot:
-    """The area of a chart: data in, SVG units out.
+class ChartArea:
+    """The plotting area of a chart, which maps data to SVG units.
 
     Attributes:
-        x_limits: of the data.
-        y_limits: of the data.
-        left: where the area begins.
+        x_limits: limits of x in data units.
+        y_limits: limits of y in data units; descending limits invert the axis.
+        left: left edge of the area in SVG units.
     """
 
     x_limits: Limits
     y_limits: Limits
     left: float = 62.0
 
-    def places(self, x: Array, y: Array) -> Array:
-        """(N, 2) units of data; NaN where y is not known."""
+    def points(self, x: Array, y: Array) -> Array:
+        """(N, 2) SVG units of data (N,); NaN where y is unknown."""
         return np.column_stack([self.x(x), self.y(y)])
 
     def x(self, values: Array | float) -> Array:
-        """Units from the left."""
+        """SVG units from the left."""
         return self._scaled(values, self.x_limits, self.left, WIDTH - _RIGHT)
 
     def y(self, values: Array | float) -> Array:
-        """Units from the top."""
+        """SVG units from the top."""
         return self._scaled(values, self.y_limits, HEIGHT - _BOTTOM, _TOP)
 
     @staticmethod
@@ -50,33 +50,33 @@ class Plot:
         return begin + (np.asarray(values, np.float64) - limits[0]) / span * (end - begin)
 
     def dots(self, x: Array, y: Array, kind: str) -> str:
-        """A dot for each finite pair; what lies outside the limits is left out."""
+        """A dot for each finite pair within the limits."""
         inside = (y >= self.y_limits[0]) & (y <= self.y_limits[1])
-        return dots(self.places(x[inside], y[inside]), kind)
+        return dots(self.points(x[inside], y[inside]), kind)
 
     def line(self, x: Array, y: Array, kind: str) -> str:
-        """A line that is broken where y is NaN, and cut off at the limits."""
-        return line(self.places(x, np.clip(y, *self.y_limits)), kind)
+        """A line that is broken where y is NaN, and clipped at the limits."""
+        return line(self.points(x, np.clip(y, *self.y_limits)), kind)
 
     def band(self, x: Array, low: Array, high: Array, kind: str) -> str:
         """The area between two lines, broken where one of them is NaN."""
         parts = []
-        for run in _runs(np.isfinite(low) & np.isfinite(high)):
-            part = run[:: max(1, len(run) // _MAX_POINTS)]
-            there, back = (self.places(x[part], np.clip(y[part], *self.y_limits)) for y in (high, low))
+        for segment in _segments(np.isfinite(low) & np.isfinite(high)):
+            part = segment[:: max(1, len(segment) // _MAX_POINTS)]
+            there, back = (self.points(x[part], np.clip(y[part], *self.y_limits)) for y in (high, low))
             parts.append(f"M{_joined(there)}L{_joined(back[::-1])}Z")
         return f'<path class="{kind}" d="{"".join(parts)}"/>' if parts else ""
 
-    def level(self, y: float, kind: str, text: str) -> str:
-        """A horizontal line with its name; nothing where it lies outside the limits."""
+    def horizontal(self, y: float, kind: str, text: str) -> str:
+        """A labelled horizontal line; empty where it lies outside the limits."""
         if not self.y_limits[0] <= y <= self.y_limits[1]:
             return ""
         at, above = float(self.y(y)), float(self.y(y)) > _TOP + 24
         name = f'<text class="{kind}" x="{WIDTH - _RIGHT}" y="{at + (-5 if above else 17):.1f}" '
         return f'{_segment(self.left, at, WIDTH - _RIGHT, at, kind)}{name}text-anchor="end">{escape(text)}</text>'
 
-    def upright(self, x: float, kind: str, text: str, row: int = 0) -> str:
-        """A vertical line with its name, in the first row of names or one below."""
+    def vertical(self, x: float, kind: str, text: str, row: int = 0) -> str:
+        """A labelled vertical line, with its label in a row from the top; empty outside the limits."""
         if not self.x_limits[0] <= x <= self.x_limits[1]:
             return ""
         at = float(self.x(x))
@@ -93,7 +93,7 @@ class Plot:
         return f'<path class="{kind}" d="{marks}"/>' if marks else ""
 
     def bars(self, edges: Array, counts: Array, kind: str) -> str:
-        """A histogram."""
+        """The bars of a histogram with edges (N + 1,) and counts (N,)."""
         left, right, top = self.x(edges[:-1]), self.x(edges[1:]), self.y(counts.astype(np.float64))
         foot = HEIGHT - _BOTTOM
         marks = "".join(
@@ -104,7 +104,7 @@ class Plot:
         return f'<path class="{kind}" d="{marks}"/>'
 
     def strip(self, x: Array, values: Sequence[str]) -> str:
-        """The background coloured by a word for each x, up to the next."""
+        """A background in the CSS class of each x, up to the next x."""
         parts, begin = [], 0
         ends = np.append(x[1:], x[-1:])
         for i in range(len(values)):
@@ -117,14 +117,14 @@ class Plot:
         return "".join(parts)
 
     def svg(self, label: str, x_label: str, marks: Sequence[str], *, rows: Sequence[str] = (), timed: bool) -> str:
-        """The chart.
+        """The complete chart.
 
         Args:
-            label: what it shows, for those who do not see it.
-            x_label: under the axis.
-            marks: what is drawn, from below upwards.
-            rows: names of y = 0, 1, ... in place of numbers.
-            timed: whether x is the page's time, on which its cursor moves.
+            label: alternative text.
+            x_label: label of the x axis.
+            marks: SVG elements, from bottom to top.
+            rows: labels of y = 0, 1, ... instead of numbers.
+            timed: whether x is time, so that the page's cursor is shown.
         """
         foot = HEIGHT - _BOTTOM
         grid = "".join(self._x_tick(v, t, i) for i, (v, t) in enumerate(ticks(*self.x_limits, 6)))
@@ -154,7 +154,7 @@ class Plot:
 
 
 def ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
-    """Round values within the limits, about ``count`` of them, and how they are written."""
+    """Round values within the limits, about ``count`` of them, with their labels."""
     rough = max(high - low, 1e-9) / count
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if power * m >= rough * 0.999)
@@ -163,42 +163,42 @@ def ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
     return [(n * step, f"{n * step + 0.0:,.{decimals}f}") for n in range(first, last + 1)]
 
 
-def dots(places: Array, kind: str) -> str:
-    """Round dots at (N, 2), each drawn once however many fall together; their size is the stroke's width."""
-    marks = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in _distinct(places))
+def dots(points: Array, kind: str) -> str:
+    """Round dots at (N, 2), each position drawn once; their size is the stroke width."""
+    marks = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in _distinct(points))
     return f'<path class="dots {kind}" d="{marks}"/>' if marks else ""
 
 
-def crosses(places: Array, kind: str, size: float) -> str:
-    """Diagonal crosses at (N, 2), with arms so long."""
+def crosses(points: Array, kind: str, size: float) -> str:
+    """Diagonal crosses at (N, 2), with arms of ``size``."""
     arms = f"l{2 * size:.1f} {2 * size:.1f}m0 {-2 * size:.1f}l{-2 * size:.1f} {2 * size:.1f}"
-    marks = "".join(f"M{x - size:.1f} {y - size:.1f}{arms}" for x, y in _distinct(places))
+    marks = "".join(f"M{x - size:.1f} {y - size:.1f}{arms}" for x, y in _distinct(points))
     return f'<path class="{kind}" d="{marks}"/>' if marks else ""
 
 
-def line(places: Array, kind: str) -> str:
-    """A line through (N, 2), broken where a place is NaN."""
-    runs = _runs(np.asarray(np.isfinite(places).all(axis=1), bool))
-    thin = max(1, sum(map(len, runs)) // _MAX_POINTS)
-    marks = "".join(f"M{_joined(places[run[::thin]])}" for run in runs)
+def line(points: Array, kind: str) -> str:
+    """A line through (N, 2), broken where a point is NaN."""
+    segments = _segments(np.asarray(np.isfinite(points).all(axis=1), bool))
+    thin = max(1, sum(map(len, segments)) // _MAX_POINTS)
+    marks = "".join(f"M{_joined(points[segment[::thin]])}" for segment in segments)
     return f'<path class="line {kind}" d="{marks}"/>' if marks else ""
 
 
-def _distinct(places: Array) -> Array:
-    """Those that are known and differ in what is written of them."""
-    return np.unique(np.round(places[np.isfinite(places).all(axis=1)], 1), axis=0)
+def _distinct(points: Array) -> Array:
+    """The finite points that differ after rounding to 0.1."""
+    return np.unique(np.round(points[np.isfinite(points).all(axis=1)], 1), axis=0)
 
 
-def _runs(known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Indices of what is known, cut where something between is not."""
+def _segments(known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Indices of true values, split where false ones lie between."""
     indices = np.flatnonzero(known)
     if not indices.size:
         return []
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 
 
-def _joined(places: Array) -> str:
-    return "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
+def _joined(points: Array) -> str:
+    return "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
 
 
 def _segment(x0: float, y0: float, x1: float, y1: float, kind: str) -> str:

@@ -1,4 +1,4 @@
-"""Several tracks of one flight in one chart: how many frames were answered how well, and how fast."""
+"""Comparison of several tracks of one flight: cumulative distributions of error and latency."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
 def draw_comparison(
     path: Path, tracks: Mapping[str, Sequence[TrackRow]], truth: Sequence[Truth] | None = None
 ) -> None:
-    """Draw the share of all frames that were answered within so many metres, and within so many milliseconds.
+    """Draw the cumulative share of all frames by horizontal error and by latency.
 
-    Refused frames are in the share, so that a curve's height at its end is the availability: a method that
-    answers little but well ends low, one that answers wrongly rises late.
+    Refused frames count in the share, so that a curve ends at the availability: a method that answers few frames
+    accurately ends low, one that answers inaccurately rises late.
 
     Args:
-        path: of the PNG file.
-        tracks: rows by the name of the run.
-        truth: in the order of time; without it only the times are drawn.
+        path: the PNG file.
+        tracks: rows by name of the run.
+        truth: in the order of time; without it only latencies are drawn.
     """
     from matplotlib.figure import Figure
 
@@ -42,8 +42,8 @@ def draw_comparison(
         panels.insert(0, ("horizontal error (m)", _errors_m(tracks, truth)))
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for ax, (label, values) in zip(axes, panels, strict=True):
-        for index, (name, found) in enumerate(values.items()):
-            _draw_share(ax, found, len(tracks[name]), name, index)
+        for index, (name, series) in enumerate(values.items()):
+            _draw_cumulative(ax, series, len(tracks[name]), name, index)
         ax.set(xscale="log", xlabel=label, ylabel="share of all frames", ylim=(-0.02, 1.02))
         ax.grid(color=GRID, linewidth=0.6)
         ax.spines[["top", "right"]].set_visible(False)
@@ -51,8 +51,8 @@ def draw_comparison(
     figure.savefig(path, dpi=DPI, facecolor="white")
 
 
-def _draw_share(ax: Any, values: Array, frames: int, name: str, index: int) -> None:
-    """A rising staircase, from the best value to the worst."""
+def _draw_cumulative(ax: Any, values: Array, frames: int, name: str, index: int) -> None:
+    """Draw an empirical cumulative distribution as steps."""
     order = np.sort(values[np.isfinite(values)])
     share = np.arange(1, order.size + 1) / max(1, frames)
     style = {

@@ -1,14 +1,13 @@
 """Plots of a track: the path over the map, position, height and error over time (the paper's Fig. 7 to 11).
 
 Convention:
-    Colours keep apart under every common colour blindness (Okabe and Ito): truth dark, fixes blue, refusals
-    vermilion. Nothing here touches matplotlib's global state, so that plots may be drawn beside others.
+    Colours are distinct under all common colour vision deficiencies (Okabe and Ito): truth dark, fixes blue,
+    refusals vermilion. matplotlib's global state is not used, so that other plots are unaffected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 
 from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M, Errors, Ground, errors_en_m, height_pairs_m, summarise
+from engine.report.metrics import FALSE_SIGMAS, WRONG_M, Ground
+from engine.report.plot_data import TrackPlotData, format_metres, larger_variance_m2, prepare_plot_data
 from engine.values import Truth, Window
 
 if TYPE_CHECKING:
@@ -27,33 +27,8 @@ Array = NDArray[np.float64]
 
 DPI = 130
 TRUTH, FIX, REFUSED, GRID = "#1a1a1a", "#0072B2", "#D55E00", "#d9d9d9"
-_MAP_PX = 1600  # longer side of the map as drawn; more would not show
-_GAP_S = 5.0  # a line of truth is broken where it says nothing for this long
-
-
-@dataclass(frozen=True, slots=True)
-class TrackPlotData:
-    """What every plot needs of a track, worked out once.
-
-    Attributes:
-        time: (N,) seconds since the first frame, or the frame's number where a stamp is missing.
-        time_label: the same in words.
-        errors: places of fixes and truth, (N, 2) each.
-        heights: (N, 2) measured and true height above the ground.
-        refused: (N,) whether the frame gave no position.
-        refused_en_m: (N, 2) where the frame was taken: truth, else between the fixes around it.
-        title: heading of every plot.
-        figures: one line of figures of merit.
-    """
-
-    time: Array
-    time_label: str
-    errors: Errors
-    heights: Array
-    refused: NDArray[np.bool_]
-    refused_en_m: Array
-    title: str
-    figures: str
+_MAX_MAP_PX = 1600  # longer side of the map as drawn; more is not visible
+_MAX_GAP_S = 5.0  # interval without truth over which its line is broken
 
 
 def draw_figures(
@@ -66,91 +41,44 @@ def draw_figures(
     frame: LocalFrame | None = None,
     ground: Ground | None = None,
 ) -> list[Path]:
-    """Draw path.png, position.png, and where there is something to show height.png and error.png.
+    """Draw path.png and position.png, and where data exists height.png and error.png.
 
     Args:
-        directory: where the files go; created where it does not exist.
+        directory: folder of the files, created where it does not exist.
         rows: the track.
         truth: in the order of time, or None.
-        site: the map under the path, or None for a blank ground.
+        site: the map under the path, or None for a blank background.
         title: heading of every plot.
-        frame: origin of east and north; None takes the map's, else the first known position.
-        ground: level of the ground; None takes flat ground at 0.
+        frame: origin of east and north; None uses the map's, else the first known position.
+        ground: level of the ground; None uses flat ground at 0.
 
     Returns:
-        The files that were written; none for a track in which no position is known at all.
+        Paths of the written files; empty for a track without any known position.
     """
     directory = Path(directory)
-    frame = frame or (site.frame if site is not None else _first_place(rows, truth))
+    frame = frame or (site.frame if site is not None else _first_position(rows, truth))
     if frame is None:
         return []
-    scene = scene_of(rows, truth, frame, ground or Ground(), title)
-    figures = {"path.png": _path(scene, site), "position.png": _position(scene)}
-    if np.isfinite(scene.heights[:, 0]).any():
-        figures["height.png"] = _height(scene)
-    if np.isfinite(scene.errors.distance_m).any():
-        figures["error.png"] = _error(scene)
+    plot_data = prepare_plot_data(rows, truth, frame, ground or Ground(), title)
+    figures = {"path.png": _path(plot_data, site), "position.png": _position(plot_data)}
+    if np.isfinite(plot_data.heights[:, 0]).any():
+        figures["height.png"] = _height(plot_data)
+    if np.isfinite(plot_data.errors.distance_m).any():
+        figures["error.png"] = _error(plot_data)
     directory.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
         figure.savefig(directory / name, dpi=DPI, facecolor="white")
     return [directory / name for name in figures]
 
 
-def _first_place(rows: Sequence[TrackRow], truth: Sequence[Truth] | None) -> LocalFrame | None:
+def _first_position(rows: Sequence[TrackRow], truth: Sequence[Truth] | None) -> LocalFrame | None:
     if truth:
         return LocalFrame(truth[0].lat_deg, truth[0].lon_deg)
-    places = ((row.lat_deg, row.lon_deg) for row in rows)
-    return next((LocalFrame(lat, lon) for lat, lon in places if lat is not None and lon is not None), None)
+    positions = ((row.lat_deg, row.lon_deg) for row in rows)
+    return next((LocalFrame(lat, lon) for lat, lon in positions if lat is not None and lon is not None), None)
 
 
-def scene_of(
-    rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: LocalFrame, ground: Ground, title: str
-) -> TrackPlotData:
-    """Work out what plots need of a track."""
-    stamps = [row.timestamp_ns for row in rows]
-    known = [stamp for stamp in stamps if stamp is not None]
-    if rows and len(known) == len(rows):
-        time, label = np.array([(stamp - known[0]) / 1e9 for stamp in known]), "time (s)"
-    else:
-        time, label = np.arange(len(rows), dtype=np.float64), "frame"
-    errors = errors_en_m(rows, truth, frame)
-    refused = np.array([not row.fixed for row in rows], dtype=bool)
-    return TrackPlotData(
-        time=time,
-        time_label=label,
-        errors=errors,
-        heights=height_pairs_m(rows, truth, ground),
-        refused=refused,
-        refused_en_m=_refused_places(time, errors, refused),
-        title=title,
-        figures=_figures_of_merit(summarise(rows, truth, frame=frame, ground=ground)),
-    )
-
-
-def _refused_places(time: Array, errors: Errors, refused: NDArray[np.bool_]) -> Array:
-    fixed = np.isfinite(errors.fix_en_m[:, 0])
-    places = errors.truth_en_m.copy()
-    if fixed.any():
-        between = np.stack([np.interp(time, time[fixed], errors.fix_en_m[fixed, axis]) for axis in (0, 1)], axis=1)
-        places = np.where(np.isfinite(places), places, between)
-    places[~refused] = np.nan
-    return places
-
-
-def _figures_of_merit(summary: dict[str, Any]) -> str:
-    parts = [f"{summary['fixes']} of {summary['frames']} frames fixed"]
-    if summary.get("rms_m") is not None:
-        parts += [f"{name} {_metres(summary[key])}" for name, key in (("RMS", "rms_m"), ("median", "median_m"))]
-        parts += [f"95 % within {_metres(summary['r95_m'])}", f"{summary['false_fixes']} false"]
-    return ", ".join(parts)
-
-
-def _metres(value: float) -> str:
-    """Centimetres where they mean something; a wild value keeps to its line."""
-    return f"{value:.2f} m" if abs(value) < 1e5 else f"{value:.1e} m"
-
-
-def _new_figure(scene: TrackPlotData, size_in: tuple[float, float], panels: int = 1) -> tuple[Any, list[Any]]:
+def _new_figure(plot_data: TrackPlotData, size_in: tuple[float, float], panels: int = 1) -> tuple[Any, list[Any]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size_in, layout="constrained")
@@ -160,13 +88,13 @@ def _new_figure(scene: TrackPlotData, size_in: tuple[float, float], panels: int 
         ax.grid(True, color=GRID, linewidth=0.6)
         ax.set_axisbelow(True)
         ax.tick_params(labelsize=9)
-    heading = [line for line in (scene.title, scene.figures) if line]
+    heading = [line for line in (plot_data.title, plot_data.figures) if line]
     axes[0].set_title("\n".join(heading), fontsize=10.5, loc="left")
     return figure, list(axes)
 
 
 def _legend(figure: Any, axes: Sequence[Any]) -> None:
-    """One legend for all panels, below them."""
+    """One legend for all axes, below them."""
     by_label = {
         label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
@@ -177,17 +105,17 @@ def _legend(figure: Any, axes: Sequence[Any]) -> None:
 
 
 def _line(time: Array, values: Array) -> tuple[Array, Array]:
-    """A line that is broken where nothing is known for a while and not where single values are missing."""
+    """A line that is broken at long gaps but not at single missing values."""
     known = np.isfinite(values)
     time, values = time[known], values[known]
     steps = np.diff(time)
-    usual = float(np.median(steps)) if steps.size else 0.0
-    breaks = np.flatnonzero(steps > max(_GAP_S, 3.0 * usual)) + 1
+    median_step = float(np.median(steps)) if steps.size else 0.0
+    breaks = np.flatnonzero(steps > max(_MAX_GAP_S, 3.0 * median_step)) + 1
     return np.insert(time, breaks, np.nan), np.insert(values, breaks, np.nan)
 
 
 def _draw_series(ax: Any, time: Array, fix: Array, truth: Array) -> None:
-    """Truth as a line and fixes as dots upon it."""
+    """Draw truth as a line and fixes as dots on top."""
     if np.isfinite(truth).any():
         ax.plot(*_line(time, truth), color=TRUTH, linewidth=1.1, label="truth", zorder=2)
     ax.plot(time, fix, ".", color=FIX, markersize=4.5, markeredgewidth=0, label="fix", zorder=3)
@@ -201,16 +129,18 @@ def _draw_refused(ax: Any, x: Array, y: Array) -> None:
 # ------------------------------------------------------------------------------------------------ Fig. 7, 9
 
 
-def _path(scene: TrackPlotData, site: OrthoMap | None) -> Any:
-    low, high = _view(scene)
+def _path(plot_data: TrackPlotData, site: OrthoMap | None) -> Any:
+    low, high = _view(plot_data)
     span = high - low
     width_in = 8.0
-    figure, (ax,) = _new_figure(scene, (width_in, float(np.clip(width_in * span[1] / span[0], 3.4, 9.0)) + 0.9))
+    figure, (ax,) = _new_figure(
+        plot_data, (width_in, float(np.clip(width_in * span[1] / span[0], 3.4, 9.0)) + 0.9)
+    )
     ax.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
     if site is not None:
         ax.grid(False)
         _draw_map(ax, site, low, high)
-    fix, truth = scene.errors.fix_en_m, scene.errors.truth_en_m
+    fix, truth = plot_data.errors.fix_en_m, plot_data.errors.truth_en_m
     if np.isfinite(truth).any():
         order = np.isfinite(truth[:, 0])
         ax.plot(*truth[order].T, color="white", linewidth=3.2, alpha=0.8, zorder=2, solid_joinstyle="round")
@@ -219,7 +149,7 @@ def _path(scene: TrackPlotData, site: OrthoMap | None) -> Any:
         fixed = np.isfinite(fix[:, 0])
         ax.plot(*fix[fixed].T, color=FIX, linewidth=0.7, alpha=0.7, zorder=2)
     ax.scatter(*fix.T, s=17, color=FIX, edgecolors="white", linewidths=0.5, label="fix", zorder=3)
-    _draw_refused(ax, scene.refused_en_m[:, 0], scene.refused_en_m[:, 1])
+    _draw_refused(ax, plot_data.refused_en_m[:, 0], plot_data.refused_en_m[:, 1])
     _note_outside(ax, np.any((fix < low) | (fix > high), axis=1))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _legend(figure, [ax])
@@ -241,10 +171,10 @@ def _note_outside(ax: Any, outside: NDArray[np.bool_]) -> None:
         )
 
 
-def _view(scene: TrackPlotData) -> tuple[Array, Array]:
-    """The corners of what is shown: the flight with a margin; one fix that is far off does not shrink it."""
-    truth = scene.errors.truth_en_m
-    shown = truth if np.isfinite(truth).any() else scene.errors.fix_en_m
+def _view(plot_data: TrackPlotData) -> tuple[Array, Array]:
+    """Lower and upper corner (2,) of the view in metres: the flight with a margin; outliers do not enlarge it."""
+    truth = plot_data.errors.truth_en_m
+    shown = truth if np.isfinite(truth).any() else plot_data.errors.fix_en_m
     if not np.isfinite(shown).any():
         shown = np.zeros((1, 2))
     low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
@@ -253,7 +183,7 @@ def _view(scene: TrackPlotData) -> tuple[Array, Array]:
 
 
 def _draw_map(ax: Any, site: OrthoMap, low: Array, high: Array) -> None:
-    """The part of the map in view, in pale grey; it may be turned against north."""
+    """Draw the part of the map in view in pale grey; its grid may be rotated against north."""
     from matplotlib.transforms import Affine2D
 
     crop = _crop(site, low, high)
@@ -287,12 +217,12 @@ def _draw_map(ax: Any, site: OrthoMap, low: Array, high: Array) -> None:
 
 
 def _crop(site: OrthoMap, low: Array, high: Array) -> tuple[Window, int] | None:
-    """The window that covers the view at the coarsest level that still shows, or None where no map is."""
+    """Window and pyramid level that cover the view at sufficient resolution, or None outside the map."""
     corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
     pixels = np.asarray(site.pixel_from_enu(corners), dtype=np.float64)
     first, last = pixels.min(axis=0), pixels.max(axis=0)
     level = 0
-    while level + 1 < site.levels and (last - first).max() > _MAP_PX << level:
+    while level + 1 < site.levels and (last - first).max() > _MAX_MAP_PX << level:
         level += 1
     height_px, width_px = site.level_shape(level)
     x0, y0 = (max(0, int(np.floor((v + 0.5) / 2**level))) for v in first)
@@ -304,21 +234,21 @@ def _crop(site: OrthoMap, low: Array, high: Array) -> tuple[Window, int] | None:
 # ----------------------------------------------------------------------------------------------- Fig. 8, 10
 
 
-def _position(scene: TrackPlotData) -> Any:
-    figure, axes = _new_figure(scene, (9.0, 6.0), panels=2)
+def _position(plot_data: TrackPlotData) -> Any:
+    figure, axes = _new_figure(plot_data, (9.0, 6.0), panels=2)
     for axis, (ax, name) in enumerate(zip(axes, ("east (m)", "north (m)"), strict=True)):
-        fix, truth = scene.errors.fix_en_m[:, axis], scene.errors.truth_en_m[:, axis]
-        _draw_series(ax, scene.time, fix, truth)
-        _draw_refused(ax, scene.time, scene.refused_en_m[:, axis])
+        fix, truth = plot_data.errors.fix_en_m[:, axis], plot_data.errors.truth_en_m[:, axis]
+        _draw_series(ax, plot_data.time, fix, truth)
+        _draw_refused(ax, plot_data.time, plot_data.refused_en_m[:, axis])
         ax.set_ylabel(name)
         _limit(ax, truth if np.isfinite(truth).any() else fix, fix)
-    axes[-1].set_xlabel(scene.time_label)
+    axes[-1].set_xlabel(plot_data.time_label)
     _legend(figure, axes)
     return figure
 
 
 def _limit(ax: Any, shown: Array, points: Array) -> None:
-    """Limits from ``shown`` with a margin; points beyond them become triangles at the edge."""
+    """Set limits from ``shown`` with a margin; points beyond them become triangles at the edge."""
     if not np.isfinite(shown).any():
         return
     low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
@@ -341,29 +271,29 @@ def _clip(ax: Any, low: float, high: float, points: Array) -> None:
 # -------------------------------------------------------------------------------------------------- Fig. 11
 
 
-def _height(scene: TrackPlotData) -> Any:
-    figure, (ax,) = _new_figure(scene, (9.0, 4.2))
-    fix, truth = scene.heights.T
-    _draw_series(ax, scene.time, fix, truth)
+def _height(plot_data: TrackPlotData) -> Any:
+    figure, (ax,) = _new_figure(plot_data, (9.0, 4.2))
+    fix, truth = plot_data.heights.T
+    _draw_series(ax, plot_data.time, fix, truth)
     difference = (fix - truth)[np.isfinite(fix - truth)]
     if difference.size:
         rms, bias = float(np.sqrt(np.mean(difference**2))), float(difference.mean())
-        heading = f"{scene.title}\nheight: RMS {_metres(rms)}, bias {_metres(bias)}"
+        heading = f"{plot_data.title}\nheight: RMS {format_metres(rms)}, bias {format_metres(bias)}"
         ax.set_title(heading.strip(), fontsize=10.5, loc="left")
-    ax.set(xlabel=scene.time_label, ylabel="height above the ground (m)")
+    ax.set(xlabel=plot_data.time_label, ylabel="height above the ground (m)")
     low, high = np.percentile(fix[np.isfinite(fix)], [2.0, 98.0])
-    if np.isfinite(truth).any():  # heights that are beyond sense do not shrink the sensible ones
+    if np.isfinite(truth).any():  # implausible heights do not enlarge the scale
         low, high = np.clip([low, high], 0.5 * np.nanmin(truth) - 5.0, 1.5 * np.nanmax(truth) + 5.0)
     _limit(ax, np.append(truth, [low, high]), fix)
-    _draw_rug(ax, scene)
+    _draw_rug(ax, plot_data)
     _legend(figure, [ax])
     return figure
 
 
-def _draw_rug(ax: Any, scene: TrackPlotData) -> None:
-    """Refusals as ticks along the lower edge, where there is no value to mark them at."""
-    if scene.refused.any():
-        time = scene.time[scene.refused]
+def _draw_rug(ax: Any, plot_data: TrackPlotData) -> None:
+    """Draw refusals, which have no value, as ticks along the lower edge."""
+    if plot_data.refused.any():
+        time = plot_data.time[plot_data.refused]
         edge, low = ax.get_xaxis_transform(), np.full(time.size, 0.02)
         ax.plot(time, low, "|", color=REFUSED, markersize=7, transform=edge, label="refused")
 
@@ -371,30 +301,24 @@ def _draw_rug(ax: Any, scene: TrackPlotData) -> None:
 # -------------------------------------------------------------------------------------------- error in time
 
 
-def _error(scene: TrackPlotData) -> Any:
-    figure, (ax,) = _new_figure(scene, (9.0, 4.2))
-    distance = scene.errors.distance_m
-    sigma = np.sqrt(_larger_axis_m2(scene.errors.covariance_en_m2))
+def _error(plot_data: TrackPlotData) -> Any:
+    figure, (ax,) = _new_figure(plot_data, (9.0, 4.2))
+    distance = plot_data.errors.distance_m
+    sigma = np.sqrt(larger_variance_m2(plot_data.errors.covariance_en_m2))
     known = np.isfinite(sigma)
     for factor, alpha in ((FALSE_SIGMAS, 0.13), (1.0, 0.22)):
         band = np.where(known, factor * sigma, np.nan)
         label = f"{factor:g} σ as stated"
-        ax.fill_between(scene.time, 0.0, band, color=FIX, alpha=alpha, linewidth=0, label=label, zorder=1)
-    ax.plot(scene.time, distance, ".", color=FIX, markersize=4.5, markeredgewidth=0, label="fix", zorder=3)
-    ordinary = [4.0 * float(np.nanmedian(distance)), 1.2 * float(np.nanpercentile(distance, 95))]
+        ax.fill_between(plot_data.time, 0.0, band, color=FIX, alpha=alpha, linewidth=0, label=label, zorder=1)
+    ax.plot(plot_data.time, distance, ".", color=FIX, markersize=4.5, markeredgewidth=0, label="fix", zorder=3)
+    limits = [4.0 * float(np.nanmedian(distance)), 1.2 * float(np.nanpercentile(distance, 95))]
     if known.any():
-        ordinary.append(1.15 * FALSE_SIGMAS * float(np.nanpercentile(sigma, 90)))
-    top = max(min(max(ordinary), 1.1 * max(float(np.nanmax(distance)), ordinary[-1])), 0.5)
+        limits.append(1.15 * FALSE_SIGMAS * float(np.nanpercentile(sigma, 90)))
+    top = max(min(max(limits), 1.1 * max(float(np.nanmax(distance)), limits[-1])), 0.5)
     if top > WRONG_M:
         ax.axhline(WRONG_M, color=TRUTH, linewidth=0.9, linestyle=(0, (4, 3)), label=f"wrong above {WRONG_M:g} m")
     _clip(ax, 0.0, top, distance)
-    _draw_rug(ax, scene)
-    ax.set(xlabel=scene.time_label, ylabel="horizontal error (m)")
+    _draw_rug(ax, plot_data)
+    ax.set(xlabel=plot_data.time_label, ylabel="horizontal error (m)")
     _legend(figure, [ax])
     return figure
-
-
-def _larger_axis_m2(covariance: Array) -> Array:
-    """Largest eigenvalue of symmetric (N, 2, 2), NaN passing through."""
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    return np.asarray((a + c) / 2.0 + np.hypot((a - c) / 2.0, b), dtype=np.float64)

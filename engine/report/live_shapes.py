@@ -1,4 +1,4 @@
-"""What the live view is made of: the engine's values as shapes of rerun, and the layout of its viewer."""
+"""Shapes of the live view: conversion of the engine's values to rerun archetypes, and the viewer's layout."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SIGMAS = 3.0
-"""Of the ellipsoid about a fix."""
+"""Size of the ellipsoid about a fix, in standard deviations."""
 FIX_RGB = (0, 158, 115)
 """Colour of fixes."""
-_MAP_PX = 1024  # longer side of the map's picture
-_LATTICE = 17  # places a side over which the map is drawn
-_ABOVE_M = 1.0  # outlines over the ground that they lie on
-_MARGIN = 238  # grey of what fills a picture up to its size
+_MAX_MAP_PX = 1024  # longer side of the map's texture
+_MESH_SIDE = 17  # vertices per side of the map's mesh
+_OUTLINE_OFFSET_M = 1.0  # of outlines above the ground
+_PADDING_GREY = 238
 
 
 def blueprint(site: OrthoMap) -> Any:
-    """How the viewer is laid out: the world on the left, the newest frame on the right, its history below."""
-    ever = rr.VisibleTimeRange(
+    """Layout of the viewer: the world on the left, the newest frame on the right, time series below."""
+    all_times = rr.VisibleTimeRange(
         "frame", start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )
     side_m = min(float(max(site.width_px, site.height_px)) * site.gsd_m_per_px, 3000.0)
@@ -41,7 +41,7 @@ def blueprint(site: OrthoMap) -> Any:
         name="World",
         eye_controls=eye,
         line_grid=False,
-        overrides={"world/fixes": rrb.VisibleTimeRanges([ever])},
+        overrides={"world/fixes": rrb.VisibleTimeRanges([all_times])},
     )
     names = {"frame": "Frame", "rectified": "Rectified", "window": "Window", "surface": "Correlation"}
     pictures = [rrb.Spatial2DView(origin=origin, name=name) for origin, name in names.items()]
@@ -64,18 +64,18 @@ def blueprint(site: OrthoMap) -> Any:
 
 
 def map_mesh(site: OrthoMap) -> Any:
-    """The map as a textured sheet on its bare ground, in metres east, north and up."""
+    """The map as a textured mesh on its ground, in metres east, north and up."""
     level = 0
-    while max(site.level_shape(level)) > _MAP_PX and level + 1 < site.levels:
+    while max(site.level_shape(level)) > _MAX_MAP_PX and level + 1 < site.levels:
         level += 1
     rows, columns = site.level_shape(level)
     gray = site.gray(Window(0, 0, columns, rows), level)
-    u, v = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(0.0, 1.0, _LATTICE)]))
+    u, v = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(0.0, 1.0, _MESH_SIDE)]))
     at_px = site.full_from_level(np.stack([u * columns, v * rows], axis=-1) - 0.5, level)
-    heights = site.ground_m if not site.has_surface else [site.ground_at(place) for place in at_px]
+    heights = site.ground_m if not site.has_surface else [site.ground_at(xy) for xy in at_px]
     vertices = np.column_stack([site.enu_from_pixel(at_px), np.broadcast_to(heights, len(at_px))])
-    first = np.arange(_LATTICE * (_LATTICE - 1)).reshape(_LATTICE - 1, _LATTICE)[:, :-1].ravel()
-    a, b, c, d = first, first + 1, first + _LATTICE, first + _LATTICE + 1
+    first = np.arange(_MESH_SIDE * (_MESH_SIDE - 1)).reshape(_MESH_SIDE - 1, _MESH_SIDE)[:, :-1].ravel()
+    a, b, c, d = first, first + 1, first + _MESH_SIDE, first + _MESH_SIDE + 1
     triangles = np.concatenate([np.stack([a, c, b], axis=-1), np.stack([b, c, d], axis=-1)])
     texture = np.repeat(gray[:, :, None], 3, axis=2)
     return rr.Mesh3D(
@@ -87,12 +87,12 @@ def map_mesh(site: OrthoMap) -> Any:
 
 
 def ellipsoid(center_m: Array, covariance_m2: Array) -> Any:
-    """The ellipsoid of :data:`SIGMAS` about a place."""
+    """The error ellipsoid of :data:`SIGMAS` about a position (3,), by its covariance (3, 3)."""
     variances, axes = np.linalg.eigh(covariance_m2)
-    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not a mirror
-    turn = cv2.Rodrigues(axes)[0].ravel()
-    angle = float(np.linalg.norm(turn))
-    axis = turn / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not a reflection
+    rotation = cv2.Rodrigues(axes)[0].ravel()
+    angle = float(np.linalg.norm(rotation))
+    axis = rotation / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
     return rr.Ellipsoids3D(
         half_sizes=[SIGMAS * np.sqrt(np.maximum(variances, 0.0))],
         centers=[center_m],
@@ -102,40 +102,40 @@ def ellipsoid(center_m: Array, covariance_m2: Array) -> Any:
 
 
 def outline(site: OrthoMap, corners_px: Array, colour: tuple[int, int, int]) -> Any:
-    """A closed line over the surface through places (4, 2) of the map."""
-    strip = np.column_stack([site.enu_from_pixel(corners_px), site.surface_at(corners_px) + _ABOVE_M])
-    return rr.LineStrips3D([closed(strip)], colors=colour, radii=rr.Radius.ui_points(1.0))
+    """A closed line above the surface through map pixels (4, 2)."""
+    strip = np.column_stack([site.enu_from_pixel(corners_px), site.surface_at(corners_px) + _OUTLINE_OFFSET_M])
+    return rr.LineStrips3D([closed_polyline(strip)], colors=colour, radii=rr.Radius.ui_points(1.0))
 
 
 def corners(window: Window) -> Array:
-    """(4, 2) along the pixels' edges."""
+    """Corners (4, 2) of a window in map pixels, at the outer edges of its pixels."""
     width, height = window.width_px, window.height_px
     sides = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
     return np.asarray(sides + np.array([window.x0, window.y0]) - 0.5, np.float64)
 
 
-def closed(places: Array) -> Array:
-    """(N + 1, ...) the same, and the first once more."""
-    return np.asarray(np.concatenate([places, places[:1]]), np.float64)
+def closed_polyline(points: Array) -> Array:
+    """Points (N, ...) with the first appended, (N + 1, ...)."""
+    return np.asarray(np.concatenate([points, points[:1]]), np.float64)
 
 
 def jpeg(image: Image) -> Any:
-    """(H, W) or (H, W, 3) RGB."""
+    """An image (H, W) grey or (H, W, 3) RGB as JPEG."""
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
     return rr.EncodedImage(contents=data, media_type="image/jpeg")
 
 
-def scaled(image: Image, side_px: int) -> Image:
-    """Scaled to a longer side."""
+def resized(image: Image, side_px: int) -> Image:
+    """Resize an image so that its longer side is ``side_px``."""
     scale = side_px / max(image.shape[:2])
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
+    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
 
 
-def filled(image: Image, width_px: int = SIDE_PX) -> Image:
-    """Filled up below and on the right: the viewer complains where the pictures of an entity differ in size."""
+def padded(image: Image, width_px: int = SIDE_PX) -> Image:
+    """Pad an image below and on the right: the viewer requires one size for all images of an entity."""
     down, right = max(0, SIDE_PX - image.shape[0]), max(0, width_px - image.shape[1])
-    full = cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_CONSTANT, value=3 * [_MARGIN])
+    full = cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_CONSTANT, value=3 * [_PADDING_GREY])
     return np.asarray(full[:SIDE_PX, :width_px], np.uint8)

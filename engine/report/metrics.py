@@ -1,8 +1,8 @@
-"""summary.json: how many frames were fixed, how fast, and with truth how well.
+"""summary.json: availability, latency and, with truth, accuracy of a track.
 
 Convention:
-    An error is fix less truth, in metres east and north. A frame is scored where it has a fix and truth is
-    known for its moment; frames without truth are counted, not scored.
+    An error is fix minus truth, in metres east and north. A frame is scored where it has a fix and truth is known
+    at its time; frames without truth are counted, not scored.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from engine.values import Truth
 Array = NDArray[np.float64]
 
 WRONG_M = 10.0
-"""An error above this is a wrong fix, whatever the fix said of itself."""
+"""A fix with a larger error is wrong, whatever its stated sigma."""
 FALSE_SIGMAS = 3.0
-"""A wrong fix that is further off than this many of its own sigmas is false."""
-_FLOOR_M2 = 1e-6  # a millimetre: keeps a covariance that was written with few digits invertible
+"""A wrong fix whose error exceeds this many of its own sigmas is false."""
+_FLOOR_M2 = 1e-6  # (1 mm)^2: keeps covariances that were rounded when written invertible
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +43,14 @@ class Ground:
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
-    """Errors of every row of a track; NaN where a row is not scored.
+class TrackErrors:
+    """Errors of each row of a track; NaN where a row is not scored.
 
     Attributes:
         truth_en_m: (N, 2) true position; NaN where unknown.
         fix_en_m: (N, 2) position of the fix; NaN where refused.
-        error_en_m: (N, 2) fix less truth.
-        covariance_en_m2: (N, 2, 2) as the fix stated it.
+        error_en_m: (N, 2) fix minus truth.
+        covariance_en_m2: (N, 2, 2) covariance that the fix states.
     """
 
     truth_en_m: Array
@@ -60,12 +60,12 @@ class Errors:
 
     @property
     def distance_m(self) -> Array:
-        """Horizontal error (N,)."""
+        """(N,) horizontal error in metres."""
         return np.asarray(np.hypot(self.error_en_m[:, 0], self.error_en_m[:, 1]), dtype=np.float64)
 
     @property
-    def squared_sigmas(self) -> Array:
-        """Normalised squared error e^T C^-1 e (N,); its mean is 2 where the covariance tells the truth."""
+    def normalised_squared_errors(self) -> Array:
+        """(N,) normalised squared error e^T C^-1 e; its mean (NEES) is 2 where the covariance is consistent."""
         c = self.covariance_en_m2 + _FLOOR_M2 * np.eye(2)
         e, n = self.error_en_m[:, 0], self.error_en_m[:, 1]
         determinant = np.maximum(c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] ** 2, _FLOOR_M2**2)
@@ -73,21 +73,24 @@ class Errors:
         return np.asarray(weighted / determinant, dtype=np.float64)
 
 
-def truth_of_rows(rows: Sequence[TrackRow], truth: Sequence[Truth]) -> list[Truth | None]:
-    """The truth at each row's moment, or None."""
+def truth_per_row(rows: Sequence[TrackRow], truth: Sequence[Truth]) -> list[Truth | None]:
+    """The truth interpolated at the time of each row, or None."""
     return [None if row.timestamp_ns is None else interpolate_truth(truth, row.timestamp_ns) for row in rows]
 
 
-def errors_en_m(rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: LocalFrame) -> Errors:
-    """Place fixes and truth in one local frame and subtract.
+def errors_en_m(rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: LocalFrame) -> TrackErrors:
+    """Convert fixes and truth to one local frame and subtract.
 
     Args:
-        rows: the track.
+        rows: the track, N rows.
         truth: in the order of time, or None.
         frame: origin of east and north.
+
+    Returns:
+        Positions, errors and covariances in metres, N rows each.
     """
-    true_places = [(t.lat_deg, t.lon_deg) if t else (np.nan, np.nan) for t in truth_of_rows(rows, truth or [])]
-    fix_places = [
+    true_lat_lon = [(t.lat_deg, t.lon_deg) if t else (np.nan, np.nan) for t in truth_per_row(rows, truth or [])]
+    fix_lat_lon = [
         (row.lat_deg, row.lon_deg) if row.lat_deg is not None and row.lon_deg is not None else (np.nan, np.nan)
         for row in rows
     ]
@@ -97,20 +100,28 @@ def errors_en_m(rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: 
             cross = row.covariance_en_m2 or 0.0
             covariance[i] = [[row.sigma_east_m**2, cross], [cross, row.sigma_north_m**2]]
     truth_en, fix_en = (
-        frame.enu_from_geodetic(*np.array(places, dtype=np.float64).reshape(-1, 2).T)
-        for places in (true_places, fix_places)
+        frame.enu_from_geodetic(*np.array(lat_lon, dtype=np.float64).reshape(-1, 2).T)
+        for lat_lon in (true_lat_lon, fix_lat_lon)
     )
-    return Errors(truth_en, fix_en, fix_en - truth_en, covariance)
+    return TrackErrors(truth_en, fix_en, fix_en - truth_en, covariance)
 
 
 def height_pairs_m(rows: Sequence[TrackRow], truth: Sequence[Truth] | None, ground: Ground) -> Array:
-    """Height above the ground (N, 2) as measured and in truth; NaN where unknown.
+    """Measured and true heights above the ground.
 
-    The ground is one level: with it, truth above sea level is compared where ``ground.ground_amsl_m`` is
-    known, else truth above the ground.
+    The ground is one level. True heights above the sea are used where ``ground.ground_amsl_m`` is known, else true
+    heights above the ground.
+
+    Args:
+        rows: the track, N rows.
+        truth: in the order of time, or None.
+        ground: level of the ground.
+
+    Returns:
+        (N, 2) measured and true heights in metres; NaN where unknown.
     """
     pairs = np.full((len(rows), 2), np.nan)
-    for i, (row, t) in enumerate(zip(rows, truth_of_rows(rows, truth or []), strict=True)):
+    for i, (row, t) in enumerate(zip(rows, truth_per_row(rows, truth or []), strict=True)):
         if row.up_m is not None:
             pairs[i, 0] = row.up_m - ground.ground_m
         if t is not None and t.alt_amsl_m is not None and ground.ground_amsl_m is not None:
@@ -127,13 +138,13 @@ def summarise(
     frame: LocalFrame | None = None,
     ground: Ground | None = None,
 ) -> dict[str, Any]:
-    """Figures of merit of a track, as JSON can hold them; what cannot be known is None.
+    """Figures of merit of a track as JSON values; what is unknown is None.
 
     Args:
-        rows: the track, one row a frame.
+        rows: the track, one row per frame.
         truth: in the order of time, or None.
-        frame: origin of east and north; None takes the first true position.
-        ground: level of the ground; None takes flat ground at 0.
+        frame: origin of east and north; None uses the first true position.
+        ground: level of the ground; None uses flat ground at 0.
 
     Returns:
         ``frames``, ``fixes``, ``availability``, ``status``, ``reasons``, ``method``, ``methods``,
@@ -162,7 +173,7 @@ def summarise(
 
 
 def _counts(values: Any) -> dict[str, int]:
-    """How often each value occurs, the most frequent first and equals by name."""
+    """Number of occurrences of each value, most frequent first, ties by name."""
     return dict(sorted(Counter(values).items(), key=lambda item: (-item[1], item[0])))
 
 
@@ -173,21 +184,21 @@ def _latency(values: list[float]) -> dict[str, float | None]:
     return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(max(values))}
 
 
-def _accuracy(errors: Errors) -> dict[str, Any]:
+def _accuracy(errors: TrackErrors) -> dict[str, Any]:
     scored = np.isfinite(errors.distance_m)
-    distance, squared_sigmas = errors.distance_m[scored], errors.squared_sigmas[scored]
-    some = distance.size > 0
+    distance, normalised_squared_errors = errors.distance_m[scored], errors.normalised_squared_errors[scored]
+    has_scores = distance.size > 0
     wrong = distance > WRONG_M
-    # NaN, a fix without sigma, is not "within three sigma": it counts as false where it is wrong.
-    false = wrong & ~(squared_sigmas <= FALSE_SIGMAS**2)
-    stated = squared_sigmas[np.isfinite(squared_sigmas)]
+    # NaN, of a fix without sigma, is not within three sigmas: a wrong one counts as false.
+    false = wrong & ~(normalised_squared_errors <= FALSE_SIGMAS**2)
+    stated = normalised_squared_errors[np.isfinite(normalised_squared_errors)]
     return {
         "frames_without_truth": int(np.isnan(errors.truth_en_m[:, 0]).sum()),
         "scored_fixes": int(distance.size),
-        "rms_m": float(np.sqrt(np.mean(distance**2))) if some else None,
-        "median_m": float(np.median(distance)) if some else None,
-        "r95_m": float(np.percentile(distance, 95)) if some else None,
-        "max_m": float(distance.max()) if some else None,
+        "rms_m": float(np.sqrt(np.mean(distance**2))) if has_scores else None,
+        "median_m": float(np.median(distance)) if has_scores else None,
+        "r95_m": float(np.percentile(distance, 95)) if has_scores else None,
+        "max_m": float(distance.max()) if has_scores else None,
         "wrong_over_10m": int(wrong.sum()),
         "false_fixes": int(false.sum()),
         "nees_mean": float(stated.mean()) if stated.size else None,

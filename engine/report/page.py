@@ -1,4 +1,4 @@
-"""report.html: one page that holds all of a track, its verdict first. It needs no network and no other file."""
+"""report.html: a self-contained page on a track, its verdict first; it needs no network and no other file."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import cv2
 import numpy as np
 import torch
 
-from engine.formats.notes import Note
+from engine.formats.notes import FrameNote
 from engine.formats.track import TrackRow
 from engine.orthomap import OrthoMap
 from engine.report.explain import SliderFrame
-from engine.report.figures import TrackPlotData, scene_of
 from engine.report.metrics import WRONG_M, Ground
 from engine.report.page_charts import draw_charts
-from engine.report.page_map import TrackMap, draw_map, map_of
+from engine.report.page_map import TrackMap, draw_map, map_of_track
+from engine.report.plot_data import TrackPlotData, prepare_plot_data
 from engine.report.verdict import MEANINGS, metres, verdict_of
 from engine.values import Reason, Truth, Window
 
@@ -37,15 +37,15 @@ _FACTS = {
 
 @dataclass(frozen=True, slots=True)
 class FinishedTrack:
-    """A finished track with what is known of it.
+    """A finished track with all inputs of its report.
 
     Attributes:
         rows: the track.
         truth: in the order of time, or None.
         site: the map.
         ground: level of the ground.
-        summary: as in summary.json, its settings included.
-        notes: one a row, or None where the run left none.
+        summary: contents of summary.json, its settings included.
+        notes: one per row, or None where the run left none.
     """
 
     rows: Sequence[TrackRow]
@@ -53,59 +53,59 @@ class FinishedTrack:
     site: OrthoMap
     ground: Ground
     summary: Mapping[str, Any]
-    notes: Sequence[Note] | None
+    notes: Sequence[FrameNote] | None
 
-    def scene(self) -> TrackPlotData:
-        """What is drawn of it."""
-        return scene_of(self.rows, self.truth, self.site.frame, self.ground, "")
+    def plot_data(self) -> TrackPlotData:
+        """Plot data of the track."""
+        return prepare_plot_data(self.rows, self.truth, self.site.frame, self.ground, "")
 
 
-def write_page(path: Path, flown: FinishedTrack, shown: Sequence[SliderFrame] = (), why_not: str = "") -> None:
+def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = (), why_not: str = "") -> None:
     """Write the page; equal inputs give equal bytes.
 
     Args:
-        path: of the file, replaced where it exists.
-        flown: what it tells of.
-        shown: frames with their pictures.
-        why_not: where there are none, the reason.
+        path: the file, replaced where it exists.
+        track: the track.
+        shown: frames of the slider with their images.
+        why_not: reason why there are none.
     """
-    scene, record = flown.scene(), flown.summary["settings"]
-    track_map = map_of(flown.site, scene)
-    verdict = verdict_of(flown.summary, _sigma_m(flown.rows), record.get("budget_ms"))
-    charts = draw_charts(flown.rows, flown.notes, scene, record.get("budget_ms"))
-    heading, subheading = _headings(flown, scene)
-    frames = [_frame(one, flown, scene, track_map) for one in shown]
+    plot_data, settings = track.plot_data(), track.summary["settings"]
+    track_map = map_of_track(track.site, plot_data)
+    verdict = verdict_of(track.summary, _median_sigma_m(track.rows), settings.get("budget_ms"))
+    charts = draw_charts(track.rows, track.notes, plot_data, settings.get("budget_ms"))
+    heading, subheading = _headings(track, plot_data)
+    frames = [_frame(item, track, plot_data, track_map) for item in shown]
     data = {"box": track_map.box, "frames": frames}
     parts = {
         "title": escape(f"{heading}: scenematch report"),
-        "style": _part("page.css"),
+        "style": _resource("page.css"),
         "heading": escape(heading),
         "subheading": escape(subheading),
         "grade": verdict.grade,
         "accuracy": escape(verdict.accuracy),
         "latency": escape(verdict.latency),
-        "map": draw_map(track_map, scene),
-        "map_legend": _map_legend(scene, track_map, bool(shown)),
+        "map": draw_map(track_map, plot_data),
+        "map_legend": _map_legend(plot_data, track_map, bool(shown)),
         "tiles": "\n".join(
-            f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in _tiles(flown)
+            f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in _tiles(track)
         ),
         "charts": "\n".join(f"<figure><figcaption>{escape(c)}</figcaption>{svg}</figure>" for c, svg in charts)
-        + _states_legend(flown),
-        "refusals": _refusals(flown, shown),
-        "frames": _slider(flown, scene, shown, why_not),
-        "made": _made(record),
+        + _states_legend(track),
+        "refusals": _refusals(track, shown),
+        "frames": _slider(track, plot_data, shown, why_not),
+        "inputs": _inputs(settings),
         "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
-        "script": _part("page.js"),
+        "script": _resource("page.js"),
     }
-    path.write_text(Template(_part("page.html")).substitute(parts), encoding="utf-8", newline="\n")
+    path.write_text(Template(_resource("page.html")).substitute(parts), encoding="utf-8", newline="\n")
 
 
-def _part(name: str) -> str:
+def _resource(name: str) -> str:
     return resources.files("engine.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def _sigma_m(rows: Sequence[TrackRow]) -> float | None:
-    """Median of the stated sigmas, the larger of the two axes."""
+def _median_sigma_m(rows: Sequence[TrackRow]) -> float | None:
+    """Median over fixes of the larger stated sigma, in metres; None without fixes."""
     sigmas = [
         max(row.sigma_east_m, row.sigma_north_m)
         for row in rows
@@ -114,22 +114,22 @@ def _sigma_m(rows: Sequence[TrackRow]) -> float | None:
     return float(np.median(sigmas)) if sigmas else None
 
 
-def _headings(flown: FinishedTrack, scene: TrackPlotData) -> tuple[str, str]:
-    """The flight's name, and how it was followed."""
-    record = flown.summary["settings"]
-    frames = Path(record.get("frames") or record["map"])
+def _headings(track: FinishedTrack, plot_data: TrackPlotData) -> tuple[str, str]:
+    """The name of the flight, and the method with the number of frames."""
+    settings = track.summary["settings"]
+    frames = Path(settings.get("frames") or settings["map"])
     name = frames.parent.name if frames.name == "frames" else frames.stem
-    method = str(record["method"])
-    text = f"{method.upper() if method != 'auto' else 'NCC and SIFT'}, {record['profile']} profile"
-    text += f", {len(flown.rows)} frames"
-    if scene.time_label.startswith("time") and len(scene.time) > 1:
-        text += f" over {scene.time[-1]:.0f} s"
+    method = str(settings["method"])
+    text = f"{method.upper() if method != 'auto' else 'NCC and SIFT'}, {settings['profile']} profile"
+    text += f", {len(track.rows)} frames"
+    if plot_data.time_label.startswith("time") and len(plot_data.time) > 1:
+        text += f" over {plot_data.time[-1]:.0f} s"
     return name or "flight", text
 
 
-def _tiles(flown: FinishedTrack) -> list[tuple[str, str]]:
-    """Key figures, each with its name; those that are not known are left out."""
-    summary = flown.summary
+def _tiles(track: FinishedTrack) -> list[tuple[str, str]]:
+    """Label and value of the key figures that are known."""
+    summary = track.summary
     share = summary["availability"]
     tiles = [(f"fixed, {summary['fixes']} of {summary['frames']}", "-" if share is None else f"{share:.1%}")]
     if summary.get("median_m") is not None:
@@ -141,8 +141,10 @@ def _tiles(flown: FinishedTrack) -> list[tuple[str, str]]:
             ("false, wrong beyond 3 sigma", str(summary["false_fixes"])),
         ]
         if summary["nees_mean"] is not None:
-            tiles.append(("NEES: 2 is honest, less cautious, more boastful", f"{summary['nees_mean']:.2f}"))
-    elif (sigma_m := _sigma_m(flown.rows)) is not None:
+            tiles.append(
+                ("NEES: 2 is consistent, less cautious, more overconfident", f"{summary['nees_mean']:.2f}")
+            )
+    elif (sigma_m := _median_sigma_m(track.rows)) is not None:
         tiles.append(("median of the stated sigmas", metres(sigma_m)))
     if summary.get("height_rms_m") is not None:
         tiles.append(("RMS error of height", metres(summary["height_rms_m"])))
@@ -152,18 +154,18 @@ def _tiles(flown: FinishedTrack) -> list[tuple[str, str]]:
     return tiles
 
 
-def _map_legend(scene: TrackPlotData, track_map: TrackMap, slider: bool) -> str:
-    true = bool(np.isfinite(scene.errors.truth_en_m).any())
-    wrong = bool((scene.errors.distance_m > WRONG_M).any())
+def _map_legend(plot_data: TrackPlotData, track_map: TrackMap, slider: bool) -> str:
+    has_truth = bool(np.isfinite(plot_data.errors.truth_en_m).any())
+    wrong = bool((plot_data.errors.distance_m > WRONG_M).any())
     cross = "M6 2l10 10M16 2l-10 10"
     entries = [
         (
-            "truth" if true else "from fix to fix",
-            f'<path d="M0 7h22" stroke="var(--{"truth" if true else "fix"})"/>',
+            "truth" if has_truth else "path of the fixes",
+            f'<path d="M0 7h22" stroke="var(--{"truth" if has_truth else "fix"})"/>',
         ),
         ("fix", '<path class="dots" d="M11 7h0" stroke="var(--fix)"/>'),
         ("its 3 sigma ellipse", '<circle cx="11" cy="7" r="6" stroke="var(--fix)" fill="#0072b220"/>'),
-        ("refused", f'<path d="{cross}" stroke="var(--refused)"/>') if scene.refused.any() else None,
+        ("refused", f'<path d="{cross}" stroke="var(--refused)"/>') if plot_data.refused.any() else None,
         (f"fix more than {WRONG_M:g} m off", f'<path d="{cross}" stroke="var(--wrong)"/>') if wrong else None,
         (
             "frame shown below and its window",
@@ -182,9 +184,9 @@ def _map_legend(scene: TrackPlotData, track_map: TrackMap, slider: bool) -> str:
     )
 
 
-def _states_legend(flown: FinishedTrack) -> str:
-    """The colours of the navigator's states, as far as they occurred."""
-    seen = {note.state for note in flown.notes or ()} - {"tracking"}
+def _states_legend(track: FinishedTrack) -> str:
+    """Legend of the navigator's states that occurred."""
+    seen = {note.state for note in track.notes or ()} - {"tracking"}
     names = {"coasting": "on dead reckoning", "searching": "searching for a first fix", "lost": "lost"}
     items = "".join(
         f'<li><svg aria-hidden="true"><rect class="{state}" width="22" height="14"/></svg>{name}</li>'
@@ -194,19 +196,21 @@ def _states_legend(flown: FinishedTrack) -> str:
     return f'\n<ul class="legend states">{items}</ul>' if items else ""
 
 
-def _refusals(flown: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
-    """A row for each reason, the most frequent first, with what one of its refusals said."""
-    if not flown.summary["reasons"]:
-        return "<p>No frame was refused.</p>" if flown.rows else "<p>There are no frames.</p>"
+def _refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
+    """Table of reasons, most frequent first, with the detail of one refusal each."""
+    if not track.summary["reasons"]:
+        return "<p>No frame was refused.</p>" if track.rows else "<p>There are no frames.</p>"
     lines = []
-    for name, count in flown.summary["reasons"].items():
-        indices = [i for i, row in enumerate(flown.rows) if row.reason == name]
+    for name, count in track.summary["reasons"].items():
+        indices = [i for i, row in enumerate(track.rows) if row.reason == name]
         known = set(indices)
-        place = next((k for k, one in enumerate(shown) if one.index in known), None)
-        index = indices[0] if place is None else shown[place].index
-        detail = (flown.notes[index].detail if flown.notes else None) or "-"
-        button = "" if place is None else f'<button class="goto" type="button" data-goto="{place}">show</button>'
-        cells = (name.replace("_", " "), MEANINGS[Reason(name)], f"{flown.rows[index].frame}: {detail}")
+        position = next((k for k, item in enumerate(shown) if item.index in known), None)
+        index = indices[0] if position is None else shown[position].index
+        detail = (track.notes[index].detail if track.notes else None) or "-"
+        button = (
+            "" if position is None else f'<button class="goto" type="button" data-goto="{position}">show</button>'
+        )
+        cells = (name.replace("_", " "), MEANINGS[Reason(name)], f"{track.rows[index].frame}: {detail}")
         text = "".join(f"<td>{escape(cell)}</td>" for cell in cells[:2])
         text += f'<td class="break">{escape(cells[2])}</td><td>{button}</td>'
         lines.append(f'<tr><td class="count">{count}</td>{text}</tr>')
@@ -214,15 +218,19 @@ def _refusals(flown: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
     return f'<table class="reasons"><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table>'
 
 
-def _slider(flown: FinishedTrack, scene: TrackPlotData, shown: Sequence[SliderFrame], why_not: str) -> str:
+def _slider(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[SliderFrame], why_not: str) -> str:
     if not shown:
         return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
     text = f"All {len(shown)} frames."
-    if len(shown) < len(flown.rows):
-        wrong = [i for i, distance_m in enumerate(scene.errors.distance_m) if distance_m > WRONG_M]
-        refused = [i for i, row in enumerate(flown.rows) if not row.fixed]
-        said = [_told(wrong, shown, "wrong fixes"), _told(refused, shown, "refusals"), "the others evenly spaced"]
-        text = f"{len(shown)} of {len(flown.rows)} frames: {', '.join(part for part in said if part)}."
+    if len(shown) < len(track.rows):
+        wrong = [i for i, distance_m in enumerate(plot_data.errors.distance_m) if distance_m > WRONG_M]
+        refused = [i for i, row in enumerate(track.rows) if not row.fixed]
+        parts = [
+            _share_shown(wrong, shown, "wrong fixes"),
+            _share_shown(refused, shown, "refusals"),
+            "the others evenly spaced",
+        ]
+        text = f"{len(shown)} of {len(track.rows)} frames: {', '.join(part for part in parts if part)}."
     return (
         f'<p class="sub">{text} Move by the slider, the arrow keys, or a click on the map or a chart. Each was '
         "matched again for this page, in the window that the run used.</p>"
@@ -235,24 +243,26 @@ def _slider(flown: FinishedTrack, scene: TrackPlotData, shown: Sequence[SliderFr
     )
 
 
-def _told(indices: Sequence[int], shown: Sequence[SliderFrame], what: str) -> str:
-    """How many of these frames are shown; nothing where there are none."""
-    count = len({one.index for one in shown} & set(indices))
+def _share_shown(indices: Sequence[int], shown: Sequence[SliderFrame], kind: str) -> str:
+    """How many of some frames are shown, in words; empty where there are none."""
+    count = len({item.index for item in shown} & set(indices))
     return (
         ""
         if not indices
-        else f"all {count} {what}"
+        else f"all {count} {kind}"
         if count == len(indices)
-        else f"{count} of {len(indices)} {what}"
+        else f"{count} of {len(indices)} {kind}"
     )
 
 
-def _frame(shown: SliderFrame, flown: FinishedTrack, scene: TrackPlotData, track_map: TrackMap) -> dict[str, Any]:
-    """What the page's script knows of one frame."""
+def _frame(
+    shown: SliderFrame, track: FinishedTrack, plot_data: TrackPlotData, track_map: TrackMap
+) -> dict[str, Any]:
+    """The data of one frame for the page's script."""
     i = shown.index
-    row, note = flown.rows[i], flown.notes[i] if flown.notes else None
-    wrong = bool(scene.errors.distance_m[i] > WRONG_M)
-    place = scene.refused_en_m[i] if scene.refused[i] else scene.errors.fix_en_m[i]
+    row, note = track.rows[i], track.notes[i] if track.notes else None
+    wrong = bool(plot_data.errors.distance_m[i] > WRONG_M)
+    position_m = plot_data.refused_en_m[i] if plot_data.refused[i] else plot_data.errors.fix_en_m[i]
     window = None
     if (
         note is not None
@@ -268,24 +278,29 @@ def _frame(shown: SliderFrame, flown: FinishedTrack, scene: TrackPlotData, track
         "kind": "wrong" if wrong else "fix" if row.fixed else "refused",
         "answer": ("Wrong fix" if wrong else "Fix") if row.fixed else f"Refused: {reason}",
         "detail": None if note is None else note.detail,
-        "facts": _facts(i, row, note, scene),
-        "t": round(float(scene.time[i]), 3),
-        "xy": [round(float(v), 1) for v in track_map.places(place)] if np.isfinite(place).all() else None,
+        "facts": _facts(i, row, note, plot_data),
+        "t": round(float(plot_data.time[i]), 3),
+        "xy": [round(float(v), 1) for v in track_map.drawing_xy(position_m)]
+        if np.isfinite(position_m).all()
+        else None,
         "window": window,
         "pictures": [
             {"s": p.src, "w": p.width_px, "h": p.height_px, "c": p.caption, "a": p.alt, "o": p.overlay}
-            for p in shown.pictures
+            for p in shown.images
         ],
     }
 
 
-def _facts(i: int, row: TrackRow, note: Note | None, scene: TrackPlotData) -> list[tuple[str, str]]:
+def _facts(i: int, row: TrackRow, note: FrameNote | None, plot_data: TrackPlotData) -> list[tuple[str, str]]:
     sigma = (
         None if row.sigma_east_m is None or row.sigma_north_m is None else (row.sigma_east_m, row.sigma_north_m)
     )
-    error_m, known = float(scene.errors.distance_m[i]), bool(np.isfinite(scene.errors.distance_m[i]))
+    error_m, known = float(plot_data.errors.distance_m[i]), bool(np.isfinite(plot_data.errors.distance_m[i]))
     facts = [
-        (scene.time_label.partition(" ")[0], f"{scene.time[i]:.2f} s" if "(s)" in scene.time_label else f"{i}"),
+        (
+            plot_data.time_label.partition(" ")[0],
+            f"{plot_data.time[i]:.2f} s" if "(s)" in plot_data.time_label else f"{i}",
+        ),
         ("error", metres(error_m) if known else None),
         ("stated sigma", None if sigma is None else f"{sigma[0]:.2f} m east, {sigma[1]:.2f} m north"),
         ("score", None if row.score is None else f"{row.score:.3f}"),
@@ -297,19 +312,19 @@ def _facts(i: int, row: TrackRow, note: Note | None, scene: TrackPlotData) -> li
     return [(name, value) for name, value in facts if value is not None]
 
 
-def _made(record: Mapping[str, Any]) -> str:
-    """Inputs and settings, what was changed from the defaults, and versions."""
+def _inputs(settings: Mapping[str, Any]) -> str:
+    """Inputs and settings, changes from the defaults, and versions."""
 
     def table(pairs: Sequence[tuple[str, str]]) -> str:
         body = "".join(f'<tr><td>{escape(k)}</td><td class="break">{escape(v)}</td></tr>' for k, v in pairs)
         return f"<table><tbody>{body}</tbody></table>"
 
-    inputs = [(name, "-" if record.get(key) is None else str(record[key])) for key, name in _FACTS.items()]
-    if record.get("heights"):
+    inputs = [(name, "-" if settings.get(key) is None else str(settings[key])) for key, name in _FACTS.items()]
+    if settings.get("heights"):
         inputs.append(
-            ("heights from", ", ".join(f"{source} ({count})" for source, count in record["heights"].items()))
+            ("heights from", ", ".join(f"{source} ({count})" for source, count in settings["heights"].items()))
         )
-    changes = [(name, str(value)) for name, value in (record.get("changed") or {}).items()]
+    changes = [(name, str(value)) for name, value in (settings.get("changed") or {}).items()]
     changed = table(changes) if changes else "<p>Nothing.</p>"
     versions = [
         ("scenematch", metadata.version("scenematch-engine")),

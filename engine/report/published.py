@@ -1,4 +1,4 @@
-"""Figures that others published of data sets, to stand beside ours. None of them was run here."""
+"""Results published by others on the data sets, for comparison. None of them was reproduced here."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class PublishedResult:
     """One published result.
 
     Attributes:
-        what: the method, on which part of the data set.
-        frames: how many pictures it was tried on.
-        answered: how many of them it placed, or in how many it was right.
-        error: of those, as published.
-        source: where it was published.
+        what: method, and part of the data set.
+        frames: number of frames that were tried.
+        answered: number of frames that were located, or located correctly.
+        error: position error of those, as published.
+        source: URL of the publication.
     """
 
     what: str
@@ -25,26 +25,28 @@ class Published:
 
 
 COLUMNS = ("published, not run here", "pictures", "answered", "error", "source")
-PUBLISHED: dict[str, tuple[Published, ...]] = {
+PUBLISHED: dict[str, tuple[PublishedResult, ...]] = {
     "wildnav": (
-        Published(
+        PublishedResult(
             "SuperGlue, data set 1",
             "124",
             "77 (62 %)",
             "15.82 m mean absolute",
             "https://github.com/TIERS/wildnav",
         ),
-        Published(
+        PublishedResult(
             "SuperGlue, data set 2", "78", "44 (56 %)", "26.58 m mean absolute", "https://github.com/TIERS/wildnav"
         ),
     ),
     "AnyVisLoc": (
-        Published("the authors' baseline", "all", "74.1 % within 5 m", "-", "https://arxiv.org/abs/2503.10692"),
+        PublishedResult(
+            "the authors' baseline", "all", "74.1 % within 5 m", "-", "https://arxiv.org/abs/2503.10692"
+        ),
     ),
 }
-"""By data set, as its reader names it. What has no line here has no such figure, or none that was found."""
+"""Published results by data set, as its reader names it."""
 
 
-def published_cells(one: Published) -> tuple[str, ...]:
-    """The figures of :data:`COLUMNS`."""
-    return one.what, one.frames, one.answered, one.error, one.source
+def published_cells(result: PublishedResult) -> tuple[str, ...]:
+    """The cells of :data:`COLUMNS`."""
+    return result.what, result.frames, result.answered, result.error, result.source

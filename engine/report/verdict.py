@@ -1,4 +1,4 @@
-"""What a track is worth, in words: the verdict in two sentences, and what each reason of a refusal means."""
+"""The verdict on a track in two sentences, and the meaning of each reason for a refusal."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from engine.values import Reason
 MEANINGS = {
     Reason.NO_TEXTURE: "The picture is almost flat, or covers next to nothing of the map.",
     Reason.OUTSIDE_MAP: "The window lies outside the map, or on parts of it that hold no data.",
-    Reason.AMBIGUOUS: "Another place matches nearly as well, or the best one lies at the window's edge.",
-    Reason.LOW_SCORE: "The best match may be chance: this piece of map is not in the picture.",
-    Reason.TOO_FEW_MATCHES: "Fewer features were matched than a pose takes.",
-    Reason.BAD_POSE: "No pose explains enough of the matches, or only one that a drone cannot have.",
+    Reason.AMBIGUOUS: "Another position matches nearly as well, or the best one lies at the window's edge.",
+    Reason.LOW_SCORE: "The best match may be chance: the frame may not show this part of the map.",
+    Reason.TOO_FEW_MATCHES: "Fewer features were matched than a pose requires.",
+    Reason.BAD_POSE: "No pose explains enough of the matches, or only one that is implausible for a drone.",
     Reason.INCONSISTENT: "Two methods, or the match and a well-known prediction, contradict each other.",
-    Reason.UNCONFIRMED: "Nothing but the match itself vouches for the place, and too few others agree yet.",
-    Reason.NO_HEIGHT: "The telemetry gives no height above the ground, without which a frame has no scale.",
-    Reason.NO_HEADING: "The telemetry gives no heading, without which a frame cannot be turned.",
-    Reason.MAP_TOO_LARGE: "Too little was known of the place: so large a part of the map is not searched.",
+    Reason.UNCONFIRMED: "Only the match itself supports the position, and too few other fixes agree yet.",
+    Reason.NO_HEIGHT: "The telemetry gives no height above the ground, which sets the scale of a frame.",
+    Reason.NO_HEADING: "The telemetry gives no heading, without which a frame cannot be rotated.",
+    Reason.MAP_TOO_LARGE: "The position was too uncertain: the part of the map to search is too large.",
     Reason.TILTED: "A corner of the frame looks so near the horizon that the ground is stretched beyond use.",
     Reason.LATE: "The answer came after the budget, or could not have come within it.",
     Reason.FAILED: "The frame could not be used, or the worker that matched it died.",
@@ -30,12 +30,12 @@ MEANINGS = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is to be said first.
+    """The verdict on a track.
 
     Attributes:
-        grade: "good", "mixed" or "bad"; "open" where nobody can say for want of truth.
-        accuracy: one sentence on what was fixed and how well.
-        latency: one sentence on how long it took.
+        grade: "good", "mixed" or "bad"; "open" where there is no truth.
+        accuracy: one sentence on availability and accuracy.
+        latency: one sentence on latency.
     """
 
     grade: str
@@ -47,9 +47,9 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
     """The verdict on a track.
 
     Args:
-        summary: as :func:`engine.report.metrics.summarise` gives it.
-        sigma_m: the median of the sigmas that the fixes state, or None without fixes.
-        budget_ms: of each frame, or None.
+        summary: figures of merit by :func:`engine.report.metrics.summarise`.
+        sigma_m: median of the sigmas that the fixes state, or None without fixes.
+        budget_ms: latency budget of each frame, or None.
     """
     frames, fixes = summary["frames"], summary["fixes"]
     fixed = f"{fixes} of {frames} frames fixed"
@@ -57,10 +57,12 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
     if not frames:
         return Verdict("bad", "The track has no frames.", late)
     if not fixes:
-        return Verdict("bad", f"None of {frames} frames fixed; most were refused as {_most(summary)}.", late)
+        return Verdict(
+            "bad", f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}.", late
+        )
     if not summary.get("scored_fixes"):
         stated = "" if sigma_m is None else f"; half of them state a sigma below {metres(sigma_m)}"
-        return Verdict("open", f"{fixed}{stated}. Without truth nobody can say whether they are right.", late)
+        return Verdict("open", f"{fixed}{stated}. Without truth their accuracy is unknown.", late)
     spread = f"half of the fixes within {metres(summary['median_m'])} of the truth, the worst "
     spread += f"{metres(summary['max_m'])} off"
     if summary["scored_fixes"] < fixes:
@@ -80,16 +82,16 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
 def _latency(summary: Mapping[str, Any], budget_ms: float | None) -> str:
     p95_ms, missed = summary["latency_ms"]["p95"], summary["deadlines_missed"]
     if p95_ms is None:
-        return "No times were taken."
-    took = f"95 % of the answers took less than {p95_ms:.1f} ms"
+        return "No latencies were recorded."
+    latency = f"95 % of the answers took less than {p95_ms:.1f} ms"
     if budget_ms is None:
-        return f"{took}; no budget was set."
+        return f"{latency}; no budget was set."
     if missed:
-        return f"{_count(missed, 'answer', 'answers')} came after the budget of {budget_ms:g} ms; {took}."
-    return f"{took}, all of them within the budget of {budget_ms:g} ms."
+        return f"{_count(missed, 'answer', 'answers')} came after the budget of {budget_ms:g} ms; {latency}."
+    return f"{latency}, all of them within the budget of {budget_ms:g} ms."
 
 
-def _most(summary: Mapping[str, Any]) -> str:
+def _main_reason(summary: Mapping[str, Any]) -> str:
     return next(iter(summary["reasons"]), "unknown").replace("_", " ")
 
 
@@ -98,5 +100,5 @@ def _count(count: int, one: str, many: str) -> str:
 
 
 def metres(value: float) -> str:
-    """A length as one reads it: centimetres below 10 m, decimetres below 100 m."""
+    """Format a length: centimetres below 10 m, decimetres below 100 m."""
     return f"{value:.2f} m" if value < 10.0 else f"{value:.1f} m" if value < 100.0 else f"{value:,.0f} m"

@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from engine.formats.datasets.recording import ImportOptions
+    from engine.formats.datasets.sequence import ImportOptions
     from engine.runs.bag_conversion import convert_to_bag
     from engine.runs.campaign import run_campaign
     from engine.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
@@ -78,7 +78,7 @@ __all__ = [
 ]
 
 _NAMES = {
-    "engine.formats.datasets.recording": "ImportOptions",
+    "engine.formats.datasets.sequence": "ImportOptions",
     "engine.runs.bag_conversion": "convert_to_bag",
     "engine.runs.campaign": "run_campaign",
     "engine.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",

@@ -8,7 +8,7 @@ from typing import Any
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.flight import open_flight
-from engine.formats.ros.bag_writer import KINDS, check_place, write_bag
+from engine.formats.ros.bag_writer import BAG_KINDS, check_replaceable, write_bag
 from engine.formats.truth import read_truth
 from engine.runs.arguments import check_choice, renamed_in_errors
 from engine.runs.folders import StrPath
@@ -24,7 +24,7 @@ def convert_to_bag(
     Args:
         folder: the flight folder.
         out: the bag.
-        kind: one of :data:`engine.formats.ros.bag_writer.KINDS`; None is ros1 for a name that ends in .bag, else
+        kind: one of :data:`engine.formats.ros.bag_writer.BAG_KINDS`; None is ros1 for a name in .bag, else
             ros2-mcap.
         force: whether the bag may be there already; it stays until the new one is whole.
         progress: is shown the frames.
@@ -38,11 +38,11 @@ def convert_to_bag(
     """
     out = Path(out)
     kind = ("ros1" if out.suffix.lower() == ".bag" else "ros2-mcap") if kind is None else kind
-    check_choice("kind", kind, KINDS)
+    check_choice("kind", kind, BAG_KINDS)
     if (out.suffix.lower() == ".bag") != (kind == "ros1"):
         raise OptionError(f"out: expected a name that ends in .bag for ros1 and for no other format, got {out}")
     with renamed_in_errors(path="out", replace="force"):
-        check_place(out, force)
+        check_replaceable(out, force)
     paths = {name: Path(folder) / file for name, file in FOLDER_LAYOUT.items()}
     camera = Camera.load(paths["camera"])
     flight = open_flight(paths["frames"], paths["telemetry"], camera)

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from engine.errors import OptionError
-from engine.report.campaign import TABLE, TABLE_HEAD, Line, write_tables
+from engine.report.campaign import TABLE, TABLE_HEAD, CampaignRow, write_tables
 from engine.runs.campaign_plan import RUNS, UNFINISHED, CampaignPlan, plan_campaign
 from engine.runs.executors import Execute, in_processes, on_ray
 from engine.runs.folders import StrPath, check_folder
@@ -30,7 +30,7 @@ def run_campaign(
     ray: str | None = None,
     force: bool = False,
     progress: Progress = SILENT,
-) -> list[Line]:
+) -> list[CampaignRow]:
     """Do what is left of a campaign, and write its tables.
 
     Args:
@@ -147,10 +147,10 @@ def _execute(execute: Execute, jobs: Sequence[Job], description: str, progress: 
     return failures
 
 
-def _line(job: Job, groups: dict[str, str], failures: dict[str, str]) -> Line:
+def _line(job: Job, groups: dict[str, str], failures: dict[str, str]) -> CampaignRow:
     flight, _, run = job.name.partition("/")
     failure = failures.get(job.name) or failures.get(flight)
     result = None if failure else read_result(job)
     if result is None:
-        return Line(groups[flight], flight, run, None, None, failure)
-    return Line(groups[flight], flight, run, result.figures, result.latency_ms, None)
+        return CampaignRow(groups[flight], flight, run, None, None, failure)
+    return CampaignRow(groups[flight], flight, run, result.figures, result.latency_ms, None)

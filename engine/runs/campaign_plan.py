@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from engine.errors import OptionError
-from engine.formats.datasets.recording import ABOUT
+from engine.formats.datasets.sequence import MANIFEST
 from engine.formats.logs.readers import LogClock
 from engine.formats.settings import read_settings
 from engine.maps.rasters import GEOREFERENCE_TAG, stated_sigma
@@ -219,7 +219,7 @@ def _files_to_come(job: Job) -> FlightFiles:
 def _dataset(folder: Path) -> str | None:
     """The published data set that a flight folder was made from, or None."""
     try:
-        name = json.loads((folder / ABOUT).read_text(encoding="utf-8"))["dataset"]
+        name = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["dataset"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return name if isinstance(name, str) else None

@@ -1,4 +1,4 @@
-"""What can be wrong with a flight as a whole: found before a run begins and before its folder is made."""
+"""What can be wrong with a flight as a whole: found before a run begins and before its folder is created."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from engine.formats.truth import read_truth
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
 from engine.orthomap import OrthoMap
-from engine.report.closed_loop import draw_loop, summarise_loop, write_record
+from engine.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
 from engine.report.figures import draw_figures
 from engine.report.metrics import Ground, summarise
 from engine.runs.arguments import check_choice, check_device
@@ -132,7 +132,7 @@ def _write_results(out: Path, flight: ClosedLoop, site: OrthoMap, record: dict[s
     ]
     write_track(out / TRACK, rows)
     rows = read_track(out / TRACK)  # as they stand in the file, so that evaluate gives the same figures
-    write_record(out / "loop.csv", flown)
+    write_loop_csv(out / "loop.csv", flown)
     figures = summarise_loop(flown)
     summary = _summarise(out, rows, site, record)
     figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}

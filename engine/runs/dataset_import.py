@@ -10,24 +10,24 @@ from typing import Any
 
 from engine.errors import OptionError, TelemetryError
 from engine.formats.datasets.alto import read_alto
-from engine.formats.datasets.anyvisloc import MODES, find_anyvisloc, read_anyvisloc, read_place
+from engine.formats.datasets.anyvisloc import MODES, find_anyvisloc, read_anyvisloc, read_local_map
 from engine.formats.datasets.ortholoc import find_ortholoc, read_ortholoc
-from engine.formats.datasets.recording import (
-    ABOUT,
-    OWNED,
+from engine.formats.datasets.sequence import (
+    MANIFEST,
+    WRITTEN_FILES,
+    DatasetSequence,
     ImportOptions,
-    Recording,
     check_complete,
     clear_frames,
-    write_recording,
+    write_sequence,
 )
-from engine.formats.datasets.singles import LocalMap, campaign_text, write_place, write_single
+from engine.formats.datasets.single_photos import LocalMap, campaign_text, write_local_map, write_single_photo
 from engine.formats.datasets.uav_visloc import read_uav_visloc
 from engine.formats.datasets.vpair import read_vpair
 from engine.formats.datasets.wildnav import read_wildnav
 from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
-from engine.formats.truth_checks import Finding, check_truth
+from engine.formats.truth_checks import TruthFinding, check_truth
 from engine.maps.rasters import open_source
 from engine.runs.arguments import check_choice
 from engine.runs.folders import StrPath, check_folder, prepare_folder
@@ -80,10 +80,10 @@ def import_dataset(
     )
     recording = _read(kind, root, part, gsd_m)
     check_complete(recording, options)
-    _check_apart(out, *(("a picture of `root`", shot.picture) for shot in recording.shots))
+    _check_apart(out, *(("a picture of `root`", image.path) for image in recording.images))
     clear_frames(out)
-    prepare_folder(out, force, OWNED)
-    notes = write_recording(out, recording, options)
+    prepare_folder(out, force, WRITTEN_FILES)
+    notes = write_sequence(out, recording, options)
     findings = check_flight(out)
     for text in (*notes, *(finding.text for finding in findings)):
         progress.message(f"note: {text}")
@@ -109,7 +109,7 @@ def _check_apart(out: Path, *inputs: tuple[str, Path | None]) -> None:
             raise OptionError(f"out: expected a folder without {name}, whose files it replaces, got {out}")
 
 
-def _read(kind: str, root: Path, part: str | None, gsd_m: float | None) -> Recording:
+def _read(kind: str, root: Path, part: str | None, gsd_m: float | None) -> DatasetSequence:
     if (kind in ("uav-visloc", "alto")) != (part is not None):
         raise OptionError(f"part: expected {'one' if part is None else 'none'} with {kind}, got {part or 'none'}")
     if gsd_m is not None and kind != "alto":
@@ -183,7 +183,7 @@ def import_photographs(
     check_folder(out, force)
     _check_apart(out, ("`root`", scene))
     paths = _photographs(kind, scene, options.limit)
-    scene_map = read_place(scene, options.reference) if kind == "anyvisloc" else None
+    scene_map = read_local_map(scene, options.reference) if kind == "anyvisloc" else None
     for path in paths:
         _check_replaceable(out / path.stem)
     prepare_folder(out, force, (CAMPAIGN, *(f"{_MAPS}/{FOLDER_LAYOUT[name]}" for name in ("map", "surface"))))
@@ -218,7 +218,7 @@ def _write_photographs(
         OptionError: all of them are.
     """
     if scene_map is not None:
-        write_place(out / _MAPS, scene_map)
+        write_local_map(out / _MAPS, scene_map)
     names = []
     for path in paths:
         single, site = read_ortholoc(path) if scene_map is None else (read_anyvisloc(path), scene_map)
@@ -227,9 +227,9 @@ def _write_photographs(
         folder = out / single.name
         if folder.exists():
             shutil.rmtree(folder)
-        write_single(folder, single, site, folder if scene_map is None else out / _MAPS, _NAMES[kind])
+        write_single_photo(folder, single, site, folder if scene_map is None else out / _MAPS, _NAMES[kind])
         if scene_map is None:
-            write_place(folder, site)
+            write_local_map(folder, site)
         names.append(single.name)
     if not names:
         raise OptionError(f"max_tilt_deg: expected some picture within {max_tilt_deg:g} degrees, got none")
@@ -237,8 +237,8 @@ def _write_photographs(
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Refuse a folder in a flight's place that no import made."""
-    if folder.is_symlink() or (folder.exists() and not (folder / ABOUT).is_file()):
+    """Refuse a folder in the way of a flight that no import created."""
+    if folder.is_symlink() or (folder.exists() and not (folder / MANIFEST).is_file()):
         raise OptionError(f"out: expected flights of an earlier import to replace, but {folder} is no such one")
 
 
@@ -249,7 +249,7 @@ _PHOTOGRAPH_NOTES = (
 )
 
 
-def check_flight(folder: StrPath, max_speed_mps: float = 70.0) -> list[Finding]:
+def check_flight(folder: StrPath, max_speed_mps: float = 70.0) -> list[TruthFinding]:
     """What is doubtful about the truth of a flight folder.
 
     Args:

@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
-from engine.report.campaign import are_figures, are_times
+from engine.report.campaign import are_valid_figures, are_valid_latencies
 from engine.runs.inputs import FlightFiles
 from engine.runs.progress import Progress
 from engine.runs.settings import TrackSettings
@@ -154,11 +154,11 @@ def read_result(job: Job) -> Result | None:
     inputs, figures, latency_ms = values["inputs"], values["figures"], None
     whole = isinstance(inputs, dict) and all(isinstance(value, str) for value in inputs.values())
     tracked = isinstance(job.task, TrackTask)
-    if not (whole and isinstance(figures, dict) and (not tracked or are_figures(figures))):
+    if not (whole and isinstance(figures, dict) and (not tracked or are_valid_figures(figures))):
         raise _damaged(job.folder / RESULT)
     if tracked:
         latency_ms = _read(job.folder / "summary.json", "latency_ms")["latency_ms"]
-        if not are_times(latency_ms):
+        if not are_valid_latencies(latency_ms):
             raise _damaged(job.folder / "summary.json")
     return Result(inputs, figures, latency_ms)
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from engine.adapters.links import parse_connection
 from engine.adapters.parameters import parameter_file
-from engine.adapters.pictures import Picture, capture, replay
-from engine.adapters.vehicle import Origin
+from engine.adapters.pictures import CapturedImage, capture, replay
+from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
 from engine.live import LiveOptions
@@ -27,8 +27,8 @@ from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_v
 from engine.runs.progress import SILENT, Progress
 
 if TYPE_CHECKING:
-    from engine.adapters.mavlink import Bridge, Status
-    from engine.adapters.mavlink_out import Outgoing
+    from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
+    from engine.adapters.mavlink_out import MavlinkOptions
 
 _MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
@@ -79,7 +79,7 @@ class BridgeFiles:
                 f"exposure_to_grab_ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
             )
 
-    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[Picture]:
+    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage]:
         """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)
@@ -127,7 +127,7 @@ class MavlinkSettings:
                 f"origin_alt_m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
             )
 
-    def outgoing(self) -> Outgoing:
+    def outgoing(self) -> MavlinkOptions:
         """What is sent.
 
         Raises:
@@ -135,12 +135,12 @@ class MavlinkSettings:
         """
         return _outgoing(self.firmware, self.message, self.max_sigma_m)
 
-    def origin(self, site: OrthoMap) -> Origin | None:
+    def origin(self, site: OrthoMap) -> NedOrigin | None:
         """The map's, at the height of its ground where none is given; None where none is to be set."""
         if not self.set_origin:
             return None
         alt_m = site.ground_m if self.origin_alt_m is None else self.origin_alt_m
-        return Origin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
+        return NedOrigin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,7 +183,7 @@ def run_mavlink_bridge(
     *,
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     progress: Progress = SILENT,
-) -> Status:
+) -> MavlinkStatus:
     """Bridge until the pictures end or the time is over.
 
     Args:
@@ -203,7 +203,7 @@ def run_mavlink_bridge(
     """
     require("pymavlink", "mavlink")
     live_view.check()
-    from engine.adapters.mavlink import Bridge
+    from engine.adapters.mavlink import MavlinkBridge
     from engine.adapters.packets import read_key
 
     settings = settings or BridgeSettings()
@@ -219,7 +219,7 @@ def run_mavlink_bridge(
 
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
         try:
-            bridge = Bridge(
+            bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(),
                 origin=link.origin(site), use_velocity=link.use_velocity, system_id=link.system_id, key=key,
                 watch=watcher,
@@ -258,14 +258,18 @@ def write_parameter_file(
     out.write_text(text, encoding="utf-8")
 
 
-def _outgoing(firmware: str, message: str, max_sigma_m: float) -> Outgoing:
-    from engine.adapters.mavlink_out import Outgoing
+def _outgoing(firmware: str, message: str, max_sigma_m: float) -> MavlinkOptions:
+    from engine.adapters.mavlink_out import MavlinkOptions
 
-    return Outgoing(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
+    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
 
 
 def _run(
-    bridge: Bridge, pictures: Iterator[Picture], camera: Camera, seconds: float | None, progress: Progress
+    bridge: MavlinkBridge,
+    pictures: Iterator[CapturedImage],
+    camera: Camera,
+    seconds: float | None,
+    progress: Progress,
 ) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
     begin = reported = time.monotonic()
@@ -288,7 +292,7 @@ def _run(
     _wait_for_answers(lambda: bridge.status.answered, count)
 
 
-def _wait_for_autopilot(bridge: Bridge, progress: Progress) -> None:
+def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress) -> None:
     """A flight that is played begins with the autopilot's: where it was earlier is not known."""
     if not bridge.connected:
         progress.message(f"the pictures wait for the autopilot, {_AUTOPILOT_TIMEOUT_S:g} s at most")
@@ -305,7 +309,7 @@ def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
         time.sleep(0.3)
 
 
-def _status_line(status: Status) -> str:
+def _status_line(status: MavlinkStatus) -> str:
     from engine.adapters.mavlink import MIN_RATE_HZ
 
     reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"

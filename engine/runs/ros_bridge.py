@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from engine.adapters.ros import RosBridge, RosNode, RosStatus, Topics
+from engine.adapters.ros import RosBridge, RosNode, RosStatus, RosTopics
 from engine.adapters.ros_out import RosOptions
-from engine.adapters.vehicle import Origin
+from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, OptionError
-from engine.formats.ros.messages import camera_of
+from engine.formats.ros.messages import camera_from_message
 from engine.matcher import SceneMatcher
 from engine.runs.arguments import parse_position
 from engine.runs.checks import check_position
@@ -43,7 +43,7 @@ class RosSettings:
     map: StrPath
     surface: StrPath | None = None
     camera: StrPath | None = None
-    topics: Topics = field(default_factory=Topics)
+    topics: RosTopics = field(default_factory=RosTopics)
     map_sigma_m: float | None = None
     version: int = 1
     firmware: str = "none"
@@ -60,7 +60,7 @@ class RosSettings:
             OptionError: the firmware or the origin is none.
         """
         position = parse_position("origin", self.origin)
-        begin = None if position is None else Origin(position.lat_deg or 0.0, position.lon_deg or 0.0, 0.0)
+        begin = None if position is None else NedOrigin(position.lat_deg or 0.0, position.lon_deg or 0.0, 0.0)
         return RosOptions(firmware=self.firmware, origin=begin)
 
 
@@ -101,7 +101,7 @@ def run_ros_bridge(
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:
-            node.spin(bridge.handlers(ros.topics), bridge.beat, settings.seconds)
+            node.spin(bridge.handlers(ros.topics), bridge.check_input, settings.seconds)
         finally:
             bridge.close()
     return bridge.status
@@ -129,4 +129,4 @@ def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:
         raise BackendError(
             f"camera_info_topic: expected a calibration on {topic} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
         )
-    return camera_of(message)
+    return camera_from_message(message)

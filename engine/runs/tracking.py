@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from engine.budget import Budget
 from engine.errors import EngineError, TelemetryError
 from engine.formats.flight import FlightFrame
-from engine.formats.notes import note_of, write_notes
+from engine.formats.notes import frame_note, write_notes
 from engine.formats.settings import changed
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackWriter, read_track, track_row
@@ -159,7 +159,7 @@ def _follow(
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
             attitudes.append(attitude_row(item.frame, result))
-            notes.append(note_of(item.name, result, navigator.state.value))
+            notes.append(frame_note(item.name, result, navigator.state.value))
             if view is not None:
                 view.show(index, item.name, item.frame, result, navigator.state, latency_ms)
     write_notes(out / NOTES, notes)

@@ -43,6 +43,17 @@ from engine.sim.sensors import GpsSample, Instruments, SensorSuite, steps_betwee
 from engine.sim.vehicle import START_NS
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
 
+__all__ = [
+    "ClosedLoop",
+    "Fault",
+    "LoopAnswer",
+    "LoopOptions",
+    "LoopResult",
+    "LoopSample",
+    "Mode",
+    "fly_closed_loop",
+]
+
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 RenderCallback = Callable[[State], Image]

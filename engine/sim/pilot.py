@@ -13,6 +13,8 @@ from engine.sim.quadrotor import STEP_S
 from engine.sim.vehicle import COURSE_STEP_S, FlightStyle, course
 from engine.values import check_positive
 
+__all__ = ["Gains", "Pilot", "Route", "Setpoint", "plan_rounds", "plan_route"]
+
 Array = NDArray[np.float64]
 
 

@@ -20,6 +20,8 @@ from engine.sim.rotations import rotation, rotation_vector
 from engine.sim.vehicle import GRAVITY_MPS2
 from engine.values import Attitude, check_positive
 
+__all__ = ["Airframe", "IdealImu", "State", "Wind", "WindField", "advance", "hovering"]
+
 Array = NDArray[np.float64]
 
 STEP_S = 0.01

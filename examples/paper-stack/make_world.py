@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.adapters.vehicle import Origin, north_east_m
-from engine.orthomap import OrthoMap
+from engine import OrthoMap
+from engine.adapters.vehicle import NedOrigin, north_east_m
 
 MODEL = """<?xml version="1.0"?>
 <sdf version="1.6">
@@ -55,7 +55,7 @@ def vertices(site: OrthoMap, step_px: int) -> tuple[np.ndarray, np.ndarray, tupl
     columns, rows = (np.r_[np.arange(0, n, step_px), n] - 0.5 for n in (site.width_px, site.height_px))
     xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     lat, lon = site.geodetic_from_pixel(xy)
-    origin = Origin(site.frame.lat_deg, site.frame.lon_deg, 0.0)
+    origin = NedOrigin(site.frame.lat_deg, site.frame.lon_deg, 0.0)
     north_east = np.array([north_east_m(*place, origin, "ardupilot") for place in zip(lat, lon, strict=True)])
     up = site.surface_at(xy) - site.ground_m
     places = np.column_stack([north_east[:, 1], north_east[:, 0], up])

@@ -22,26 +22,26 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.links import parse_connection
-from engine.adapters.mavlink import MIN_RATE_HZ, Bridge
-from engine.adapters.mavlink_in import WANTED, Clock, Telemetry
+from engine.adapters.mavlink import MIN_RATE_HZ, MavlinkBridge
+from engine.adapters.mavlink_in import HANDLED_MESSAGES, AutopilotClock, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
-    FixVelocity,
-    Outgoing,
-    Sending,
-    Velocity,
+    FixReport,
+    GroundVelocity,
+    MavlinkOptions,
+    VelocityFromFixes,
     command_message,
+    fix_message,
     heartbeat_message,
-    make_message,
     pose_covariance,
     set_origin_message,
     timesync_message,
-    why_withheld,
+    withhold_reason,
 )
-from engine.adapters.packets import Decoder, Encoder, read_key, signing_time
+from engine.adapters.packets import PacketDecoder, PacketEncoder, read_key, signing_time
 from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import replay
-from engine.adapters.vehicle import Origin, RecentValues, Vehicle, north_east_m
+from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
 from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
@@ -49,8 +49,8 @@ from engine.values import Fix, NoFix, Reason, Timings, Window
 from tests.support.paths import ROOT
 
 GOLDEN = ROOT / "tests" / "golden" / "mavlink"
-ORIGIN = Origin(33.6400000, 72.9900000, 510.0)
-VEHICLE = Vehicle(
+ORIGIN = NedOrigin(33.6400000, 72.9900000, 510.0)
+VEHICLE = VehicleState(
     roll_deg=2.0, pitch_deg=-3.0, heading_deg=270.0, east_velocity_mps=1.0, north_velocity_mps=2.0,
     up_velocity_mps=0.5, height_agl_m=120.0, alt_amsl_m=630.0, down_m=-120.0,
 )  # fmt: skip
@@ -72,13 +72,13 @@ def fix(sigma_m=0.5, **changes):
 def sending(**changes):
     values = {
         "fix": fix(), "captured_ns": 12_345_678_901, "age_ms": 80.0, "vehicle": VEHICLE, "origin": ORIGIN,
-        "velocity": Velocity(1.5, -2.5, 0.7), "reset_counter": 3, "unix_ns": 1_700_000_000_123_000_000,
+        "velocity": GroundVelocity(1.5, -2.5, 0.7), "reset_counter": 3, "unix_ns": 1_700_000_000_123_000_000,
     }  # fmt: skip
-    return Sending(**(values | changes))
+    return FixReport(**(values | changes))
 
 
 def encoded(message):
-    return Encoder(1).encode(message)
+    return PacketEncoder(1).encode(message)
 
 
 # -------------------------------------------------------------------------------------------- what is sent
@@ -86,7 +86,7 @@ def encoded(message):
 
 @pytest.mark.parametrize(("firmware", "kind"), KINDS)
 def test_bytes_are_the_golden_ones(firmware, kind):
-    made = encoded(make_message(sending(), Outgoing(firmware=firmware, message=kind)))
+    made = encoded(fix_message(sending(), MavlinkOptions(firmware=firmware, message=kind)))
     golden = bytes.fromhex((GOLDEN / f"{firmware}-{kind}.hex").read_text(encoding="ascii"))
     assert made.hex() == golden.hex()
 
@@ -108,7 +108,7 @@ def test_bytes_of_all_that_is_sent_beside_fixes_are_the_golden_ones(name, messag
 
 def test_signed_bytes_are_the_golden_ones(monkeypatch):
     monkeypatch.setattr("engine.adapters.packets.signing_time", lambda: 10 * 365 * 86400 * 100_000)
-    made = Encoder(1, KEY).encode(make_message(sending(), Outgoing()))
+    made = PacketEncoder(1, KEY).encode(fix_message(sending(), MavlinkOptions()))
     assert made.hex() == (GOLDEN / "ardupilot-signed.hex").read_text(encoding="ascii").strip()
 
 
@@ -124,12 +124,12 @@ def test_golden_bytes_are_made_without_the_engine(tmp_path):
 @pytest.mark.parametrize(("firmware", "kind"), KINDS)
 def test_stamps_are_of_capture_whenever_it_is_sent(firmware, kind):
     for age_ms in (0.0, 200.0):
-        m = make_message(sending(age_ms=age_ms), Outgoing(firmware=firmware, message=kind))
+        m = fix_message(sending(age_ms=age_ms), MavlinkOptions(firmware=firmware, message=kind))
         stamp_us = m.usec if kind == "vision_position_estimate" else m.time_usec
         waited_us = m.processing_time if kind == "global_position_sensor" else 0
         assert stamp_us - waited_us == 12_345_678
     week_ms = 1_700_000_000_123 - 315_964_800_000 + 18_000
-    m = make_message(sending(), Outgoing(message="gps_input"))
+    m = fix_message(sending(), MavlinkOptions(message="gps_input"))
     assert m.time_week * 604_800_000 + m.time_week_ms == week_ms
 
 
@@ -137,7 +137,7 @@ def test_ardupilot_finds_the_fix_again_by_its_own_scale():
     rng = np.random.default_rng(1)
     scale = 0.011131884502145034  # of ArduPilot's Location, metres per 1e-7 degrees
     for _ in range(50):
-        origin = Origin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
+        origin = NedOrigin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
         lat, lon = origin.lat_deg + rng.uniform(-0.05, 0.05), origin.lon_deg + rng.uniform(-0.05, 0.05)
         north, east = north_east_m(lat, lon, origin, "ardupilot")
         back_lat = origin.lat_deg + north / scale * 1e-7
@@ -150,7 +150,7 @@ def test_ardupilot_finds_the_fix_again_by_its_own_scale():
 def test_px4_finds_the_fix_again_by_its_own_projection():
     rng = np.random.default_rng(2)
     for _ in range(50):
-        origin = Origin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
+        origin = NedOrigin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
         lat, lon = origin.lat_deg + rng.uniform(-0.05, 0.05), origin.lon_deg + rng.uniform(-0.05, 0.05)
         north, east = north_east_m(lat, lon, origin, "px4")
         c = math.hypot(north, east) / 6371000.0  # the inverse of the azimuthal projection
@@ -161,7 +161,7 @@ def test_px4_finds_the_fix_again_by_its_own_projection():
         turn = math.atan2(across, math.cos(lat0) * math.cos(c) - along * math.sin(lat0) * math.sin(c))
         assert math.degrees(back) == pytest.approx(lat, abs=1e-9)
         assert math.remainder(origin.lon_deg + math.degrees(turn) - lon, 360.0) == pytest.approx(0.0, abs=1e-9)
-    assert north_east_m(10.0, 20.0, Origin(10.0, 20.0, 0.0), "px4") == (0.0, 0.0)
+    assert north_east_m(10.0, 20.0, NedOrigin(10.0, 20.0, 0.0), "px4") == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
@@ -185,7 +185,7 @@ def test_the_height_does_not_drown_the_covariance():
 
 @pytest.mark.parametrize("message", ["vision_position_estimate", "odometry"])
 def test_attitude_is_in_radians_and_the_same_in_both_forms(message):
-    m = make_message(sending(), Outgoing(message=message))
+    m = fix_message(sending(), MavlinkOptions(message=message))
     angles = np.radians([2.0, -3.0, -90.0])
     if message == "vision_position_estimate":
         assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
@@ -196,25 +196,25 @@ def test_attitude_is_in_radians_and_the_same_in_both_forms(message):
 
 
 def test_odometry_frames_are_those_that_each_firmware_takes():
-    ardupilot = make_message(sending(), Outgoing(message="odometry"))
+    ardupilot = fix_message(sending(), MavlinkOptions(message="odometry"))
     assert (ardupilot.frame_id, ardupilot.child_frame_id) == (20, 12)  # LOCAL_FRD, BODY_FRD
-    px4 = make_message(sending(velocity=None), Outgoing(firmware="px4", message="odometry"))
+    px4 = fix_message(sending(velocity=None), MavlinkOptions(firmware="px4", message="odometry"))
     assert (px4.frame_id, px4.child_frame_id) == (1, 12)  # LOCAL_NED, BODY_FRD
     assert all(map(math.isnan, (px4.vx, px4.vy, px4.vz, px4.velocity_covariance[0])))
 
 
 def test_odometry_velocity_is_that_of_the_body():
-    level = Vehicle(roll_deg=0.0, pitch_deg=0.0, heading_deg=90.0, up_velocity_mps=0.25, down_m=-1.0)
-    m = make_message(sending(vehicle=level), Outgoing(message="odometry"))
+    level = VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=90.0, up_velocity_mps=0.25, down_m=-1.0)
+    m = fix_message(sending(vehicle=level), MavlinkOptions(message="odometry"))
     assert (m.vx, m.vy, m.vz) == pytest.approx((1.5, 2.5, -0.25))  # facing east: forward is east, right south
 
 
 def test_gps_input_carries_velocity_and_accuracies():
-    m = make_message(sending(), Outgoing(message="gps_input"))
+    m = fix_message(sending(), MavlinkOptions(message="gps_input"))
     assert (m.vn, m.ve, m.vd) == (-2.5, 1.5, -0.5)
     assert (m.speed_accuracy, m.horiz_accuracy) == pytest.approx((0.7, 0.5))
     assert m.ignore_flags == 0
-    bare = make_message(sending(vehicle=Vehicle()), Outgoing(message="gps_input"))
+    bare = fix_message(sending(vehicle=VehicleState()), MavlinkOptions(message="gps_input"))
     assert bare.ignore_flags == mavlink.GPS_INPUT_IGNORE_FLAG_ALT | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
 
 
@@ -227,8 +227,8 @@ def test_gps_input_carries_velocity_and_accuracies():
         ({"age_ms": 250.1}, "gps_input", "too old"),
         ({"origin": None}, "vision_position_estimate", "no origin"),
         ({"origin": None}, "gps_input", None),
-        ({"vehicle": Vehicle(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0)}, "odometry", "no height"),
-        ({"vehicle": Vehicle(down_m=-1.0)}, "vision_position_estimate", "no attitude"),
+        ({"vehicle": VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0)}, "odometry", "no height"),
+        ({"vehicle": VehicleState(down_m=-1.0)}, "vision_position_estimate", "no attitude"),
         ({"velocity": None}, "gps_input", "no velocity"),
         ({"velocity": None}, "odometry", "no velocity"),
         ({"velocity": None}, "vision_position_estimate", None),
@@ -236,7 +236,7 @@ def test_gps_input_carries_velocity_and_accuracies():
     ],
 )
 def test_what_would_mislead_is_withheld(changes, message, why):
-    assert why_withheld(sending(**changes), Outgoing(message=message)) == why
+    assert withhold_reason(sending(**changes), MavlinkOptions(message=message)) == why
 
 
 @pytest.mark.parametrize(
@@ -245,11 +245,11 @@ def test_what_would_mislead_is_withheld(changes, message, why):
 )
 def test_options_are_refused_in_one_line(values):
     with pytest.raises(OptionError, match=next(iter(values))):
-        Outgoing(**values)
+        MavlinkOptions(**values)
 
 
 def test_velocity_is_that_of_the_last_fixes_and_forgets_at_a_reset():
-    by_fixes = FixVelocity()
+    by_fixes = VelocityFromFixes()
     found = [by_fixes.add(fix(east_m=3.0 * t, north_m=-t), round(t * 1e9), 0) for t in np.arange(1.0, 4.0, 0.2)]
     assert found[0] is None
     assert (found[-1].east_mps, found[-1].north_mps) == pytest.approx((3.0, -1.0))
@@ -260,7 +260,7 @@ def test_velocity_is_that_of_the_last_fixes_and_forgets_at_a_reset():
 
 
 def heard(*messages, start_ns=10_000_000_000):
-    telemetry = Telemetry()
+    telemetry = MavlinkTelemetry()
     for i, message in enumerate(messages):
         telemetry.update(message, start_ns + i * 1_000_000)
     return telemetry.vehicle(start_ns)
@@ -299,7 +299,7 @@ def test_a_rangefinder_without_a_stamp_counts_from_its_arrival():
 
 
 def test_the_date_is_the_autopilots_and_none_where_it_has_none():
-    telemetry, unix_us = Telemetry(), 1_700_000_000_000_000
+    telemetry, unix_us = MavlinkTelemetry(), 1_700_000_000_000_000
     telemetry.update(mavlink.MAVLink_system_time_message(0, 5000), 10_000_000_000)  # no date before a GPS fix
     assert telemetry.unix_offset_ns() is None
     telemetry.update(mavlink.MAVLink_system_time_message(unix_us, 6000), 11_000_000_000)
@@ -320,28 +320,28 @@ def test_series_go_the_shorter_way_round_and_grow_stale():
 def test_clock_finds_the_offset_by_timesync_and_without():
     rng = random.Random(3)
     offset = 7_000_000_000
-    by_arrival, by_sync = Clock(), Clock()
+    by_arrival, by_sync = AutopilotClock(), AutopilotClock()
     for sent in range(10**10, 10**10 + 10**9, 10**7):
         delay = rng.randrange(1_000_000, 30_000_000)
-        by_arrival.ours_ns(sent + offset, sent + delay)
-        by_sync.asked(sent)
-        by_sync.answered(sent, sent + delay // 2 + offset, sent + delay)
+        by_arrival.local_ns(sent + offset, sent + delay)
+        by_sync.add_request(sent)
+        by_sync.accept_response(sent, sent + delay // 2 + offset, sent + delay)
     assert abs(by_arrival.offset_ns - offset) < 3_000_000  # late by the quickest way
     assert abs(by_sync.offset_ns - offset) < 1_000_000
-    by_sync.answered(12345, 0, 10**11)  # nobody asked
+    by_sync.accept_response(12345, 0, 10**11)  # nobody asked
     assert abs(by_sync.offset_ns - offset) < 1_000_000
 
 
 def test_an_origin_of_zeros_is_none():
-    telemetry = Telemetry()
+    telemetry = MavlinkTelemetry()
     telemetry.update(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), 1)
     assert telemetry.origin is None
     telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 510000), 1)
-    assert telemetry.origin == Origin(pytest.approx(33.64), pytest.approx(72.99), 510.0)
+    assert telemetry.origin == NedOrigin(pytest.approx(33.64), pytest.approx(72.99), 510.0)
 
 
 def test_an_autopilot_that_starts_again_is_followed():
-    telemetry = Telemetry()
+    telemetry = MavlinkTelemetry()
     telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
     for ms in range(60_000, 61_000, 10):
         telemetry.update(mavlink.MAVLink_attitude_message(ms, 0.1, 0, 0, 0, 0, 0), ms * 1_000_000)
@@ -354,10 +354,10 @@ def test_an_autopilot_that_starts_again_is_followed():
 
 def test_a_restart_shows_in_timesync_before_it_shows_in_the_stamps():
     """Its first answer after the restart is quicker than all before it, and must not pass for a better one."""
-    telemetry, boot_ns = Telemetry(), 60_000_000_000
+    telemetry, boot_ns = MavlinkTelemetry(), 60_000_000_000
 
     def ask(now_ns, since_boot_ns, trip_ns):
-        telemetry.sync_asked(now_ns)
+        telemetry.add_timesync_request(now_ns)
         answer = mavlink.MAVLink_timesync_message(since_boot_ns, now_ns)
         telemetry.update(answer, now_ns + trip_ns)
 
@@ -389,7 +389,7 @@ def beat(made, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
 
 
 def decoder(**options):
-    return Decoder(1, WANTED, **({"is_stream": True} | options))
+    return PacketDecoder(1, HANDLED_MESSAGES, **({"is_stream": True} | options))
 
 
 def test_packets_may_be_cut_anywhere_in_a_stream_but_not_in_datagrams():
@@ -434,7 +434,7 @@ def test_with_a_key_only_what_is_rightly_signed_and_new_is_heard():
 
 
 def test_what_is_sent_with_a_key_is_signed():
-    packet = Encoder(1, KEY).encode(make_message(sending(), Outgoing()))
+    packet = PacketEncoder(1, KEY).encode(fix_message(sending(), MavlinkOptions()))
     reader = mavlink.MAVLink(None)
     reader.signing.secret_key = KEY
     assert reader.decode(bytearray(packet)).get_type() == "VISION_POSITION_ESTIMATE"
@@ -646,8 +646,8 @@ def bridge_to():
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         navigator = Matched()
-        bridge = Bridge(
-            parse_connection(f"udpin:127.0.0.1:{port}"), lambda _: navigator, options or Outgoing(), **more
+        bridge = MavlinkBridge(
+            parse_connection(f"udpin:127.0.0.1:{port}"), lambda _: navigator, options or MavlinkOptions(), **more
         )
         opened.append(bridge)
         return SimpleNamespace(bridge=bridge, navigator=navigator, port=port)
@@ -736,7 +736,7 @@ def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_
 
 
 def test_an_origin_that_is_there_is_not_set_again(bridge_to):
-    made = bridge_to(origin=Origin(1.0, 2.0, 3.0))
+    made = bridge_to(origin=NedOrigin(1.0, 2.0, 3.0))
     with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 5)
         assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
@@ -765,7 +765,7 @@ def test_poor_fixes_and_refusals_are_not_sent(bridge_to):
 
 
 def test_the_other_firmware_is_not_steered(bridge_to):
-    made = bridge_to(Outgoing(firmware="px4"))
+    made = bridge_to(MavlinkOptions(firmware="px4"))
     with Standin(made.port) as pilot:
         fly(made.bridge, lambda: made.bridge.status.withheld.get("other firmware", 0) > 3)
         assert not pilot.of("GLOBAL_POSITION_SENSOR")
@@ -847,7 +847,9 @@ def test_tcp_reconnects_after_the_link_drops(monkeypatch):
         server.settimeout(10.0)
         port = server.getsockname()[1]
         made = autopilot()
-        with Bridge(parse_connection(f"tcp:127.0.0.1:{port}"), lambda _: Matched(), Outgoing()) as bridge:
+        with MavlinkBridge(
+            parse_connection(f"tcp:127.0.0.1:{port}"), lambda _: Matched(), MavlinkOptions()
+        ) as bridge:
             for expected in (0, 1):
                 other, _ = server.accept()
                 with other:
@@ -873,7 +875,9 @@ def test_a_serial_port_takes_halves_and_its_loss_is_survived(monkeypatch):
     tty.setraw(vehicle)
     tty.setraw(port)
     packet = beat(autopilot())
-    with Bridge(parse_connection(f"serial:{os.ttyname(port)}:115200"), lambda _: Matched(), Outgoing()) as bridge:
+    with MavlinkBridge(
+        parse_connection(f"serial:{os.ttyname(port)}:115200"), lambda _: Matched(), MavlinkOptions()
+    ) as bridge:
         os.write(vehicle, packet[:7])
         time.sleep(0.05)
         assert not bridge.connected

@@ -15,21 +15,21 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from engine.adapters.ros import OUTPUTS, RosBridge, RosTelemetry, Topics
+from engine.adapters.ros import OUTPUTS, RosBridge, RosTelemetry, RosTopics
 from engine.adapters.ros_out import FIRMWARES, RosOptions, diagnostics, pose, window_picture
-from engine.adapters.vehicle import Origin, Vehicle
+from engine.adapters.vehicle import NedOrigin, VehicleState
 from engine.camera import Camera
 from engine.cli.app import run as main
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.formats.ros.messages import (
     NO_POSITION,
     MessageFactory,
-    attitude_of,
-    camera_of,
-    picture_of,
-    position_of,
+    attitude_from_message,
+    camera_from_message,
+    image_from_message,
+    position_from_message,
     quaternion_xyzw,
-    range_of,
+    range_from_message,
     stamp_ns,
 )
 from engine.live import LiveOptions
@@ -85,16 +85,16 @@ def test_colours_of_every_encoding(ros, maker, encoding, order, padding):
     rows = [row.tobytes() + b"\xee" * padding for row in pixels]
     step = len(rows[0])
     message = wired(ros, raw_image(maker, encoding, rows, step, 7))
-    assert np.array_equal(picture_of(message), rgb)
+    assert np.array_equal(image_from_message(message), rgb)
     rows[-1] = rows[-1][: step - padding]  # some drivers leave the last padding out
-    assert np.array_equal(picture_of(wired(ros, raw_image(maker, encoding, rows, step, 7))), rgb)
+    assert np.array_equal(image_from_message(wired(ros, raw_image(maker, encoding, rows, step, 7))), rgb)
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
 def test_grey_stays_grey(ros, maker, encoding):
     grey = np.random.default_rng(2).integers(0, 256, (5, 7), dtype=np.uint8)
     rows = [row.tobytes() + b"\x00" * 9 for row in grey]
-    picture = picture_of(wired(ros, raw_image(maker, encoding, rows, 16, 7)))
+    picture = image_from_message(wired(ros, raw_image(maker, encoding, rows, 16, 7)))
     assert np.array_equal(picture, grey)
     picture[0, 0] ^= 255  # a copy, not the message's own bytes
 
@@ -105,7 +105,7 @@ def test_grey_stays_grey(ros, maker, encoding):
 def test_bytes_as_rospy_and_rclpy_have_them(maker, kind):
     message = maker.image(NOW_NS, "", np.zeros((2, 3, 3), np.uint8))
     message.data = kind(bytes(range(18)))
-    assert picture_of(message).tobytes() == bytes(range(18))
+    assert image_from_message(message).tobytes() == bytes(range(18))
 
 
 @pytest.mark.parametrize(
@@ -123,14 +123,14 @@ def test_pictures_that_are_none_are_named(maker, changes, told):
     for name, value in changes.items():
         setattr(message, name, value)
     with pytest.raises(TelemetryError, match=told):
-        picture_of(message)
+        image_from_message(message)
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (6, 9, 3)])
 def test_pictures_go_out_as_they_come_in(ros, maker, shape):
     picture = np.random.default_rng(4).integers(0, 256, shape, dtype=np.uint8)
     message = wired(ros, maker.image(NOW_NS, "map", picture[:, ::-1]))
-    assert np.array_equal(picture_of(message), picture[:, ::-1])
+    assert np.array_equal(image_from_message(message), picture[:, ::-1])
     assert stamp_ns(message) == NOW_NS
     assert message.header.frame_id == "map"
 
@@ -141,7 +141,7 @@ def test_pictures_go_out_as_they_come_in(ros, maker, shape):
 def test_a_calibration_comes_back(ros, maker):
     camera = Camera(640, 480, np.array([[500.5, 0, 320.25], [0, 501, 239.5], [0, 0, 1]]), "plumb_bob",
                     np.array([0.1, -0.2, 1e-3, 2e-3, 0.05]))  # fmt: skip
-    back = camera_of(wired(ros, maker.camera_info(NOW_NS, "camera", camera)))
+    back = camera_from_message(wired(ros, maker.camera_info(NOW_NS, "camera", camera)))
     assert (back.width_px, back.height_px, back.distortion_model) == (640, 480, "plumb_bob")
     assert np.array_equal(back.matrix, camera.matrix)
     assert np.array_equal(back.distortion, camera.distortion)
@@ -151,18 +151,18 @@ def test_an_ideal_camera_may_state_no_distortion(ros, maker):
     message = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
     setattr(message, "D" if ros == "ros1" else "d", np.zeros(0))
     message.distortion_model = ""
-    assert not camera_of(wired(ros, message)).distorts
+    assert not camera_from_message(wired(ros, message)).distorts
 
 
 def test_calibrations_that_are_none_are_named(ros, maker):
     blank = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
     setattr(blank, "K" if ros == "ros1" else "k", np.zeros(9))
     with pytest.raises(CalibrationError, match="camera_info"):
-        camera_of(blank)
+        camera_from_message(blank)
     binned = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
     binned.binning_x = 2
     with pytest.raises(CalibrationError, match="binning"):
-        camera_of(binned)
+        camera_from_message(binned)
 
 
 # ------------------------------------------------------------------------------------------ REP-103, by hand
@@ -188,7 +188,7 @@ def test_facing_east_is_no_turn_and_north_a_quarter():
 
 def test_attitudes_come_back(ros, maker):
     for roll, pitch, heading in random_angles(50):
-        back = attitude_of(wired(ros, maker.imu(NOW_NS, "base_link", roll, pitch, heading)))
+        back = attitude_from_message(wired(ros, maker.imu(NOW_NS, "base_link", roll, pitch, heading)))
         assert back[:2] == pytest.approx((roll, pitch), abs=1e-6)
         assert math.remainder(back[2] - heading, 360.0) == pytest.approx(0.0, abs=1e-6)
 
@@ -196,11 +196,11 @@ def test_attitudes_come_back(ros, maker):
 def test_an_imu_without_orientation_says_nothing(maker):
     message = maker.imu(NOW_NS, "", 1, 2, 3)
     message.orientation_covariance = np.array([-1.0, *(0.0,) * 8])
-    assert attitude_of(message) is None
+    assert attitude_from_message(message) is None
     for values in ((0, 0, 0, 0), (0, 0, math.nan, 1), (0, 0, 3, 1)):
         message = maker.imu(NOW_NS, "", 1, 2, 3)
         message.orientation = maker.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
-        assert attitude_of(message) is None
+        assert attitude_from_message(message) is None
 
 
 def a_range(maker, range_m):
@@ -211,19 +211,19 @@ def a_range(maker, range_m):
 @pytest.mark.parametrize(("range_m", "told"), [(12.0, 12.0), (0.1, None), (60.0, None), (math.inf, None),
                                                (math.nan, None), (-math.inf, None)])  # fmt: skip
 def test_ranges_beyond_reach_are_unknown(maker, range_m, told):
-    assert range_of(a_range(maker, range_m)) == told
+    assert range_from_message(a_range(maker, range_m)) == told
 
 
 def test_positions_carry_the_worse_axis(ros, maker):
     turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
     covariance = turn @ np.diag([4.0, 25.0, 9.0]) @ turn.T
     message = wired(ros, maker.position(NOW_NS, "", 33.5, -72.25, covariance))
-    assert position_of(message) == pytest.approx((33.5, -72.25, 5.0))
+    assert position_from_message(message) == pytest.approx((33.5, -72.25, 5.0))
     assert math.isnan(message.altitude)
     message.position_covariance_type = 0
-    assert position_of(message) == (33.5, -72.25, None)
+    assert position_from_message(message) == (33.5, -72.25, None)
     message.status.status = NO_POSITION
-    assert position_of(message) is None
+    assert position_from_message(message) is None
 
 
 # ------------------------------------------------------------------------------------------------ telemetry
@@ -243,7 +243,7 @@ def test_telemetry_is_that_of_the_capture(maker):
     assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx((2.5, -5.0))
     heard.compass(20.0, NOW_NS + 250_000_000)
     assert heard.vehicle(NOW_NS + 250_000_000).heading_deg == pytest.approx(20.0)
-    assert heard.vehicle(NOW_NS + 3_000_000_000) == Vehicle()
+    assert heard.vehicle(NOW_NS + 3_000_000_000) == VehicleState()
 
 
 def test_the_beam_leans_with_the_body(maker):
@@ -283,7 +283,7 @@ def a_fix(site, **changes):
     return Fix(**(values | changes))
 
 
-VEHICLE = Vehicle(roll_deg=2.0, pitch_deg=-3.0, heading_deg=200.0, height_agl_m=120.0, down_m=-118.0)
+VEHICLE = VehicleState(roll_deg=2.0, pitch_deg=-3.0, heading_deg=200.0, height_agl_m=120.0, down_m=-118.0)
 
 
 def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
@@ -302,7 +302,7 @@ def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
 def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
     fix = a_fix(sim_site, attitude=Attitude(5.0, 6.0, 77.0), up_m=sim_site.ground_m + 80.0)
     message = pose(
-        maker, fix, Vehicle(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0), NOW_NS, sim_site, RosOptions()
+        maker, fix, VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0), NOW_NS, sim_site, RosOptions()
     )
     turn = message.pose.pose.orientation
     assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx(quaternion_xyzw(5.0, 6.0, 77.0))
@@ -310,7 +310,7 @@ def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
 
 
 def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
-    message = pose(maker, a_fix(sim_site), Vehicle(), NOW_NS, sim_site, RosOptions())
+    message = pose(maker, a_fix(sim_site), VehicleState(), NOW_NS, sim_site, RosOptions())
     variances = np.diag(np.asarray(message.pose.covariance).reshape(6, 6))
     assert variances[2] >= 1e6
     assert (variances[3:] >= math.pi**2).all()
@@ -320,13 +320,13 @@ def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
 
 def test_the_origin_moves_the_pose(maker, sim_site):
     fix = a_fix(sim_site)
-    options = RosOptions(origin=Origin(fix.lat_deg, fix.lon_deg, 0.0))
+    options = RosOptions(origin=NedOrigin(fix.lat_deg, fix.lon_deg, 0.0))
     at = pose(maker, fix, VEHICLE, NOW_NS, sim_site, options).pose.pose.position
     assert (at.x, at.y) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
 def test_ardupilot_finds_the_fix_again_and_the_height_drowns_nothing(maker, sim_site):
-    fix, origin = a_fix(sim_site), Origin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
+    fix, origin = a_fix(sim_site), NedOrigin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
     message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions(firmware="ardupilot", origin=origin))
     at, scale = (
         message.pose.pose.position,
@@ -379,7 +379,7 @@ class StandIn:
     """A node that keeps what is published."""
 
     def __init__(self, maker, wanted=True):
-        self.maker, self.wanted, self.published, self.changed = maker, wanted, [], threading.Condition()
+        self.messages, self.wanted, self.published, self.changed = maker, wanted, [], threading.Condition()
         self.time_ns = NOW_NS
 
     def now_ns(self):
@@ -390,7 +390,7 @@ class StandIn:
             self.published.append((output, message))
             self.changed.notify_all()
 
-    def is_wanted(self, output):
+    def has_subscribers(self, output):
         return self.wanted
 
     def of(self, output):
@@ -504,23 +504,23 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
 def test_silence_is_told(maker, sim_site, monkeypatch):
     node = StandIn(maker)
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
-        bridge.beat()
+        bridge.check_input()
         assert not node.of("diagnostics")
         later = time.monotonic() + 5.0
         monkeypatch.setattr("engine.adapters.ros.time.monotonic", lambda: later)
-        bridge.beat()
+        bridge.check_input()
     assert "no picture for" in node.of("diagnostics")[0].status[0].message
 
 
 def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
     node = StandIn(maker)
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
-        handlers = bridge.handlers(Topics(compass="", velocity=""))
+        handlers = bridge.handlers(RosTopics(compass="", velocity=""))
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
-        handlers[Topics().height][1](maker.float64(42.0))
+        handlers[RosTopics().height][1](maker.float64(42.0))
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
     assert "" not in kinds
-    assert set(kinds) == {Topics().image, Topics().imu, Topics().height, Topics().range}
+    assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
 
 
@@ -584,8 +584,8 @@ class Rclpy(ModuleType):
 def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
     maker, camera = maker_of("ros2"), Camera.from_fov(6, 4, 60.0)
     rclpy = Rclpy({
-        Topics().camera_info: maker.camera_info(NOW_NS, "", camera),
-        Topics().image: an_image(maker, NOW_NS),
+        RosTopics().camera_info: maker.camera_info(NOW_NS, "", camera),
+        RosTopics().image: an_image(maker, NOW_NS),
     })  # fmt: skip
     quality = ModuleType("rclpy.qos")
     quality.qos_profile_sensor_data = "best effort"
@@ -598,11 +598,11 @@ def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
         "1",
         "LOCALHOST",
     )
-    told = node.wait_for(Topics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
-    assert np.array_equal(camera_of(told).matrix, camera.matrix)
+    told = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
+    assert np.array_equal(camera_from_message(told).matrix, camera.matrix)
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
-        node.spin(bridge.handlers(Topics()), bridge.beat, None)
+        node.spin(bridge.handlers(RosTopics()), bridge.check_input, None)
     assert {topic: len(sent) for topic, sent in rclpy.published.items()} == {
         "~/pose": 1, "~/fix": 1, "~/window": 1, "/diagnostics": 1,
     }  # fmt: skip
@@ -647,7 +647,7 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
         package, _, short = name.split("/")
         if f"{package}.msg" in sys.modules:
             setattr(sys.modules[f"{package}.msg"], short, kind)
-    rospy = Rospy({Topics().image: an_image(maker, NOW_NS)})
+    rospy = Rospy({RosTopics().image: an_image(maker, NOW_NS)})
     genpy, rosgraph = ModuleType("genpy"), ModuleType("rosgraph")
     genpy.Time = lambda secs, nsecs: SimpleNamespace(secs=secs, nsecs=nsecs)
     rosgraph.is_master_online, rosgraph.get_master_uri = (lambda: rospy.named is None), (lambda: "http://here")
@@ -659,13 +659,13 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
     assert ros1.os.environ["ROS_IP"] == "127.0.0.1"
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
-        node.spin(bridge.handlers(Topics()), bridge.beat, 1.0)
+        node.spin(bridge.handlers(RosTopics()), bridge.check_input, 1.0)
     assert {topic: len(sent) for topic, sent in rospy.published.items()} == {
         "~pose": 1, "~fix": 1, "~window": 1, "/diagnostics": 1,
     }  # fmt: skip
     assert stamp_ns(rospy.published["~pose"][0]) == NOW_NS
     # By rospy's own buffer pictures would grow old in the socket.
-    assert rospy.subscribed[Topics().image] == {"queue_size": 1, "buff_size": 2**24}
+    assert rospy.subscribed[RosTopics().image] == {"queue_size": 1, "buff_size": 2**24}
     with pytest.raises(BackendError, match="expected a ROS master at http://here"):
         ros1.Node("again")
 
@@ -689,5 +689,5 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
 def test_the_command_line_names_the_topics_of_the_code(capsys):
     assert main(["bridge", "ros", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    for name in Topics.__slots__:
-        assert getattr(Topics(), name) in text
+    for name in RosTopics.__slots__:
+        assert getattr(RosTopics(), name) in text

@@ -22,7 +22,7 @@ from engine.cli.app import run as main
 from engine.errors import MissingExtraError, OptionError, TelemetryError
 from engine.formats.flight import open_flight
 from engine.formats.logs.readers import open_truth
-from engine.formats.ros.bag_writer import KINDS, write_bag
+from engine.formats.ros.bag_writer import BAG_KINDS, write_bag
 from engine.formats.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
 from engine.formats.ros.messages import MessageFactory
 from engine.values import Frame, Prior, Truth
@@ -69,7 +69,7 @@ def a_bag(folder, kind, **options):
     return path, frames, truth
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 @pytest.mark.parametrize("grey", [False, True])
 def test_pictures_come_back_byte_for_byte(tmp_path, kind, grey):
     path, frames, _ = a_bag(tmp_path, kind, grey=grey)
@@ -80,7 +80,7 @@ def test_pictures_come_back_byte_for_byte(tmp_path, kind, grey):
         assert source.read(str(k)).tobytes() == image.tobytes()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_a_flight_comes_back(tmp_path, kind):
     path, frames, truth = a_bag(tmp_path, kind)
     flight = open_flight(path, camera=read_bag_camera(path))
@@ -99,7 +99,7 @@ def test_a_flight_comes_back(tmp_path, kind):
             assert getattr(row, name) == pytest.approx(getattr(told, name), abs=1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_the_calibration_comes_back_but_its_mount(tmp_path, kind):
     path, _, _ = a_bag(tmp_path, kind)
     camera = read_bag_camera(path)
@@ -108,7 +108,7 @@ def test_the_calibration_comes_back_but_its_mount(tmp_path, kind):
     assert np.array_equal(camera.distortion, CAMERA.distortion)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_others_read_what_is_written(tmp_path, kind):
     """By rosbags alone: the names, types and numbers that a ROS tool finds."""
     path, frames, _ = a_bag(tmp_path, kind)
@@ -227,7 +227,7 @@ def test_misuse_is_named(tmp_path):
 # -------------------------------------------------------------------------------------------------- damage
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_every_truncation_is_one_line_or_a_shorter_flight(tmp_path, kind):
     path, frames, _ = a_bag(tmp_path, kind, count=2)
     file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix in (".db3", ".mcap"))
@@ -237,7 +237,7 @@ def test_every_truncation_is_one_line_or_a_shorter_flight(tmp_path, kind):
         check_readable_or_one_line(path, frames)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_mutated_bags_are_one_line_or_a_flight(tmp_path, kind):
     path, frames, _ = a_bag(tmp_path, kind, count=2)
     rng = np.random.default_rng(5)
@@ -325,7 +325,7 @@ def unreadable():
     raise TelemetryError("frame 1: expected a readable picture")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_a_bag_stays_until_the_next_one_is_whole(tmp_path, kind, monkeypatch):
     path, _, _ = a_bag(tmp_path, kind, count=2)
     before = files_in(tmp_path)

@@ -17,7 +17,7 @@ from rasterio.warp import reproject
 from engine import Camera
 from engine.cli.app import run
 from engine.formats.datasets.alto import EPSG
-from engine.formats.datasets.mosaic import Mosaic, Piece, write_mosaic
+from engine.formats.datasets.mosaic import Mosaic, MosaicTile, write_mosaic
 from engine.formats.geotiff import write_geotiff
 from engine.formats.telemetry import TelemetryRow, read_telemetry
 from engine.formats.truth import read_truth
@@ -187,7 +187,7 @@ def test_uav_visloc_says_where_the_maps_own_georeference_disagrees(in_degrees, f
         file.write(np.moveaxis(picture, 2, 0))
     command = ["dataset", "import", "uav-visloc", str(tmp_path), "--part=03", "--hfov-deg=60"]
     assert run([*command, f"--out={tmp_path / 'flight'}", "--height-is=agl"]) == 0
-    assert "satellite03.tif has itself up to 11 m off its published range" in capsys.readouterr().err
+    assert "georeference of satellite03.tif is up to 11 m off its published range" in capsys.readouterr().err
     with rasterio.open(tmp_path / "flight" / "map.tif") as file:
         assert file.bounds.top == pytest.approx(north, abs=1e-9)
 
@@ -229,8 +229,8 @@ def test_wildnav_is_followed_on_its_map_of_pictures(in_degrees, frames, truth, t
     assert not flight.exists()
     assert run([*command, "--interval-s=0.893"]) == 0
     told = capsys.readouterr().err
-    assert "1 of 5 pictures are not there" in told
-    assert "1 of 3 pictures of the map are not there" in told
+    assert "1 of 5 pictures are missing" in told
+    assert "1 of 3 pictures of the map are missing" in told
     followed(flight, tmp_path, frames, truth)
 
 
@@ -429,7 +429,8 @@ def test_a_mosaic_of_pieces_of_several_pixels_takes_the_median(tmp_path):
     save(tmp_path / "b.png", fine)
     save(tmp_path / "c.png", fine[::2, ::2])
     pieces = [
-        Piece(tmp_path / f"{name}.png", x, 10.0, x + 10.0, 0.0) for name, x in (("a", 0), ("b", 10), ("c", 30))
+        MosaicTile(tmp_path / f"{name}.png", x, 10.0, x + 10.0, 0.0)
+        for name, x in (("a", 0), ("b", 10), ("c", 30))
     ]
     write_mosaic(tmp_path / "map.tif", Mosaic(pieces, epsg=32633))
     with rasterio.open(tmp_path / "map.tif") as file:
@@ -523,14 +524,14 @@ def test_a_fault_of_the_places_is_named(kind, ground):
         (
             each(height_agl_m=lambda row, k: 1.0, alt_amsl_m=lambda row, k: None),
             ["height"],
-            ("1 m in the median",),
+            ("median height above the ground is 1 m",),
         ),
         (each(heading_deg=lambda row, k: None), ["heading"], ("48 of 48 rows have no heading",)),
         (each(heading_deg=lambda row, k: (-row.heading_deg) % 360.0), ["heading"], ("mirrored",)),
         (
             each(heading_deg=lambda row, k: (row.heading_deg + 90.0) % 360.0),
             ["heading"],
-            ("degrees off the course", "steadily"),
+            ("degrees off the course", "throughout"),
         ),
         (each(heading_deg=lambda row, k: (row.heading_deg + 8.0) % 360.0), [], ()),  # wind
     ],
@@ -719,4 +720,4 @@ def test_anyvisloc_becomes_flights_of_one_frame_on_one_map(plan, truth, tmp_path
 def test_a_sample_that_would_run_code_is_refused(tmp_path, capsys):
     np.savez(tmp_path / "L01_R0000.npz", image_query=np.array([{"a": 1}], dtype=object))
     assert run(["dataset", "import", "ortholoc", str(tmp_path), f"--out={tmp_path / 'out'}"]) == 1
-    assert "expected arrays of numpy" in capsys.readouterr().err
+    assert "expected NumPy arrays" in capsys.readouterr().err

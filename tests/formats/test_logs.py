@@ -25,7 +25,7 @@ from engine.cli.app import run
 from engine.errors import OptionError, TelemetryError
 from engine.formats.flight import open_flight
 from engine.formats.logs.readers import LogClock, open_log, open_truth, stamp_frames
-from engine.formats.resampling import MAX_GAP_NS, Log, interpolate, make_series, telemetry_at
+from engine.formats.resampling import MAX_SAMPLE_GAP_NS, FlightLog, interpolate, make_series, telemetry_at
 from engine.formats.telemetry import read_telemetry
 from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
@@ -51,7 +51,7 @@ def refusal(call, *arguments, error=TelemetryError, **options):
 
 def test_values_are_linear_between_samples_and_angles_take_the_short_way():
     angle = make_series([0, S, 2 * S], [350.0, 10.0, 190.5])
-    values = interpolate(angle, np.array([0, S // 2, 3 * S // 4, S, 3 * S // 2]), turning=True)
+    values = interpolate(angle, np.array([0, S // 2, 3 * S // 4, S, 3 * S // 2]), is_angle=True)
     assert values % 360.0 == pytest.approx([350.0, 0.0, 5.0, 10.0, 280.25])
     line = make_series([5, 15], [1.0, 3.0])
     assert interpolate(line, np.array([5, 10, 15])) == pytest.approx([1.0, 2.0, 3.0])
@@ -63,8 +63,8 @@ def test_stamps_since_1970_lose_no_nanosecond():
 
 
 def test_gaps_and_the_time_outside_say_nothing():
-    series = make_series([0, S, S + MAX_GAP_NS + 1], [1.0, 2.0, 4.0])
-    moments = np.array([-S, -1, S // 2, S, S + 1, 2 * S, S + MAX_GAP_NS + 1, 9 * S])
+    series = make_series([0, S, S + MAX_SAMPLE_GAP_NS + 1], [1.0, 2.0, 4.0])
+    moments = np.array([-S, -1, S // 2, S, S + 1, 2 * S, S + MAX_SAMPLE_GAP_NS + 1, 9 * S])
     known = np.isfinite(interpolate(series, moments))
     assert known.tolist() == [False, True, True, True, False, False, True, False]
 
@@ -337,7 +337,7 @@ def save(path, content=b"x"):
 def outcome(path):
     """Read or refused in one line; any other error is the test's."""
     try:
-        return "read" if isinstance(open_log(path), Log) else "neither"
+        return "read" if isinstance(open_log(path), FlightLog) else "neither"
     except TelemetryError as error:
         return "neither" if "\n" in str(error) else "refused"
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from engine import OptionError
-from engine.formats.settings import changed, meanings_of, options_from_mapping, read_settings, settings_text
+from engine.formats.settings import changed, field_descriptions, options_from_mapping, read_settings, settings_text
 from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.runs.settings import TrackSettings, load_settings
@@ -92,6 +92,6 @@ def test_a_file_cannot_hold_what_is_no_value():
 
 
 def test_meanings_are_whole_sentences_of_the_docstring():
-    meanings = meanings_of(NavigatorOptions)
+    meanings = field_descriptions(NavigatorOptions)
     assert meanings["growth"].endswith("for every refusal in a row.")
     assert set(meanings) == set(NavigatorOptions.__dataclass_fields__)

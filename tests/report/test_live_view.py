@@ -232,9 +232,11 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
     if bridge == "mavlink":
         mavlink = pytest.importorskip("engine.adapters.mavlink", reason="pymavlink is not installed")
         from engine.adapters.links import Connection
-        from engine.adapters.mavlink_out import Outgoing
+        from engine.adapters.mavlink_out import MavlinkOptions
 
-        made = mavlink.Bridge(Connection("udpin", "127.0.0.1", 0), quiet, Outgoing(), watch=told.append)
+        made = mavlink.MavlinkBridge(
+            Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=told.append
+        )
     else:
         made = RosBridge(SilentNode(), sim_site, quiet, RosOptions(), watch=told.append)
     made.deliver(answer)
@@ -250,7 +252,7 @@ class SilentNode:
     def now_ns(self):
         return 1
 
-    def is_wanted(self, output):
+    def has_subscribers(self, output):
         return False
 
     def publish(self, output, message):

@@ -10,7 +10,7 @@ from PIL import Image
 
 from bench.pages.browser import missing, open_browser
 from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.formats.notes import Note, note_of, read_notes, write_notes
+from engine.formats.notes import FrameNote, frame_note, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.integrity import PeakRule
@@ -141,8 +141,8 @@ def test_notes_come_back_as_they_were(tmp_path):
     window = Window(3, 4, 50, 60)
     refusal = NoFix(reason=Reason.AMBIGUOUS, detail='0.41 against 0.40, "here"', window=window)
     notes = [
-        note_of("a.jpg", refusal, "lost"),
-        Note(frame="b.jpg", state="tracking", heading_deg=12.5, stage="fine"),
+        frame_note("a.jpg", refusal, "lost"),
+        FrameNote(frame="b.jpg", state="tracking", heading_deg=12.5, stage="fine"),
     ]
     write_notes(tmp_path / "notes.csv", notes)
     assert read_notes(tmp_path / "notes.csv") == notes

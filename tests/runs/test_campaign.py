@@ -21,7 +21,7 @@ from engine.errors import TelemetryError
 from engine.formats.logs.readers import LogClock
 from engine.formats.settings import read_settings
 from engine.formats.track import read_track
-from engine.report.campaign import Line, pooled, write_tables
+from engine.report.campaign import CampaignRow, pool_runs, write_tables
 from engine.runs.campaign import _prepare
 from engine.runs.campaign_plan import Campaign, _content_hash, plan_campaign
 from engine.runs.executors import in_processes
@@ -416,11 +416,11 @@ def line(flight, rms_m, fixes, **more):
         "false_fixes": 1,
         "wrong_over_10m": 2,
     }
-    return replace(Line("towns", flight, "ncc", figures, None, None), **more)
+    return replace(CampaignRow("towns", flight, "ncc", figures, None, None), **more)
 
 
 def test_a_pool_weighs_each_fix_alike():
-    (pool,) = pooled([line("a", 3.0, 10), line("b", 4.0, 5), line("c", None, 0, figures=None, failure="gone")])
+    (pool,) = pool_runs([line("a", 3.0, 10), line("b", 4.0, 5), line("c", None, 0, figures=None, failure="gone")])
     assert pool.rms_m == pytest.approx(((10 * 9.0 + 5 * 16.0) / 15) ** 0.5)
     assert (pool.flights, pool.failed, pool.frames, pool.availability) == (2, 1, 20, 0.75)
     assert (pool.worst_rms_m, pool.false_fixes, pool.wrong_over_10m) == (4.0, 2, 4)
@@ -428,7 +428,7 @@ def test_a_pool_weighs_each_fix_alike():
 
 def test_what_has_no_truth_has_no_errors(tmp_path):
     blind = line("a", None, 10, figures={"frames": 10, "fixes": 10, "availability": 1.0})
-    (pool,) = pooled([blind])
+    (pool,) = pool_runs([blind])
     assert (pool.rms_m, pool.false_fixes, pool.availability) == (None, None, 1.0)
     write_tables(tmp_path, [blind])
     assert "| a | ncc | 10 | 100.0% | - | - | - | - | - | - | - |" in (tmp_path / "campaign.md").read_text()

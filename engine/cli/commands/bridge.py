@@ -191,13 +191,13 @@ def ros(
     Hears pictures, attitude and height, and publishes poses, fixes, diagnostics and the window that was searched.
     An empty name of a topic leaves it out.
     """
-    from engine.adapters.ros import Topics
+    from engine.adapters.ros import RosTopics
     from engine.runs.live_viewing import LiveViewTarget
     from engine.runs.mavlink_bridge import BridgeSettings
     from engine.runs.ros_bridge import RosSettings, run_ros_bridge
 
     use_threads(threads)
-    topics = Topics(
+    topics = RosTopics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
         velocity=velocity,
     )  # fmt: skip

@@ -34,15 +34,15 @@ def campaign(
     Each flight by each method is a run in a process of its own, with one thread. The same command goes on where an
     earlier one ended, for whatever reason it did.
     """
-    from engine.report.campaign import POOL_COLUMNS, pool_cells, pooled
+    from engine.report.campaign import POOL_COLUMNS, pool_runs, pooled_cells
     from engine.runs.campaign import run_campaign
 
     lines = run_campaign(file, out, workers=workers, ray=ray, force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json([asdict(line) for line in lines])
     else:
-        pools = pooled(lines)
+        pools = pool_runs(lines)
         for group in dict.fromkeys(pool.group for pool in pools):
-            console.print_table(group, POOL_COLUMNS, [pool_cells(p) for p in pools if p.group == group])
+            console.print_table(group, POOL_COLUMNS, [pooled_cells(p) for p in pools if p.group == group])
         console.say(f"written to {out}")
     raise typer.Exit(1 if any(line.failure for line in lines) else 0)

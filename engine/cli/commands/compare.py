@@ -58,7 +58,7 @@ def compare(
 ) -> None:
     """Several methods or settings over one flight.
 
-    Follows the flight once a run, each into a folder of its own as track does, and tells them apart in one table
+    Follows the flight once a run, each into a folder of its own as track does, and compares them in one table
     and one chart.
     """
     from engine.runs.comparison import compare as compare_runs

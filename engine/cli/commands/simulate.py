@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Flight folder, made by this run.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Flight folder, created by this run.")],
     seed: Annotated[
         int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
     ] = 1,

@@ -1,1 +1,1 @@
-"""Published data sets: a reader a layout, from the files that a user has downloaded to a flight folder."""
+"""Readers of published data sets, one per layout, and the writer of their flight folders."""

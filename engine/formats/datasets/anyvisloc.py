@@ -1,4 +1,4 @@
-"""AnyVisLoc: single photographs of drones over China, a scene a folder with two maps, in local metres.
+"""AnyVisLoc: single photographs of drones over China, one folder per scene with two maps, in local metres.
 
 Layout (https://github.com/UAV-AVL/Benchmark)::
 
@@ -7,8 +7,8 @@ Layout (https://github.com/UAV-AVL/Benchmark)::
     Scene_01/aerial_map.png, aerial_dsm.npy, satellite_map.png, satellite_dsm.npy
     Scene_01/L01_0001.npz          image or image_relpath, K, dist, xyz (z up), euler_deg (roll, pitch, yaw)
 
-A pitch of 0 looks straight down, a yaw of 0 to the north. Which way a roll is positive could not be verified: it
-is taken as 0, which it is on a gimbal.
+A pitch of 0 is nadir, a yaw of 0 north. The sign of the roll could not be verified: it is taken as 0, as on a
+gimbal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from PIL import Image
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.formats.datasets.singles import Array, LocalMap, Single, picture_of, read_arrays
+from engine.formats.datasets.single_photos import Array, LocalMap, SinglePhoto, as_rgb_image, read_arrays
 from engine.values import Attitude
 
 MODES = ("aerial", "satellite")
@@ -33,11 +33,11 @@ def find_anyvisloc(scene: Path) -> list[Path]:
     return sorted(scene.glob("L??_????.npz"))
 
 
-def read_place(scene: Path, mode: str) -> LocalMap:
-    """Read one of a scene's two maps.
+def read_local_map(scene: Path, mode: str) -> LocalMap:
+    """Read one of the two maps of a scene.
 
     Args:
-        scene: its folder.
+        scene: folder of the scene.
         mode: one of :data:`MODES`.
 
     Raises:
@@ -45,10 +45,10 @@ def read_place(scene: Path, mode: str) -> LocalMap:
     """
     path = next(iter(sorted(scene.glob("L??_reference.json"))), scene / "L01_reference.json")
     try:
-        said: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["modes"][mode]
-        map_px, dsm_px = (_pair(said[f"{name}_resolution"]) for name in ("map", "dsm"))
-        map_at, dsm_from = (_pair(said.get(f"{name}_origin_local", (0.0, 0.0))) for name in ("map", "dsm"))
-        picture, heights = scene / str(said["map_path"]), scene / str(said["dsm_path"])
+        entry: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["modes"][mode]
+        map_px, dsm_px = (_pair(entry[f"{name}_resolution"]) for name in ("map", "dsm"))
+        map_origin, dsm_offset = (_pair(entry.get(f"{name}_origin_local", (0.0, 0.0))) for name in ("map", "dsm"))
+        picture, heights = scene / str(entry["map_path"]), scene / str(entry["dsm_path"])
     except FileNotFoundError:
         raise TelemetryError(f"{path}: no such file") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -60,9 +60,9 @@ def read_place(scene: Path, mode: str) -> LocalMap:
     surface_m = np.asarray(surface_m if surface_m.ndim == 2 else surface_m[..., 0], dtype=np.float32)
     return LocalMap(
         picture=picture,
-        pixel_to_m=_south_up(map_at, map_px),
+        pixel_to_m=_affine(map_origin, map_px),
         surface_m=surface_m,
-        surface_to_m=_south_up(map_at + dsm_from, dsm_px),
+        surface_to_m=_affine(map_origin + dsm_offset, dsm_px),
     )
 
 
@@ -73,17 +73,17 @@ def _pair(value: Any) -> Array:
     return pair
 
 
-def _south_up(origin: Array, step: Array) -> Array:
-    """East and north of pixels whose local y points south."""
+def _affine(origin: Array, step: Array) -> Array:
+    """(2, 3) affine transform of pixels, whose local y points south, to east and north."""
     return np.array([[step[0], 0.0, origin[0]], [0.0, -step[1], -origin[1]]])
 
 
-def read_anyvisloc(path: Path) -> Single:
+def read_anyvisloc(path: Path) -> SinglePhoto:
     """Read one sample.
 
     Raises:
         TelemetryError: it is not of the layout.
-        CalibrationError: its intrinsics are none.
+        CalibrationError: its intrinsics are invalid.
     """
     arrays = read_arrays(path, ("image", "K", "dist", "xyz", "euler_deg"))
     image = arrays["image"]
@@ -94,12 +94,12 @@ def read_anyvisloc(path: Path) -> Single:
                 image = np.array(opened.convert("RGB"))
         except OSError as error:
             raise TelemetryError(f"{path.parent / relative}: cannot be read: {error.strerror or error}") from None
-    picture = picture_of(image, path, "image")
+    picture = as_rgb_image(image, path, "image")
     east_m, south_m, up_m = (float(v) for v in np.asarray(arrays["xyz"], dtype=np.float64).reshape(3))
     _, pitch_deg, yaw_deg = (float(v) for v in np.asarray(arrays["euler_deg"], dtype=np.float64).reshape(3))
     distortion = np.asarray(arrays["dist"], dtype=np.float64).reshape(-1)
     matrix = np.asarray(arrays["K"], dtype=np.float64)
-    return Single(
+    return SinglePhoto(
         name=path.stem,
         image=picture,
         camera=Camera(picture.shape[1], picture.shape[0], matrix, distortion=distortion),

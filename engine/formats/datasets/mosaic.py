@@ -1,4 +1,4 @@
-"""A map in pieces, laid together into one GeoTIFF strip by strip, whatever its size."""
+"""Mosaicking: the tiles of a map are merged into one GeoTIFF strip by strip, so that size does not matter."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _STRIP_PX = 512
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """A picture of a part of the map, north up.
+class MosaicTile:
+    """A north-up image of a part of the map; edges are those of the outer pixels, in the mosaic's CRS.
 
     Attributes:
-        path: the picture, uint8.
-        left: edge in the mosaic's coordinate system, as are the next three; the outer edges of the outer pixels.
-        top: see left.
-        right: see left.
-        bottom: see left.
+        path: the image, uint8.
+        left: western edge.
+        top: northern edge.
+        right: eastern edge.
+        bottom: southern edge.
     """
 
     path: Path
@@ -42,11 +42,11 @@ class Mosaic:
     """Pieces of one map; where two overlap, the later one counts.
 
     Attributes:
-        pieces: at least one.
-        epsg: of their coordinates.
+        tiles: at least one.
+        epsg: EPSG code of their coordinates.
     """
 
-    pieces: Sequence[Piece]
+    tiles: Sequence[MosaicTile]
     epsg: int
 
 
@@ -65,29 +65,29 @@ def write_mosaic(path: Path, mosaic: Mosaic) -> None:
 
     try:
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
-            step_x, step_y = np.median([_pixel(piece) for piece in mosaic.pieces], axis=0)
-            left, top = min(p.left for p in mosaic.pieces), max(p.top for p in mosaic.pieces)
-            right, bottom = max(p.right for p in mosaic.pieces), min(p.bottom for p in mosaic.pieces)
+            step_x, step_y = np.median([_pixel(tile) for tile in mosaic.tiles], axis=0)
+            left, top = min(p.left for p in mosaic.tiles), max(p.top for p in mosaic.tiles)
+            right, bottom = max(p.right for p in mosaic.tiles), min(p.bottom for p in mosaic.tiles)
             width, height = math.ceil((right - left) / step_x - 1e-6), math.ceil((top - bottom) / step_y - 1e-6)
-            place = Affine(step_x, 0.0, left, 0.0, -step_y, top)
+            transform = Affine(step_x, 0.0, left, 0.0, -step_y, top)
             profile: dict[str, Any] = {
                 "driver": "GTiff", "width": width, "height": height, "count": 3, "dtype": "uint8", "tiled": True,
-                "crs": rasterio.CRS.from_epsg(mosaic.epsg), "transform": place,
+                "crs": rasterio.CRS.from_epsg(mosaic.epsg), "transform": transform,
                 "photometric": "RGB", "BIGTIFF": "IF_SAFER", "SPARSE_OK": "TRUE",
             }  # fmt: skip
             with rasterio.open(path, "w", **profile) as file:
-                for piece in mosaic.pieces:
-                    corner = (round((piece.left - left) / step_x), round((top - piece.top) / step_y))
-                    size = (round((piece.right - piece.left) / step_x), round((piece.top - piece.bottom) / step_y))
-                    _paste(file, piece, corner, size)
+                for tile in mosaic.tiles:
+                    corner = (round((tile.left - left) / step_x), round((top - tile.top) / step_y))
+                    size = (round((tile.right - tile.left) / step_x), round((tile.top - tile.bottom) / step_y))
+                    _paste(file, tile, corner, size)
     except OptionError:
         raise
     except (RasterioError, OSError, ValueError) as error:
-        raise MapError(f"{path}: cannot be laid together: {str(error).splitlines()[0]}") from None
+        raise MapError(f"{path}: cannot be mosaicked: {str(error).splitlines()[0]}") from None
 
 
 def size_px(path: Path) -> tuple[int, int]:
-    """Columns and rows of a picture.
+    """Width and height of an image in pixels.
 
     Raises:
         MapError: it cannot be read.
@@ -102,7 +102,7 @@ def size_px(path: Path) -> tuple[int, int]:
 
 
 def own_edges(path: Path, epsg: int) -> tuple[float, float, float, float] | None:
-    """Left, top, right and bottom as the file itself has them in this system, or None."""
+    """Left, top, right and bottom of the file's own georeference, or None where its CRS is another."""
     with _open(path) as source:
         if source.crs is None or source.crs.to_epsg() != epsg:
             return None
@@ -112,7 +112,7 @@ def own_edges(path: Path, epsg: int) -> tuple[float, float, float, float] | None
 
 @contextmanager
 def _open(path: Path) -> Iterator[Any]:
-    """A picture, by what its content says that it is; a VRT could point to any file or address."""
+    """Open an image by the format of its content; a VRT is refused, since it could refer to any file or URL."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
@@ -125,23 +125,23 @@ def _open(path: Path) -> Iterator[Any]:
             yield source
 
 
-def _pixel(piece: Piece) -> tuple[float, float]:
-    """Width and height of a pixel in the mosaic's coordinates."""
-    if not (piece.left < piece.right and piece.bottom < piece.top):
-        raise OptionError(f"{piece.path}: expected left < right and bottom < top, got {piece}")
-    with _open(piece.path) as source:
+def _pixel(tile: MosaicTile) -> tuple[float, float]:
+    """Pixel width and height in units of the mosaic's CRS."""
+    if not (tile.left < tile.right and tile.bottom < tile.top):
+        raise OptionError(f"{tile.path}: expected left < right and bottom < top, got {tile}")
+    with _open(tile.path) as source:
         if source.dtypes[0] != "uint8":
-            raise OptionError(f"{piece.path}: expected pixels of uint8, got {source.dtypes[0]}")
-        return (piece.right - piece.left) / source.width, (piece.top - piece.bottom) / source.height
+            raise OptionError(f"{tile.path}: expected pixels of uint8, got {source.dtypes[0]}")
+        return (tile.right - tile.left) / source.width, (tile.top - tile.bottom) / source.height
 
 
-def _paste(file: Any, piece: Piece, corner: tuple[int, int], size: tuple[int, int]) -> None:
-    """Write one piece, a strip at a time."""
+def _paste(file: Any, tile: MosaicTile, corner: tuple[int, int], size: tuple[int, int]) -> None:
+    """Resample and write one tile, a strip at a time."""
     from rasterio.enums import Resampling
     from rasterio.windows import Window
 
     width, height = min(size[0], file.width - corner[0]), min(size[1], file.height - corner[1])
-    with _open(piece.path) as source:
+    with _open(tile.path) as source:
         bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
         scale_x, scale_y = source.width / size[0], source.height / size[1]
         for row in range(0, height, _STRIP_PX):

@@ -1,6 +1,6 @@
 """OrthoLoC: single photographs with an orthophoto, a surface model and an exact pose each, in local metres.
 
-Layout (https://github.com/deepscenario/OrthoLoC): a file ``L01_R0000.npz`` a sample, of which are read
+Layout (https://github.com/deepscenario/OrthoLoC): one file ``L01_R0000.npz`` per sample, with
 
     image_query    (H, W, 3)    the photograph
     image_dop      (h, w, 3)    the orthophoto
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.formats.datasets.singles import Array, LocalMap, Single, picture_of, read_arrays
+from engine.formats.datasets.single_photos import Array, LocalMap, SinglePhoto, as_rgb_image, read_arrays
 from engine.geo import attitude_from_rotation
 from engine.values import Attitude
 
 _NAMES = ("image_query", "image_dop", "dsm", "intrinsics", "extrinsics")
-_OFF_GRID = 0.05  # pixels by which the places of a regular grid may be off it
+_MAX_GRID_ERROR_PX = 0.05  # deviation of positions from a regular grid
 
 
 def find_ortholoc(root: Path) -> list[Path]:
@@ -31,16 +31,16 @@ def find_ortholoc(root: Path) -> list[Path]:
     return sorted(root.glob("L*.npz"))
 
 
-def read_ortholoc(path: Path) -> tuple[Single, LocalMap]:
+def read_ortholoc(path: Path) -> tuple[SinglePhoto, LocalMap]:
     """Read one sample.
 
     Raises:
         TelemetryError: it is not of the layout.
-        CalibrationError: its intrinsics are none.
+        CalibrationError: its intrinsics are invalid.
     """
     arrays = read_arrays(path, _NAMES)
-    image = picture_of(arrays["image_query"], path, "image_query")
-    ortho = picture_of(arrays["image_dop"], path, "image_dop")
+    image = as_rgb_image(arrays["image_query"], path, "image_query")
+    ortho = as_rgb_image(arrays["image_dop"], path, "image_dop")
     world, pose = (np.asarray(arrays[name], dtype=np.float64) for name in ("dsm", "extrinsics"))
     if world.shape != ortho.shape or pose.shape != (3, 4):
         raise TelemetryError(
@@ -51,7 +51,7 @@ def read_ortholoc(path: Path) -> tuple[Single, LocalMap]:
     camera = Camera(image.shape[1], image.shape[0], np.asarray(arrays["intrinsics"], dtype=np.float64))
     position_m = -rotation.T @ pose[:, 3]
     attitude = attitude_from_rotation(rotation.T @ camera.mount.T)
-    single = Single(
+    single = SinglePhoto(
         name=path.stem,
         image=image,
         camera=camera,
@@ -63,18 +63,20 @@ def read_ortholoc(path: Path) -> tuple[Single, LocalMap]:
 
 
 def _grid(world: Array, path: Path) -> tuple[Array, NDArray[np.float64]]:
-    """Where pixels lie about the middle of the map, and where that lies in the file's metres."""
+    """(2, 3) affine transform of pixels to metres about the centre of the map, and (2,) that centre."""
     known = np.isfinite(world[:, :, :2]).all(axis=2)
     y, x = np.nonzero(known)
     if len(x) < 3:
-        raise TelemetryError(f"{path}: dsm: expected places of its pixels, got {len(x)} that are finite")
+        raise TelemetryError(f"{path}: dsm: expected positions of its pixels, got {len(x)} that are finite")
     origin = world[known][:, :2].mean(axis=0)
     design = np.column_stack([x, y, np.ones(len(x))])
-    places_m = world[known][:, :2] - origin
-    matrix: Array = np.asarray(np.linalg.lstsq(design, places_m, rcond=None)[0].T, dtype=np.float64)
-    off_px = float(np.abs(design @ matrix.T - places_m).max() / np.sqrt(abs(np.linalg.det(matrix[:, :2])) or 1.0))
-    if not off_px <= _OFF_GRID:
+    positions_m = world[known][:, :2] - origin
+    matrix: Array = np.asarray(np.linalg.lstsq(design, positions_m, rcond=None)[0].T, dtype=np.float64)
+    off_px = float(
+        np.abs(design @ matrix.T - positions_m).max() / np.sqrt(abs(np.linalg.det(matrix[:, :2])) or 1.0)
+    )
+    if not off_px <= _MAX_GRID_ERROR_PX:
         raise TelemetryError(
-            f"{path}: dsm: expected places on a regular grid, got some {off_px:.2f} pixels off it"
+            f"{path}: dsm: expected positions on a regular grid, got some {off_px:.2f} pixels off it"
         )
     return matrix, origin

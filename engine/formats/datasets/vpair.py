@@ -1,4 +1,4 @@
-"""VPAIR: pictures of a light aircraft over the Eifel with poses on the Earth; the map is the user's.
+"""VPAIR: images of a light aircraft over the Eifel with poses in ECEF; the user provides the map.
 
 Layout of the published sample (https://github.com/AerVisLoc/vpair, https://zenodo.org/record/6473989)::
 
@@ -6,8 +6,8 @@ Layout of the published sample (https://github.com/AerVisLoc/vpair, https://zeno
     queries/00001.png        as filepath says, 800 x 600 px
     poses_reference_view.txt, reference_views/, distractors/    not read: renderings, not a map
 
-Places are in metres on the axes of the Earth (ECEF), angles in radians about north, east and down. The undulation
-is the geoid's height, which makes heights above the sea of them. There are no times.
+Positions are in metres in ECEF, angles in radians about north, east and down. The undulation is the geoid's
+height, which converts ellipsoidal heights to heights above the sea. There are no times.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import TelemetryError
-from engine.formats.datasets.recording import Recording, Shot
-from engine.formats.telemetry import Cells, read_table
+from engine.formats.datasets.sequence import DatasetSequence, SequenceImage
+from engine.formats.tables import CsvRow, read_table
 from engine.geo import geodetic_from_ecef
 
 _COLUMNS = ("filepath", "x", "y", "z", "undulation", "roll", "pitch", "yaw")
 _NOTES = (
-    "the data set has renderings and no map: an orthophoto of the area is yours to give",
-    "whether the angles are the aircraft's or the camera's is not said; a mount in your calibration counts",
+    "the data set has renderings and no map: give an orthophoto of the area",
+    "whether the angles are the aircraft's or the camera's is not published; a mount in your calibration applies",
 )
 
 
-def read_vpair(root: Path) -> Recording:
+def read_vpair(root: Path) -> DatasetSequence:
     """Read the queries of the unpacked sample.
 
     Args:
@@ -38,21 +38,21 @@ def read_vpair(root: Path) -> Recording:
     Raises:
         TelemetryError: a file is missing or is not of the layout.
     """
-    shots = [_shot(cells, root) for cells in read_table(root / "poses_query.txt", _COLUMNS)]
-    if not shots:
-        raise TelemetryError(f"{root / 'poses_query.txt'}: expected a row a picture, got a header and no rows")
-    return Recording(dataset="VPAIR", shots=shots, datum="amsl", notes=_NOTES)
+    images = [_sequence_image(csv_row, root) for csv_row in read_table(root / "poses_query.txt", _COLUMNS)]
+    if not images:
+        raise TelemetryError(f"{root / 'poses_query.txt'}: expected one row per picture, got a header and no rows")
+    return DatasetSequence(dataset="VPAIR", images=images, datum="amsl", notes=_NOTES)
 
 
-def _shot(cells: Cells, root: Path) -> Shot:
-    ecef_m = np.array([cells.known(axis) for axis in ("x", "y", "z")])
+def _sequence_image(csv_row: CsvRow, root: Path) -> SequenceImage:
+    ecef_m = np.array([csv_row.required(axis) for axis in ("x", "y", "z")])
     lat_deg, lon_deg, ellipsoid_m = (float(value) for value in geodetic_from_ecef(ecef_m))
-    return Shot(
-        picture=root / cells.text("filepath"),
+    return SequenceImage(
+        path=root / csv_row.text("filepath"),
         lat_deg=lat_deg,
         lon_deg=lon_deg,
-        height_m=ellipsoid_m - cells.known("undulation"),
-        heading_deg=math.degrees(cells.known("yaw")),
-        roll_deg=math.degrees(cells.known("roll")),
-        pitch_deg=math.degrees(cells.known("pitch")),
+        height_m=ellipsoid_m - csv_row.required("undulation"),
+        heading_deg=math.degrees(csv_row.required("yaw")),
+        roll_deg=math.degrees(csv_row.required("roll")),
+        pitch_deg=math.degrees(csv_row.required("pitch")),
     )

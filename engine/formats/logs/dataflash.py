@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
-from engine.formats.resampling import Log, Series, make_log, make_position, make_series
+from engine.formats.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
 
-_HEAD, _FMT = b"\xa3\x95", 0x80  # each message begins with these two; the type that tells the other types
-_MAX_US = 1e13  # a third of a year: a later stamp is damage
-_KINDS = {  # numpy's type and divisor of each letter of a format
+_HEAD, _FMT = b"\xa3\x95", 0x80  # the first two bytes of each message; the type that defines the others
+_MAX_US = 1e13  # a third of a year: a later stamp is corrupt
+_FIELD_TYPES = {  # numpy dtype and divisor by format character
     "a": ("V64", 1.0),
     "b": ("<i1", 1.0),
     "B": ("<u1", 1.0),
@@ -62,24 +62,24 @@ _FIX_3D, _RANGE_GOOD, _DOWN, _TERRAIN_OK = 3, 4, 25, 2
 Columns = Mapping[str, NDArray[np.float64]]
 
 
-def read_dataflash(path: Path) -> Log:
+def read_dataflash(path: Path) -> FlightLog:
     """Read a DataFlash log.
 
     Raises:
-        TelemetryError: the file is no DataFlash log, or it knows nothing of use.
+        TelemetryError: the file is no DataFlash log, or has no usable series.
     """
     data = path.read_bytes()
     if not data.startswith(_HEAD + bytes([_FMT])):
         got = data[:3].hex(" ")
         raise TelemetryError(f"{path}: expected a DataFlash log, which begins with A3 95 80, got {got}")
-    with np.errstate(all="ignore"):  # damage may make any numbers, signalling NaNs among them
+    with np.errstate(all="ignore"):  # corrupt files may hold any numbers, signalling NaNs included
         return _log(path, {name: columns for name, columns in _messages(data).items() if columns})
 
 
-def _log(path: Path, found: Mapping[str, Columns]) -> Log:
+def _log(path: Path, found: Mapping[str, Columns]) -> FlightLog:
     stamps = {name: _stamps_ns(columns) for name, columns in found.items()}
     position = "POS" if "POS" in found else "GPS"
-    series: dict[str, Series | None] = {
+    series: dict[str, TimeSeries | None] = {
         "roll_deg": _series(found, "ATT", "Roll"),
         "pitch_deg": _series(found, "ATT", "Pitch"),
         "heading_deg": _series(found, "ATT", "Yaw"),
@@ -90,16 +90,16 @@ def _log(path: Path, found: Mapping[str, Columns]) -> Log:
     if position in found:
         at = found[position]
         fixed = at["Status"] >= _FIX_3D if position == "GPS" else True
-        series |= make_position(stamps[position], at["Lat"], at["Lng"], fixed)
+        series |= make_position_series(stamps[position], at["Lat"], at["Lng"], fixed)
     captures = next((stamps[name] for name in ("CAM", "TRIG") if name in found), ())
     return make_log(path, series, _heights(found), captures, _utc_ns(found.get("GPS")))
 
 
 def _messages(data: bytes) -> dict[str, Columns]:
-    """(N,) values by message and field, first instances only; a field that the log lacks is NaN.
+    """(N,) values by message and field, of first instances only; a field that the log lacks is NaN.
 
-    A log is a row of messages, each with two bytes of head and its type. What is damaged is skipped up to the
-    next head, and a message that was cut off at the end is left out.
+    A log is a sequence of messages, each with a header of two bytes and its type. Corrupt data is skipped up to
+    the next header; a message that is truncated at the end is omitted.
     """
     formats = {_FMT: _Format("FMT", 89, "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
     bodies: dict[str, list[bytes]] = {name: [] for name in _FIELDS}
@@ -111,9 +111,9 @@ def _messages(data: bytes) -> dict[str, Columns]:
             continue
         body = data[at + 3 : at + known.length]
         if known.name == "FMT":
-            told = _told_format(body)
-            if told is not None:  # a type is told once; a second telling is damage
-                formats.setdefault(body[0], told)
+            defined = _parse_format(body)
+            if defined is not None:  # a type is defined once; a second definition is corrupt
+                formats.setdefault(body[0], defined)
         elif known.name in bodies:
             bodies[known.name].append(body)
         at += known.length
@@ -123,7 +123,7 @@ def _messages(data: bytes) -> dict[str, Columns]:
 
 @dataclass(frozen=True, slots=True)
 class _Format:
-    """How one type of message is laid out; ``length`` counts the three bytes of its head."""
+    """Layout of one message type; ``length`` includes the three bytes of its header."""
 
     name: str
     length: int
@@ -132,17 +132,23 @@ class _Format:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        return np.dtype([(name, _KINDS[kind][0]) for name, kind in zip(self.columns, self.kinds, strict=True)])
+        return np.dtype(
+            [(name, _FIELD_TYPES[kind][0]) for name, kind in zip(self.columns, self.kinds, strict=True)]
+        )
 
 
-def _told_format(body: bytes) -> _Format | None:
-    """The format that a FMT message tells, or None where it contradicts itself."""
+def _parse_format(body: bytes) -> _Format | None:
+    """The format that a FMT message defines, or None where it is inconsistent."""
     _, length, *texts = struct.unpack("<BB4s16s64s", body)
     name, kinds, columns = (text.split(b"\0")[0].decode("ascii", "replace") for text in texts)
-    told = _Format(name, length, kinds, tuple(columns.split(",")) if columns else ())
-    if len(told.columns) != len(kinds) or len(set(told.columns)) != len(kinds) or not set(kinds) <= set(_KINDS):
+    defined = _Format(name, length, kinds, tuple(columns.split(",")) if columns else ())
+    if (
+        len(defined.columns) != len(kinds)
+        or len(set(defined.columns)) != len(kinds)
+        or not set(kinds) <= set(_FIELD_TYPES)
+    ):
         return None
-    return told if "" not in told.columns and told.dtype.itemsize + 3 == length else None
+    return defined if "" not in defined.columns and defined.dtype.itemsize + 3 == length else None
 
 
 def _columns(known: _Format, rows: list[bytes]) -> Columns:
@@ -151,9 +157,9 @@ def _columns(known: _Format, rows: list[bytes]) -> Columns:
     columns = {field: np.full(len(table), np.nan) for field in ("TimeUS", *_FIELDS[known.name])}
     for field, kind in zip(known.columns, known.kinds, strict=True):
         if field in columns and table[field].dtype.kind in "iuf":
-            columns[field] = table[field].astype(np.float64) / _KINDS[kind][1]
+            columns[field] = table[field].astype(np.float64) / _FIELD_TYPES[kind][1]
     keep = np.isfinite(columns["TimeUS"]) & (np.abs(columns["TimeUS"]) < _MAX_US)
-    for field in ("I", "C", "Instance"):  # logs from before there were instances have none
+    for field in ("I", "C", "Instance"):  # older logs have no instances
         if field in columns:
             keep &= ~(columns[field] > 0)
     return {field: column[keep] for field, column in columns.items() if keep.any()}
@@ -163,11 +169,11 @@ def _stamps_ns(columns: Columns) -> NDArray[np.int64]:
     return np.rint(columns["TimeUS"]).astype(np.int64) * 1000
 
 
-def _series(found: Mapping[str, Columns], name: str, field: str, valid: Any = True) -> Series | None:
+def _series(found: Mapping[str, Columns], name: str, field: str, valid: Any = True) -> TimeSeries | None:
     return make_series(_stamps_ns(found[name]), found[name][field], valid) if name in found else None
 
 
-def _velocity(found: Mapping[str, Columns]) -> dict[str, Series | None]:
+def _velocity(found: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
     for name in ("XKF1", "NKF1"):
         if name in found:
             return {
@@ -184,7 +190,7 @@ def _velocity(found: Mapping[str, Columns]) -> dict[str, Series | None]:
     }
 
 
-def _heights(found: Mapping[str, Columns]) -> dict[str, Series | None]:
+def _heights(found: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
     heights = {"take-off": _series(found, "POS", "RelHomeAlt")}
     if "RFND" in found:
         down = (found["RFND"]["Stat"] == _RANGE_GOOD) & (found["RFND"]["Orient"] == _DOWN)
@@ -195,7 +201,7 @@ def _heights(found: Mapping[str, Columns]) -> dict[str, Series | None]:
 
 
 def _utc_ns(gps: Columns | None) -> int | None:
-    """What takes TimeUS to UTC: the median over the receiver's fixes of its time less that of the log."""
+    """Offset that converts TimeUS to UTC in nanoseconds: the median over GPS fixes of GPS time minus log time."""
     if gps is None:
         return None
     known = (gps["Status"] >= _FIX_3D) & (gps["GWk"] > 0) & (gps["GWk"] < _LAST_WEEK) & (gps["GMS"] >= 0)

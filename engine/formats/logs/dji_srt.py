@@ -1,10 +1,10 @@
-"""DJI's subtitles (.SRT): what a drone wrote beside its video, a cue a frame or a cue a second.
+"""DJI's subtitles (.SRT): telemetry that a drone writes beside its video, one cue per frame or second.
 
 Convention:
-    The clock is the video's, from its first frame. Both syntaxes are read: ``[latitude: ..] [longitude: ..]
+    The clock is the video's, from its first frame. Both syntaxes are supported: ``[latitude: ..] [longitude: ..]
     [rel_alt: .. abs_alt: ..] [gb_yaw: ..]``, and ``GPS(lon, lat, ..) BAROMETER: ..`` or ``H ..m``. Heights
-    are above the place of take-off. The third number of GPS() is an altitude on some models and a count of
-    satellites on others, and is not read; nor is HOME().
+    are above the take-off point. The third number of GPS() is an altitude on some models and a count of
+    satellites on others, and is ignored; so is HOME().
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pathlib import Path
 
 from engine.errors import TelemetryError
 from engine.formats.frames import nadir_attitude
-from engine.formats.resampling import Log, Series, make_log, make_position, make_series
+from engine.formats.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
 
 _NUMBER = r"([+-]?[0-9]{1,18}(?:\.[0-9]{1,18})?)"
 _TIME = r"([0-9]{1,3}):([0-9]{2}):([0-9]{2})[,.]([0-9]{3})"
-# Every repetition is bounded, so that no text, however made, takes more than a time in proportion to its length.
+# Every repetition is bounded, so that matching takes linear time on any input.
 _CUE = re.compile(rf"^[ \t]{{0,8}}{_TIME}[ \t]{{0,8}}-->[ \t]{{0,8}}{_TIME}.*$", re.MULTILINE)
 _PAIR = re.compile(rf"\b([A-Za-z_.]{{1,20}})[ \t]{{0,3}}[: ][ \t]{{0,3}}{_NUMBER}")
 _GPS = re.compile(rf"\bGPS ?\( ?{_NUMBER} ?, ?{_NUMBER} ?(?:,[^)]{{0,40}})?\)")
@@ -27,11 +27,11 @@ _MARKUP = re.compile(r"<[^>]{0,200}>")
 _ANGLES = ("gb_roll", "gb_pitch", "gb_yaw")
 
 
-def read_srt(path: Path) -> Log:
+def read_srt(path: Path) -> FlightLog:
     """Read the telemetry in a video's subtitles.
 
     Raises:
-        TelemetryError: the file is no UTF-8 text, has no cues, or its cues tell nothing of a flight.
+        TelemetryError: the file is no UTF-8 text, has no cues, or its cues have no telemetry.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -46,14 +46,14 @@ def read_srt(path: Path) -> Log:
     cues = [_values(text[match.end() : end]) for match, end in zip(starts, ends, strict=True)]
     stamps_ns = [_time_ns(match) for match in starts]
 
-    def series(name: str) -> Series | None:
+    def series(name: str) -> TimeSeries | None:
         return make_series(stamps_ns, [cue.get(name, float("nan")) for cue in cues])
 
     nan = [float("nan")] * len(cues)
     lat_deg = [cue.get("latitude", none) for cue, none in zip(cues, nan, strict=True)]
     lon_deg = [cue.get("longitude", none) for cue, none in zip(cues, nan, strict=True)]
     angles = {name: series(name) for name in ("roll_deg", "pitch_deg", "heading_deg")}
-    known = angles | {"alt_amsl_m": series("abs_alt")} | make_position(stamps_ns, lat_deg, lon_deg)
+    known = angles | {"alt_amsl_m": series("abs_alt")} | make_position_series(stamps_ns, lat_deg, lon_deg)
     return make_log(path, known, {"take-off": series("rel_alt")})
 
 
@@ -63,10 +63,10 @@ def _time_ns(match: re.Match[str]) -> int:
 
 
 def _values(cue: str) -> dict[str, float]:
-    """Numbers of one cue by name, those of the older syntax under the names of the newer one."""
+    """Numbers of one cue by name; those of the older syntax under the names of the newer one."""
     cue = _MARKUP.sub(" ", cue)
     values = {key.lower(): float(value) for key, value in _PAIR.findall(cue)}
-    if "longtitude" in values:  # so written by some models
+    if "longtitude" in values:  # misspelled by some models
         values["longitude"] = values["longtitude"]
     if gps := _GPS.search(cue):
         values["longitude"], values["latitude"] = float(gps.group(1)), float(gps.group(2))

@@ -1,4 +1,4 @@
-"""Flight logs: which reader a file is given, and when each frame was taken on the log's clock."""
+"""Flight logs: the reader of each file type, and the capture times of frames on the log's clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from engine.formats.frames import FrameSource, VideoFile, exif_telemetry
 from engine.formats.logs.dataflash import read_dataflash
 from engine.formats.logs.dji_srt import read_srt
 from engine.formats.logs.ulog import read_ulog
-from engine.formats.resampling import EPOCH_NS, Log, truth_of
+from engine.formats.resampling import UTC_FROM_NS, FlightLog, truth_from_log
 from engine.formats.ros.bags import BagFrames, is_bag, read_bag
 from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
@@ -19,16 +19,16 @@ from engine.values import Truth
 
 _READERS = {".bin": read_dataflash, ".ulg": read_ulog, ".srt": read_srt}
 LOG_SUFFIXES = tuple(_READERS)
-"""Files that are read as logs, in either case."""
+"""Suffixes of flight logs, in lower or upper case."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogClock:
-    """When the frames of a flight with a log were taken.
+    """Source of the capture times of a flight whose telemetry is a log.
 
     Attributes:
-        stamps: a CSV with ``timestamp_ns`` and ``frame``; without it the video's or bag's own times, the log's
-            camera messages or the photographs' EXIF.
+        stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the log's
+            camera messages, or the photographs' EXIF.
         offset_s: added to every frame's stamp.
 
     Raises:
@@ -44,19 +44,19 @@ class LogClock:
 
 
 AS_LOGGED = LogClock()
-"""The frames' own stamps, as they are."""
+"""The frames' own stamps, without offset."""
 
 
 def is_log(path: str | Path) -> bool:
-    """Whether a path is a flight log or a bag, by its ending."""
+    """Whether a path is a flight log or a bag, by its suffix."""
     return Path(path).suffix.lower() in LOG_SUFFIXES or is_bag(path)
 
 
-def open_log(path: str | Path) -> Log:
+def open_log(path: str | Path) -> FlightLog:
     """Read a flight log: ArduPilot's DataFlash (.BIN), PX4's ULog (.ulg), DJI's subtitles (.SRT), or a bag of ROS.
 
     Raises:
-        TelemetryError: the file cannot be read, is none of them, or knows nothing of use.
+        TelemetryError: the file cannot be read, is none of these, or has no usable series.
     """
     path = Path(path)
     try:
@@ -73,23 +73,28 @@ def open_log(path: str | Path) -> Log:
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def stamp_frames(source: FrameSource, log: Log, clock: LogClock = AS_LOGGED) -> tuple[list[int], list[str]]:
-    """When each frame was taken, and its name, in the order of time.
+def stamp_frames(source: FrameSource, log: FlightLog, clock: LogClock = AS_LOGGED) -> tuple[list[int], list[str]]:
+    """Capture time and name of each frame, in the order of time.
+
+    Args:
+        source: the frames.
+        log: the flight log.
+        clock: source of the times, and their offset.
 
     Returns:
-        tuple[list[int], list[str]]: stamps in nanoseconds, on the log's clock or in UTC, and names.
+        Stamps in nanoseconds, on the log's clock or in UTC, and names.
 
     Raises:
-        TelemetryError: nothing says when the frames were taken, or the log's camera messages are not as many.
+        TelemetryError: there are no capture times, or the number of camera messages differs from that of images.
     """
-    stamps_ns, names = _own_stamps(source, log, clock)
+    stamps_ns, names = _unshifted_stamps(source, log, clock)
     offset_ns = round(clock.offset_s * 1e9)
     return [stamp_ns + offset_ns for stamp_ns in stamps_ns], names
 
 
-def _own_stamps(source: FrameSource, log: Log, clock: LogClock) -> tuple[list[int], list[str]]:
+def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> tuple[list[int], list[str]]:
     if clock.stamps is not None:
-        rows = read_telemetry(clock.stamps, source, source.described)
+        rows = read_telemetry(clock.stamps, source, source.description)
         return [row.timestamp_ns for row in rows], [row.frame for row in rows]
     if isinstance(source, (VideoFile, BagFrames)):
         stamps_ns = source.stamps_ns()
@@ -111,11 +116,11 @@ def _own_stamps(source: FrameSource, log: Log, clock: LogClock) -> tuple[list[in
 
 
 def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
-    """Truth from truth.csv, or a log's own positions; of a bag those under ``/truth``, where it has them.
+    """Read truth from truth.csv, or from the positions of a log; from a bag's ``/truth`` topics where it has them.
 
     Args:
         path: truth.csv or a log.
-        stamp_ns: a stamp of the frames: where it is UTC, a log's truth is put there too.
+        stamp_ns: a stamp of the frames; where it is UTC, the truth of a log is converted to UTC.
 
     Raises:
         TelemetryError: the file cannot be read or has no positions.
@@ -123,4 +128,4 @@ def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
     if not is_log(path):
         return read_truth(path)
     log = read_bag(Path(path), truth=True) if is_bag(path) else open_log(path)
-    return truth_of(log, utc=stamp_ns is not None and stamp_ns >= EPOCH_NS)
+    return truth_from_log(log, utc=stamp_ns is not None and stamp_ns >= UTC_FROM_NS)

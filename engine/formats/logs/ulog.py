@@ -1,9 +1,9 @@
 """PX4's ULog (.ulg): its attitude, heights, velocity, positions and camera messages.
 
 Convention:
-    The clock is microseconds since the autopilot started; a message that says when it was sampled
-    (``timestamp_sample``) is stamped so. Of topics with several instances the first is read. An estimator's own
-    topic stands for the vehicle's where a log has none, and ``sensor_gps`` for ``vehicle_gps_position``.
+    The clock is microseconds since the autopilot started; ``timestamp_sample`` is preferred to ``timestamp``. Of
+    topics with several instances the first is read. The topic of an estimator replaces the vehicle's where a log
+    lacks that, and ``sensor_gps`` replaces ``vehicle_gps_position``.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError, require
-from engine.formats.resampling import Log, Series, make_log, make_position, make_series
+from engine.formats.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
 
 HEAD = b"ULog\x01\x12\x35"
-"""The first bytes."""
+"""The first bytes of a ULog file."""
 _TOPICS = (
     "vehicle_attitude",
     "vehicle_local_position",
@@ -32,24 +32,24 @@ _TOPICS = (
     "camera_capture",
     "camera_trigger",
 )
-_ELSE = {  # of the same fields; a log of few topics, or of one estimator among several, may have these alone
+_FALLBACKS = {  # topics with the same fields, in logs of few topics or of several estimators
     "vehicle_attitude": "estimator_attitude",
     "vehicle_local_position": "estimator_local_position",
     "vehicle_global_position": "estimator_global_position",
     "vehicle_gps_position": "sensor_gps",
 }
 _DOWN, _FIX_3D = 25, 3
-_MAX_ENDS = 16  # how often a parser that makes its way comes to the end of a file
+_MAX_ENDS = 16  # reads at the end of the file after which the parser is in a loop
 
 Columns = Mapping[str, NDArray[Any]]
 
 
-def read_ulog(path: Path) -> Log:
+def read_ulog(path: Path) -> FlightLog:
     """Read a ULog.
 
     Raises:
         MissingExtraError: pyulog is not installed.
-        TelemetryError: the file is no ULog, or it knows nothing of use.
+        TelemetryError: the file is no ULog, or has no usable series.
     """
     with path.open("rb") as file:
         head = file.read(len(HEAD))
@@ -57,22 +57,22 @@ def read_ulog(path: Path) -> Log:
         raise TelemetryError(f"{path}: expected a ULog, which begins with 'ULog' 01 12 35, got {head.hex(' ')}")
     topics = _topics(path)
     try:
-        with np.errstate(all="ignore"):  # damage may make any numbers, signalling NaNs among them
+        with np.errstate(all="ignore"):  # corrupt files may hold any numbers, signalling NaNs included
             series = _attitude(topics) | _velocity(topics) | _position(topics)
             cameras = (topics[name] for name in ("camera_capture", "camera_trigger") if name in topics)
             captures = next(map(_stamps_ns, cameras), ())
             return make_log(path, series, _heights(topics), captures, _utc_ns(topics))
     except KeyError as error:
-        raise TelemetryError(f"{path}: expected a topic of PX4 with the field {error}, got one without") from None
+        raise TelemetryError(f"{path}: expected a PX4 topic with the field {error}, got one without") from None
 
 
-class _Watched(io.BufferedReader):
-    """A file for pyulog, which leads some that are damaged in circles: behind the end, and back before it."""
+class _LoopGuard(io.BufferedReader):
+    """A file for pyulog, which seeks back and forth across the end of some corrupt files for ever."""
 
     _ends = 0
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read; comes to an end where the end was come to again and again."""
+        """Read; raises EOFError once the end of the file has been reached too often."""
         data = super().read(size)
         self._ends += size is not None and len(data) < size
         if self._ends > _MAX_ENDS:
@@ -83,31 +83,31 @@ class _Watched(io.BufferedReader):
 def _topics(path: Path) -> dict[str, Columns]:
     """(N,) values by topic and field."""
     pyulog = require("pyulog", "logs")
-    # The parser prints what it skips, and fails in its own ways on a file that is damaged.
+    # The parser prints what it skips, and raises various errors on corrupt files.
     quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
-    with _Watched(io.FileIO(path)) as file, quiet[0], quiet[1]:
+    with _LoopGuard(io.FileIO(path)) as file, quiet[0], quiet[1]:
         try:
-            log: Any = pyulog.ULog(file, [*_TOPICS, *_ELSE.values()])
+            log: Any = pyulog.ULog(file, [*_TOPICS, *_FALLBACKS.values()])
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise TelemetryError(f"{path}: expected a ULog that can be read: {reason}") from None
-    found = {topic.name: topic.data for topic in reversed(log.data_list) if _counts(topic.data, "timestamp")}
-    return {name: found[other] for name, other in _ELSE.items() if other in found} | found
+    found = {topic.name: topic.data for topic in reversed(log.data_list) if _has_integers(topic.data, "timestamp")}
+    return {name: found[other] for name, other in _FALLBACKS.items() if other in found} | found
 
 
-def _counts(topic: Columns, field: str) -> bool:
-    """Whether a field is there, in whole numbers, with at least one value."""
+def _has_integers(topic: Columns, field: str) -> bool:
+    """Whether a field exists with integer type and at least one value."""
     return field in topic and topic[field].size > 0 and topic[field].dtype.kind in "iu"
 
 
 def _stamps_ns(topic: Columns) -> NDArray[np.int64]:
-    sampled = _counts(topic, "timestamp_sample") and topic["timestamp_sample"].all()
+    sampled = _has_integers(topic, "timestamp_sample") and topic["timestamp_sample"].all()
     stamps_us = topic["timestamp_sample" if sampled else "timestamp"]
     return stamps_us.astype(np.int64) * 1000
 
 
-def _attitude(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
-    """Aerospace angles of the quaternion from body (forward, right, down) to north, east, down."""
+def _attitude(topics: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
+    """Roll, pitch and heading of the quaternion from body (forward, right, down) to north, east, down."""
     if "vehicle_attitude" not in topics:
         return {}
     attitude = topics["vehicle_attitude"]
@@ -124,7 +124,7 @@ def _attitude(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
     }
 
 
-def _velocity(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
+def _velocity(topics: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
     if "vehicle_local_position" not in topics:
         return {}
     local = topics["vehicle_local_position"]
@@ -135,7 +135,7 @@ def _velocity(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
     }
 
 
-def _position(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
+def _position(topics: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
     """The estimator's position, else the receiver's."""
     if "vehicle_global_position" in topics:
         place = topics["vehicle_global_position"]
@@ -146,25 +146,27 @@ def _position(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
         stamps_ns, valid = _stamps_ns(place), place["fix_type"] >= _FIX_3D
         if "latitude_deg" in place:
             lat_deg, lon_deg, alt_m = place["latitude_deg"], place["longitude_deg"], place["altitude_msl_m"]
-        else:  # before PX4 1.15: whole numbers of 1e-7 degrees and of millimetres
+        else:  # before PX4 1.15: integers of 1e-7 degrees and of millimetres
             lat_deg, lon_deg, alt_m = place["lat"] / 1e7, place["lon"] / 1e7, place["alt"] / 1e3
     else:
         return {}
-    series = make_position(stamps_ns, lat_deg, lon_deg, valid)
+    series = make_position_series(stamps_ns, lat_deg, lon_deg, valid)
     series["alt_amsl_m"] = make_series(stamps_ns, alt_m, valid)
     if "eph" in place:
         series["sigma_m"] = make_series(stamps_ns, place["eph"], valid)
     return series
 
 
-def _heights(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
-    heights: dict[str, Series | None] = {}
+def _heights(topics: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
+    heights: dict[str, TimeSeries | None] = {}
     if "distance_sensor" in topics:
         sensor = topics["distance_sensor"]
         distance_m = sensor["current_distance"]
-        seen = (distance_m >= sensor["min_distance"]) & (distance_m <= sensor["max_distance"])
-        good = seen & (sensor["orientation"] == _DOWN) & (sensor.get("signal_quality", np.int8(-1)) != 0)
-        heights["rangefinder"] = make_series(_stamps_ns(sensor), distance_m, good)
+        in_range = (distance_m >= sensor["min_distance"]) & (distance_m <= sensor["max_distance"])
+        valid_range = (
+            in_range & (sensor["orientation"] == _DOWN) & (sensor.get("signal_quality", np.int8(-1)) != 0)
+        )
+        heights["rangefinder"] = make_series(_stamps_ns(sensor), distance_m, valid_range)
     local = topics.get("vehicle_local_position", {})
     if "dist_bottom" in local:
         valid = local["dist_bottom_valid"]
@@ -172,15 +174,15 @@ def _heights(topics: Mapping[str, Columns]) -> dict[str, Series | None]:
     if "vehicle_global_position" in topics and "home_position" in topics:
         place, home_m = topics["vehicle_global_position"], float(topics["home_position"]["alt"][-1])
         heights["take-off"] = make_series(_stamps_ns(place), place["alt"] - home_m)
-    elif "z" in local:  # down from where the estimator started
+    elif "z" in local:  # down from the estimator's start
         heights["take-off"] = make_series(_stamps_ns(local), -local["z"], local.get("z_valid", True))
     return heights
 
 
 def _utc_ns(topics: Mapping[str, Columns]) -> int | None:
-    """What takes the log's clock to UTC: the median over the receiver's messages."""
+    """Offset that converts the log's clock to UTC in nanoseconds: the median over the GPS messages."""
     gps = topics.get("vehicle_gps_position", {})
-    if not _counts(gps, "time_utc_usec"):
+    if not _has_integers(gps, "time_utc_usec"):
         return None
     utc_us = gps["time_utc_usec"].astype(np.int64)
     differences = np.sort((utc_us * 1000 - gps["timestamp"].astype(np.int64) * 1000)[utc_us > 0])

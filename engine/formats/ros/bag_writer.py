@@ -1,4 +1,4 @@
-"""Writes a flight as a bag of ROS 1 or ROS 2 (sqlite3, mcap), under the names of a camera driver and of MAVROS."""
+"""Writer of a flight as a bag of ROS 1 or ROS 2 (sqlite3, mcap), with the topics of a camera driver and MAVROS."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from engine.formats.ros.bags import (
 from engine.formats.ros.messages import MessageFactory
 from engine.values import Frame, Prior, Truth
 
-KINDS = ("ros1", "ros2-sqlite3", "ros2-mcap")
-"""What is written."""
+BAG_KINDS = ("ros1", "ros2-sqlite3", "ros2-mcap")
+"""Kinds of bags that can be written."""
 
-_PARTS = ("metadata.yaml", "*.mcap", "*.db3")  # the files of a bag of ROS 2
+_PARTS = ("metadata.yaml", "*.mcap", "*.db3")  # the files of a ROS 2 bag
 
 Write = Callable[[str, int, Any], None]
-"""Writes a message on a topic at a moment."""
+"""Writes a message, by topic, time in nanoseconds and message."""
 
 
 def write_bag(
@@ -47,49 +47,49 @@ def write_bag(
     truth: Iterable[Truth] = (),
     replace: bool = False,
 ) -> int:
-    """Write a flight as a bag, under the names that a camera driver and MAVROS give their topics.
+    """Write a flight as a bag, with the topic names of a camera driver and MAVROS.
 
-    It is written beside its place and put there once it is whole: until then an older one stays.
+    The bag is written to a temporary folder and moved into place when complete; until then an older one stays.
 
     Args:
         path: a file for ros1, a folder for the others.
-        frames: stamped frames with what else is known of their places, consumed one at a time before ``truth``.
-        camera: written beside every frame; its mount has no place in a bag.
-        kind: one of :data:`KINDS`.
-        truth: where the vehicle really was, under ``/truth``.
-        replace: whether a bag that is there leaves for the new one.
+        frames: stamped frames with their prior positions, consumed one at a time before ``truth``.
+        camera: written with every frame; bags have no message for its mount.
+        kind: one of :data:`BAG_KINDS`.
+        truth: the true states, written under ``/truth``.
+        replace: whether an existing bag is replaced.
 
     Returns:
-        int: how many frames were written.
+        The number of frames written.
 
     Raises:
-        OptionError: the kind is unknown or does not go with the name, or what is there may not be replaced.
+        OptionError: the kind is unknown or does not match the suffix, or the existing path may not be replaced.
         MissingExtraError: rosbags is not installed.
         TelemetryError: a frame has no stamp, or the bag cannot be written.
     """
     path = Path(path)
-    if kind not in KINDS:
-        raise OptionError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+    if kind not in BAG_KINDS:
+        raise OptionError(f"kind: expected one of {', '.join(BAG_KINDS)}, got {kind!r}")
     if (path.suffix.lower() == ".bag") != (kind == "ros1"):
         raise OptionError(f"path: expected a name that ends in .bag for ros1 and for no other kind, got {path}")
-    check_place(path, replace)
+    check_replaceable(path, replace)
     count = 0
-    with _put(path, replace) as unfinished, _written(path, unfinished, kind) as (write, maker):
+    with _replaced(path, replace) as unfinished, _bag_writer(path, unfinished, kind) as (write, messages):
         for frame, prior in frames:
             if frame.timestamp_ns is None:
                 raise TelemetryError(f"{path}: frame {count}: expected a stamp, got None")
-            _write_frame(write, maker, frame, prior, camera, frame.timestamp_ns)
+            _write_frame(write, messages, frame, prior, camera, frame.timestamp_ns)
             count += 1
         for row in truth:
-            _write_truth(write, maker, row)
+            _write_truth(write, messages, row)
     return count
 
 
-def check_place(path: Path, replace: bool) -> None:
-    """Refuse to write a bag where something is that may not leave for it.
+def check_replaceable(path: Path, replace: bool) -> None:
+    """Check that a bag can be written to a path.
 
     Raises:
-        OptionError: a bag that is not to be replaced, or a folder that holds anything but a bag.
+        OptionError: a bag exists and ``replace`` is off, or a folder contains anything but a bag.
     """
     if not (path.exists() or path.is_symlink()):
         return
@@ -99,20 +99,20 @@ def check_place(path: Path, replace: bool) -> None:
         parts = {file for pattern in _PARTS for file in path.glob(pattern)}
         others = sorted(set(path.iterdir()) - parts)
         if others or path.is_symlink():
-            held = f"it holds {others[0].name} too" if others else "it is a link"
-            raise OptionError(f"path: expected a bag in {path} to replace, but {held}")
+            cause = f"it also contains {others[0].name}" if others else "it is a link"
+            raise OptionError(f"path: expected a bag in {path} to replace, but {cause}")
 
 
 @contextmanager
-def _put(path: Path, replace: bool) -> Iterator[Path]:
-    """Where a new bag is written; when all is well it takes its place, and the older one leaves."""
+def _replaced(path: Path, replace: bool) -> Iterator[Path]:
+    """A temporary path for a new bag, which replaces the older one when the block succeeds."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # A folder of its own beside the place: a bag's files have its name within them.
+        # A folder of its own beside the target: the files of a bag contain its name.
         with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
             unfinished = Path(folder) / path.name
             yield unfinished
-            check_place(path, replace)  # again: writing took its time
+            check_replaceable(path, replace)  # once more: writing takes time
             older = Path(folder) / "older"
             if path.exists():
                 path.rename(older)
@@ -127,42 +127,42 @@ def _put(path: Path, replace: bool) -> Iterator[Path]:
 
 
 def _write_frame(
-    write: Write, maker: MessageFactory, frame: Frame, prior: Prior | None, camera: Camera, time_ns: int
+    write: Write, messages: MessageFactory, frame: Frame, prior: Prior | None, camera: Camera, time_ns: int
 ) -> None:
     image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
-    write(IMAGE, time_ns, maker.image(time_ns, "camera", image))
-    write(CAMERA_INFO, time_ns, maker.camera_info(time_ns, "camera", camera))
+    write(IMAGE, time_ns, messages.image(time_ns, "camera", image))
+    write(CAMERA_INFO, time_ns, messages.camera_info(time_ns, "camera", camera))
     angles = frame.roll_deg, frame.pitch_deg, frame.heading_deg
     if None not in angles:
-        write(IMU, time_ns, maker.imu(time_ns, "base_link", *angles))  # type: ignore[arg-type]
+        write(IMU, time_ns, messages.imu(time_ns, "base_link", *angles))  # type: ignore[arg-type]
     if frame.heading_deg is not None:
-        write(COMPASS, time_ns, maker.float64(frame.heading_deg))
+        write(COMPASS, time_ns, messages.float64(frame.heading_deg))
     if frame.height_agl_m is not None:
-        write(HEIGHT, time_ns, maker.float64(frame.height_agl_m))
+        write(HEIGHT, time_ns, messages.float64(frame.height_agl_m))
     if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
-        velocity = maker.velocity(time_ns, "map", frame.east_velocity_mps, frame.north_velocity_mps)
+        velocity = messages.velocity(time_ns, "map", frame.east_velocity_mps, frame.north_velocity_mps)
         write(VELOCITY, time_ns, velocity)
     if prior is not None and prior.lat_deg is not None and prior.lon_deg is not None:
         covariance_m2 = np.diag([prior.sigma_m**2, prior.sigma_m**2, 0.0])
-        place = maker.position(time_ns, "base_link", prior.lat_deg, prior.lon_deg, covariance_m2)
-        write(POSITION, time_ns, place)
+        position = messages.position(time_ns, "base_link", prior.lat_deg, prior.lon_deg, covariance_m2)
+        write(POSITION, time_ns, position)
 
 
-def _write_truth(write: Write, maker: MessageFactory, row: Truth) -> None:
+def _write_truth(write: Write, messages: MessageFactory, row: Truth) -> None:
     time_ns = row.timestamp_ns
-    write(TRUTH, time_ns, maker.position(time_ns, "base_link", row.lat_deg, row.lon_deg, np.zeros((3, 3))))
+    write(TRUTH, time_ns, messages.position(time_ns, "base_link", row.lat_deg, row.lon_deg, np.zeros((3, 3))))
     angles = row.roll_deg, row.pitch_deg, row.heading_deg
     if None not in angles:
-        write(TRUTH_ATTITUDE, time_ns, maker.imu(time_ns, "base_link", *angles))  # type: ignore[arg-type]
+        write(TRUTH_ATTITUDE, time_ns, messages.imu(time_ns, "base_link", *angles))  # type: ignore[arg-type]
     if row.height_agl_m is not None:
-        write(TRUTH_HEIGHT, time_ns, maker.float64(row.height_agl_m))
+        write(TRUTH_HEIGHT, time_ns, messages.float64(row.height_agl_m))
     if row.alt_amsl_m is not None:
-        write(TRUTH_ALTITUDE, time_ns, maker.float64(row.alt_amsl_m))
+        write(TRUTH_ALTITUDE, time_ns, messages.float64(row.alt_amsl_m))
 
 
 @contextmanager
-def _written(path: Path, unfinished: Path, kind: str) -> Iterator[tuple[Write, MessageFactory]]:
-    """What writes messages into a new bag, and makes them; ``path`` is what errors call it."""
+def _bag_writer(path: Path, unfinished: Path, kind: str) -> Iterator[tuple[Write, MessageFactory]]:
+    """A function that writes messages to a new bag, and their factory; errors name ``path``."""
     _, typesys = import_rosbags()
     from rosbags import rosbag1, rosbag2
 

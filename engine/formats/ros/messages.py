@@ -1,9 +1,9 @@
-"""ROS messages: pictures, calibrations, attitude, heights and positions out of them and into them, of either ROS.
+"""ROS messages: conversion of images, calibrations, attitude, heights and positions from and to messages.
 
 Convention:
-    Frames are those of REP-103: the world is east-north-up, the body forward-left-up, quaternions are x, y, z, w
-    and turn the body to the world. Compass headings are degrees clockwise from true north, as MAVROS has them.
-    Messages are those of rospy, of rclpy or of rosbags: only their fields are looked at.
+    Frames follow REP-103: the world is east-north-up, the body forward-left-up, quaternions are x, y, z, w and
+    rotate the body to the world. Compass headings are degrees clockwise from true north, as in MAVROS. Messages
+    may be of rospy, rclpy or rosbags: only their fields are accessed.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from engine.errors import CalibrationError, TelemetryError
 from engine.geo import Array, attitude_from_rotation, enu_from_body
 
 CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
-"""Encodings of sensor_msgs/Image that are read, and their bytes a pixel; 8UC3 and 8UC4 are blue first."""
-_FLU = np.diag([1.0, -1.0, -1.0])  # forward-left-up of forward-right-down, and back
-_UNIT = 0.01  # by which the square of a quaternion may miss 1
-_POSITION_KNOWN = 3
+"""Supported encodings of sensor_msgs/Image and their bytes per pixel; 8UC3 and 8UC4 are in BGR order."""
+_FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])  # its own inverse
+_NORM_TOLERANCE = 0.01  # of the squared norm of a quaternion
+_COVARIANCE_KNOWN = 3  # NavSatFix.COVARIANCE_TYPE_KNOWN
 NO_POSITION = -1
 """NavSatStatus.status of a receiver without a fix."""
 
 
-# ------------------------------------------------------------------------------------------------ out of them
+# ---------------------------------------------------------------------------------------------- from messages
 
 
 def stamp_ns(message: Any) -> int:
-    """The header's stamp in nanoseconds; 0 where nobody set it."""
+    """The stamp of the header in nanoseconds; 0 where it is not set."""
     stamp = message.header.stamp
     seconds = stamp.secs if hasattr(stamp, "secs") else stamp.sec
     nanoseconds = stamp.nsecs if hasattr(stamp, "nsecs") else stamp.nanosec
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def picture_of(message: Any) -> NDArray[np.uint8]:
-    """The picture of a sensor_msgs/Image or CompressedImage, a copy.
+def image_from_message(message: Any) -> NDArray[np.uint8]:
+    """Copy the image out of a sensor_msgs/Image or CompressedImage.
 
     Returns:
-        (H, W) grey or (H, W, 3) RGB.
+        (H, W) grey or (H, W, 3) RGB, uint8.
 
     Raises:
-        TelemetryError: the encoding is not in :data:`CHANNELS`, or the bytes are too few or no picture.
+        TelemetryError: the encoding is not in :data:`CHANNELS`, or there are too few bytes or no valid image.
     """
     if not hasattr(message, "encoding"):
-        return _decoded(bytes(memoryview(message.data)))
+        return _decode(bytes(memoryview(message.data)))
     height, width, step = int(message.height), int(message.width), int(message.step)
     channels = CHANNELS.get(message.encoding)
     if channels is None:
@@ -63,7 +63,7 @@ def picture_of(message: Any) -> NDArray[np.uint8]:
             f"image: expected {height} rows of {step} bytes for {width} x {height} {message.encoding}, "
             f"got {data.size} bytes"
         )
-    # The last row may lack its padding.
+    # The last row may lack padding.
     rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
     if channels == 1:
         return rows.copy()
@@ -72,7 +72,7 @@ def picture_of(message: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[:, :, order])
 
 
-def _decoded(data: bytes) -> NDArray[np.uint8]:
+def _decode(data: bytes) -> NDArray[np.uint8]:
     from PIL import Image
 
     try:
@@ -83,11 +83,11 @@ def _decoded(data: bytes) -> NDArray[np.uint8]:
         raise TelemetryError(f"image: expected a readable compressed picture: {reason}") from None
 
 
-def camera_of(message: Any) -> Camera:
-    """The calibration of a sensor_msgs/CameraInfo, of a camera that looks straight down, its top to the nose.
+def camera_from_message(message: Any) -> Camera:
+    """The calibration of a sensor_msgs/CameraInfo, for a nadir camera whose image top points to the nose.
 
     Raises:
-        CalibrationError: the camera is not calibrated, bins its pixels, or its model is unknown.
+        CalibrationError: the camera is not calibrated, uses binning, or its distortion model is unknown.
     """
     if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
         raise CalibrationError("camera_info: expected pictures without binning or region of interest")
@@ -96,7 +96,7 @@ def camera_of(message: Any) -> Camera:
     model = message.distortion_model or "plumb_bob"
     if matrix.size != 9:
         raise CalibrationError(f"camera_info: expected 9 numbers in K, got {matrix.size}")
-    if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
+    if not distortion.any():  # ROS writes no distortion as zero, four or five zeros
         distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
     try:
         return Camera(int(message.width), int(message.height), matrix.reshape(3, 3), model, distortion)
@@ -104,31 +104,31 @@ def camera_of(message: Any) -> Camera:
         raise CalibrationError(f"camera_info: {error}") from None
 
 
-def attitude_of(message: Any) -> tuple[float, float, float] | None:
+def attitude_from_message(message: Any) -> tuple[float, float, float] | None:
     """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None where it has no orientation."""
     q = message.orientation
     x, y, z, w = (float(v) for v in (q.x, q.y, q.z, q.w))
     square = x * x + y * y + z * z + w * w
-    if message.orientation_covariance[0] == -1.0 or not abs(square - 1.0) < _UNIT:
+    if message.orientation_covariance[0] == -1.0 or not abs(square - 1.0) < _NORM_TOLERANCE:
         return None
-    turn = np.array(
+    rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return attitude_from_rotation(turn @ _FLU)
+    return attitude_from_rotation(rotation @ _FLU_FROM_FRD)
 
 
-def range_of(message: Any) -> float | None:
-    """Metres along the beam of a sensor_msgs/Range; None beyond the reach that it states."""
+def range_from_message(message: Any) -> float | None:
+    """Distance in metres along the beam of a sensor_msgs/Range; None outside the range that it states."""
     range_m = float(message.range)
     return range_m if range_m > 0.0 and message.min_range <= range_m <= message.max_range else None
 
 
-def position_of(message: Any) -> tuple[float, float, float | None] | None:
-    """Latitude, longitude and standard deviation (None where unknown) of a sensor_msgs/NavSatFix, or None."""
+def position_from_message(message: Any) -> tuple[float, float, float | None] | None:
+    """Latitude and longitude in degrees and sigma in metres of a sensor_msgs/NavSatFix; None where unknown."""
     lat_deg, lon_deg = float(message.latitude), float(message.longitude)
     if message.status.status == NO_POSITION or not (math.isfinite(lat_deg) and math.isfinite(lon_deg)):
         return None
@@ -138,19 +138,19 @@ def position_of(message: Any) -> tuple[float, float, float | None] | None:
     return lat_deg, lon_deg, math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
 
 
-# ------------------------------------------------------------------------------------------------ into them
+# ------------------------------------------------------------------------------------------------ to messages
 
 
 @dataclass(frozen=True, slots=True)
 class MessageFactory:
-    """Makes messages of one ROS.
+    """Constructs messages of ROS 1 or ROS 2.
 
     Attributes:
-        find: the class of a name such as "sensor_msgs/msg/Image".
-        ros1: whether headers count and calibrations are written in capitals.
-        time: a stamp of seconds and nanoseconds; None for the class builtin_interfaces/msg/Time.
-        octets: how the bytes of a picture are stored.
-        octet: how a single byte is stored.
+        find: returns the class of a name such as "sensor_msgs/msg/Image".
+        ros1: whether headers have ``seq`` and the fields of calibrations are upper case.
+        time: constructs a stamp from seconds and nanoseconds; None uses the class builtin_interfaces/msg/Time.
+        octets: converts the bytes of an image to the stored type.
+        octet: converts a single byte to the stored type.
     """
 
     find: Callable[[str], Any]
@@ -160,11 +160,11 @@ class MessageFactory:
     octet: Callable[[int], Any] = int
 
     def make(self, kind: str, /, **fields: Any) -> Any:
-        """A message with all of its fields."""
+        """Construct a message from all of its fields."""
         return self.find(kind)(**fields)
 
     def header(self, time_ns: int, frame_id: str) -> Any:
-        """A header of a moment and a frame."""
+        """A std_msgs/Header with a time in nanoseconds and a frame."""
         time = self.time or (
             lambda sec, nanosec: self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         )
@@ -181,26 +181,26 @@ class MessageFactory:
         return self.make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
 
     def quaternion(self, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
-        """A geometry_msgs/Quaternion."""
+        """A geometry_msgs/Quaternion of an attitude."""
         x, y, z, w = quaternion_xyzw(roll_deg, pitch_deg, heading_deg)
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
-    def image(self, time_ns: int, frame_id: str, picture: NDArray[np.uint8]) -> Any:
-        """A sensor_msgs/Image of (H, W) grey or (H, W, 3) RGB."""
-        height, width = picture.shape[:2]
+    def image(self, time_ns: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
+        """A sensor_msgs/Image of (H, W) grey or (H, W, 3) RGB, uint8."""
+        height, width = pixels.shape[:2]
         return self.make(
             "sensor_msgs/msg/Image",
             header=self.header(time_ns, frame_id),
             height=height,
             width=width,
-            encoding="mono8" if picture.ndim == 2 else "rgb8",
+            encoding="mono8" if pixels.ndim == 2 else "rgb8",
             is_bigendian=0,
-            step=picture[0].size,
-            data=self.octets(np.ascontiguousarray(picture).ravel()),
+            step=pixels[0].size,
+            data=self.octets(np.ascontiguousarray(pixels).ravel()),
         )
 
     def camera_info(self, time_ns: int, frame_id: str, camera: Camera) -> Any:
-        """A sensor_msgs/CameraInfo; of the mount it says nothing."""
+        """A sensor_msgs/CameraInfo; it has no field for the mount."""
         K = camera.matrix
         blocks = {
             "D": camera.distortion,
@@ -224,7 +224,7 @@ class MessageFactory:
         )
 
     def imu(self, time_ns: int, frame_id: str, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
-        """A sensor_msgs/Imu that knows the orientation only."""
+        """A sensor_msgs/Imu with orientation only."""
         unknown = np.array([-1.0, *(0.0,) * 8])
         return self.make(
             "sensor_msgs/msg/Imu",
@@ -238,14 +238,14 @@ class MessageFactory:
         )
 
     def velocity(self, time_ns: int, frame_id: str, east_mps: float, north_mps: float) -> Any:
-        """A geometry_msgs/TwistStamped of a velocity over ground; what it does not know is NaN."""
+        """A geometry_msgs/TwistStamped of a velocity over ground; the unknown components are NaN."""
         nan = math.nan
         linear, angular = self.vector(east_mps, north_mps, nan), self.vector(nan, nan, nan)
         twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
         return self.make("geometry_msgs/msg/TwistStamped", header=self.header(time_ns, frame_id), twist=twist)
 
     def position(self, time_ns: int, frame_id: str, lat_deg: float, lon_deg: float, covariance_m2: Array) -> Any:
-        """A sensor_msgs/NavSatFix with its covariance (3, 3) in east, north, up; the altitude is NaN, unknown."""
+        """A sensor_msgs/NavSatFix with covariance (3, 3) of east, north, up; the altitude is NaN, unknown."""
         status = self.make("sensor_msgs/msg/NavSatStatus", status=0, service=0)
         return self.make(
             "sensor_msgs/msg/NavSatFix",
@@ -255,14 +255,14 @@ class MessageFactory:
             longitude=float(lon_deg),
             altitude=math.nan,
             position_covariance=np.asarray(covariance_m2, np.float64).ravel(),
-            position_covariance_type=_POSITION_KNOWN,
+            position_covariance_type=_COVARIANCE_KNOWN,
         )
 
 
 def quaternion_xyzw(roll_deg: float, pitch_deg: float, heading_deg: float) -> tuple[float, float, float, float]:
-    """The turn from the body (forward-left-up) to east-north-up, w not negative."""
-    m = enu_from_body(roll_deg, pitch_deg, heading_deg) @ _FLU
-    # The largest of the four squares is at least a quarter: dividing by its root loses nothing.
+    """Quaternion that rotates the body (forward-left-up) to east-north-up, w not negative."""
+    m = enu_from_body(roll_deg, pitch_deg, heading_deg) @ _FLU_FROM_FRD
+    # The largest of the four squares is at least 1/4, so that dividing by its root is stable.
     squares = np.array([1 + 2 * m[i, i] - np.trace(m) for i in range(3)] + [1 + np.trace(m)]) / 4.0
     k = int(np.argmax(squares))
     sums = np.array(

@@ -1,0 +1,224 @@
+"""CSV tables: the one reader and writer that telemetry, truth, track and the data sets share.
+
+Convention:
+    A blank cell is unknown; columns that were not requested are ignored. A byte order mark and either line ending
+    are accepted. A message names the file, the line in the file (the header is line 1), the column, what was
+    expected and what came.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from engine.errors import TelemetryError
+from engine.values import MAX_SIGMA_M
+
+_INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """The range of a column, both ends included.
+
+    Attributes:
+        low: the smallest value.
+        high: the largest value.
+        text: the range in words, for messages.
+    """
+
+    low: float
+    high: float
+    text: str
+
+
+ANY = Bounds(-math.inf, math.inf, "a finite number")
+HEADING = Bounds(-360.0, 360.0, "degrees from -360 to 360")
+HALF_TURN = Bounds(-180.0, 180.0, "degrees from -180 to 180")
+QUARTER_TURN = Bounds(-90.0, 90.0, "degrees from -90 to 90")
+LONGITUDE = Bounds(-180.0, 360.0, "degrees from -180 to 360")
+POSITIVE = Bounds(math.ulp(0.0), math.inf, "a finite number above 0")
+NOT_NEGATIVE = Bounds(0.0, math.inf, "a finite number of 0 or more")
+SIGMA = Bounds(0.0, MAX_SIGMA_M, f"a number from 0 to {MAX_SIGMA_M:g}")
+"""Ranges of the columns of telemetry, truth and track."""
+
+
+@dataclass(frozen=True, slots=True)
+class CsvRow:
+    """One row of a CSV table with its position in the file.
+
+    Attributes:
+        path: the file.
+        line: line number in the file, from 1.
+        values: stripped text by column; blank where the file lacks the column.
+    """
+
+    path: Path
+    line: int
+    values: Mapping[str, str]
+
+    def error(self, column: str, expected: str) -> TelemetryError:
+        """Create the error of one cell."""
+        return TelemetryError(
+            f"{self.path}: line {self.line}, {column}: expected {expected}, got {quoted(self.values[column])}"
+        )
+
+    def text(self, column: str) -> str:
+        """The text of a cell that must not be blank."""
+        if not self.values[column]:
+            raise self.error(column, "a value")
+        return self.values[column]
+
+    def integer(self, column: str) -> int | None:
+        """A 64-bit integer, or None where blank."""
+        text = self.values[column]
+        if not text:
+            return None
+        if not _INTEGER.fullmatch(text) or not -(2**63) <= int(text) < 2**63:
+            raise self.error(column, "a whole number")
+        return int(text)
+
+    def stamp(self, column: str = "timestamp_ns") -> int:
+        """A time stamp in nanoseconds that must not be blank."""
+        value = self.integer(column)
+        if value is None:
+            raise self.error(column, "whole nanoseconds")
+        return value
+
+    def number(self, column: str, bounds: Bounds = ANY) -> float | None:
+        """A finite number within ``bounds``, or None where blank."""
+        text = self.values[column]
+        if not text:
+            return None
+        # float() alone would accept "nan", "inf" and "1_000".
+        value = float(text) if _NUMBER.fullmatch(text) else math.nan
+        if not (math.isfinite(value) and bounds.low <= value <= bounds.high):
+            raise self.error(column, bounds.text)
+        return value
+
+    def required(self, column: str, bounds: Bounds = ANY) -> float:
+        """A finite number within ``bounds`` that must not be blank."""
+        value = self.number(column, bounds)
+        if value is None:
+            raise self.error(column, bounds.text)
+        return value
+
+
+def quoted(text: str) -> str:
+    """A piece of a file as a message may hold it: quoted, on one line, short."""
+    return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
+
+
+def read_table(path: str | Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[CsvRow]:
+    """Read the rows of a CSV file with a header.
+
+    Args:
+        path: the file.
+        required: columns that the header must contain.
+        optional: columns that it may contain.
+
+    Yields:
+        One :class:`CsvRow` per row that is not blank, with all of ``required`` and ``optional`` as keys.
+
+    Raises:
+        TelemetryError: the file is missing, empty, not UTF-8 or not CSV, lacks a required column, repeats
+            one, or has a row of another length than its header.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file)
+            columns = _header(path, reader, required, optional)
+            for row in reader:
+                if any(cell.strip() for cell in row):
+                    yield _cells(path, reader.line_num, row, columns)
+    except FileNotFoundError:
+        raise TelemetryError(f"{path}: no such file") from None
+    except UnicodeDecodeError as error:
+        raise TelemetryError(
+            f"{path}: expected UTF-8 text, got the byte {error.object[error.start]:#04x}"
+        ) from None
+    except csv.Error as error:
+        raise TelemetryError(f"{path}: line {reader.line_num}: expected comma-separated text: {error}") from None
+    except OSError as error:
+        raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    count: int
+    index: Mapping[str, int | None]
+
+
+def _header(path: Path, reader: Iterator[list[str]], required: Sequence[str], optional: Sequence[str]) -> _Columns:
+    names = [name.strip() for name in next(reader, [])]
+    if not any(names):
+        raise TelemetryError(f"{path}: expected a header with {', '.join(required)}, got an empty first line")
+    for column in (*required, *optional):
+        if names.count(column) > 1:
+            raise TelemetryError(
+                f"{path}: line 1, {column}: expected the column once, got it {names.count(column)} times"
+            )
+    for column in required:
+        if column not in names:
+            raise TelemetryError(
+                f"{path}: line 1: lacks the column {column}; its columns are {quoted(','.join(names))}"
+            )
+    index = {column: names.index(column) if column in names else None for column in (*required, *optional)}
+    return _Columns(len(names), index)
+
+
+def _cells(path: Path, line: int, row: list[str], columns: _Columns) -> CsvRow:
+    # Spreadsheets append commas to lines; a cell with content must have a column.
+    if len(row) < columns.count or any(cell.strip() for cell in row[columns.count :]):
+        raise TelemetryError(
+            f"{path}: line {line}: expected {columns.count} cells as in the header, got {len(row)}"
+        )
+    return CsvRow(path, line, {name: "" if i is None else row[i].strip() for name, i in columns.index.items()})
+
+
+def check_increasing(csv_row: CsvRow, previous_ns: int | None, stamp_ns: int) -> None:
+    """Check that a row's stamp is later than that of the row before.
+
+    Raises:
+        TelemetryError: the stamp repeats or goes back.
+    """
+    if previous_ns is not None and stamp_ns <= previous_ns:
+        raise csv_row.error("timestamp_ns", f"a stamp later than the row before ({previous_ns})")
+
+
+def known_columns(rows: Sequence[Any], required: Sequence[str], optional: Sequence[str]) -> list[str]:
+    """The required columns, and the optional ones in which at least one row has a value."""
+    return [*required, *(name for name in optional if any(getattr(row, name) is not None for row in rows))]
+
+
+def cell_text(value: object, decimals: int) -> str:
+    """Format a value as a CSV cell: None is blank, a float has fixed decimals and no negative zero."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{round(value, decimals) + 0.0:.{decimals}f}"
+    return str(value)
+
+
+def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a header and rows as UTF-8 with line feeds.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    try:
+        with Path(path).open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(rows)
+    except OSError as error:
+        raise TelemetryError(f"{path}: cannot be written: {error.strerror or error}") from None
