@@ -15,7 +15,7 @@ from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.integrity import PeakRule
 from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
-from engine.report.charts import Plot, ticks
+from engine.report.charts import ChartArea, ticks
 from engine.report.explain import choose_frames
 from engine.report.metrics import Errors, Ground, summarise
 from engine.report.page import FinishedTrack, write_page
@@ -108,7 +108,7 @@ def test_ticks_are_round_and_inside(low, span):
 
 
 def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
-    plot = Plot((0.0, 4.0), (0.0, 1.0))
+    plot = ChartArea((0.0, 4.0), (0.0, 1.0))
     time, values = np.arange(5.0), np.array([0.0, 0.5, np.nan, 0.5, 7.0])
     assert plot.line(time, values, "truth").count("M") == 2
     assert plot.dots(time, values, "fix").count("h0") == 3
