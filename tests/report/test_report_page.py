@@ -17,7 +17,7 @@ from engine.integrity import PeakRule
 from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
 from engine.report.charts import ChartArea, ticks
 from engine.report.explain import choose_frames
-from engine.report.metrics import Errors, Ground, summarise
+from engine.report.metrics import Ground, TrackErrors, summarise
 from engine.report.page import FinishedTrack, write_page
 from engine.report.verdict import MEANINGS, verdict_of
 from engine.runs.evaluation import evaluate
@@ -118,7 +118,7 @@ def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
 def errors_of(distances_m):
     east = np.array(distances_m, float)
     error = np.column_stack([east, np.where(np.isfinite(east), 0.0, np.nan)])
-    return Errors(np.zeros_like(error), error, error, np.full((len(east), 2, 2), np.nan))
+    return TrackErrors(np.zeros_like(error), error, error, np.full((len(east), 2, 2), np.nan))
 
 
 def test_wrong_frames_are_shown_before_refusals_before_others():
