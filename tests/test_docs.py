@@ -45,7 +45,14 @@ def flight(tmp_path_factory):
 
 
 @pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
-@pytest.mark.parametrize("page", [p for p in PAGES if FENCE.search(p.read_text(encoding="utf-8"))], ids=page_name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page_name(page), marks=[pytest.mark.slow] if page.stem == "simulator" else [])
+        for page in PAGES
+        if FENCE.search(page.read_text(encoding="utf-8"))
+    ],
+)
 def test_snippets_run_as_they_stand(page, flight, monkeypatch):
     monkeypatch.chdir(flight)
     names = {"__name__": page.stem}  # the snippets of a page follow each other

@@ -151,6 +151,7 @@ def test_without_a_prior_the_whole_map_is_searched_and_the_same_place_found(
     assert np.hypot(lost.east_m - known.east_m, lost.north_m - known.north_m) < 0.1
 
 
+@pytest.mark.slow
 def test_without_a_prior_a_place_on_a_large_map_is_found_by_way_of_a_coarse_one(camera):
     ground = Ground(size=(1200, 1100), seed=9)  # more than the million pixels that are searched at once
     matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
@@ -690,6 +691,7 @@ def test_a_town_gives_the_same_fixes_in_any_projection(town_projections, sim_fli
         assert np.hypot(*difference.T).max() < most_m, name
 
 
+@pytest.mark.slow
 def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, camera):
     ground = Ground(lon_deg=16.45)  # 1.1 degrees of convergence
     rng = np.random.default_rng(0)

@@ -538,7 +538,7 @@ def test_the_simulated_flight_is_joined_without_a_start(sim_site, sim_flight, er
     assert errors.max() < 10.0
 
 
-@pytest.mark.parametrize("method", ["ncc", "sift"])
+@pytest.mark.parametrize("method", ["ncc", pytest.param("sift", marks=pytest.mark.slow)])
 def test_the_papers_profile_flies_the_simulated_flight(sim_site, sim_flight, errors_of, method):
     """Its NCC knows no tilt: at 7 degrees it is 18.4 m off at 150 m, and more where height and heading err."""
     results = fly(sim_site, sim_flight, method, profile="paper")

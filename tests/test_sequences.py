@@ -38,7 +38,9 @@ def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
     fly(tiny, steps, method, start=start)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [method if method == "sift" else pytest.param(method, marks=pytest.mark.slow) for method in METHODS]
+)
 def test_random_sequences_end_in_documented_ways_and_some_in_fixes(tiny, method):
     """A slice of ``python -m bench.live.sequences``."""
     endings = sum((sequence(tiny, seed, method) for seed in range(12)), start=sequence(tiny, 99, method))

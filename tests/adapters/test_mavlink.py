@@ -716,6 +716,7 @@ def test_the_velocity_is_believed_where_it_is_told_to(bridge_to, use):
     assert (made.navigator.frames[-1].east_velocity_mps is not None) == use
 
 
+@pytest.mark.slow
 def test_fixes_come_at_4_hz_or_more(bridge_to):
     made = bridge_to()
     with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:

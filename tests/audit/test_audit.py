@@ -108,6 +108,7 @@ def test_fine_random_texture_is_less_stable_than_a_town(town_gray):
     assert np.nanmax(values[0]) < np.nanmin(values[1])
 
 
+@pytest.mark.slow
 def test_another_date_finds_what_changed(town_gray):
     """Half of the map was built anew: the other date's half is another town."""
     later = town_gray.copy()
@@ -126,6 +127,7 @@ def test_another_date_finds_what_changed(town_gray):
     assert (found.availability[changed] <= alone.availability[changed]).all()
 
 
+@pytest.mark.slow
 def test_the_same_map_gives_the_same_audit(site, found):
     again = audit_map(site, CAMERA, HEIGHT_M)
     assert np.array_equal(again.availability, found.availability, equal_nan=True)
@@ -307,6 +309,7 @@ def test_the_command_writes_raster_picture_and_summary(map_file, route_file, fou
     assert cv2.imread(str(out / "audit.png"), cv2.IMREAD_GRAYSCALE).std() > 5
 
 
+@pytest.mark.slow
 def test_the_raster_lies_where_the_map_does(map_file, found, tmp_path):
     out = tmp_path / "out"
     assert run(command(map_file, out)) == 0
@@ -324,6 +327,7 @@ def test_the_raster_lies_where_the_map_does(map_file, found, tmp_path):
     assert place == pytest.approx(found.plan.centers_px[3, 4], abs=0.02)
 
 
+@pytest.mark.slow
 def test_people_get_a_table_and_a_pipe_no_escapes(map_file, route_file, tmp_path, capsys):
     assert run(command(map_file, tmp_path / "out", f"--route={route_file}")) == 0
     printed = capsys.readouterr()
@@ -333,6 +337,7 @@ def test_people_get_a_table_and_a_pipe_no_escapes(map_file, route_file, tmp_path
     assert "\x1b" not in printed.out
 
 
+@pytest.mark.slow
 def test_a_folder_that_exists_is_kept_unless_forced(map_file, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()

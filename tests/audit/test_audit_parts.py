@@ -89,6 +89,7 @@ def test_a_part_at_the_edge_ends_with_the_map(site):
     assert (plan.window.x0, plan.window.y0 + plan.window.height_px) == (0, 900)
 
 
+@pytest.mark.slow
 def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(site):
     route = lat_lon(site, [[200, 250], [640, 300], [700, 650]])
     whole = audit_map(site, CAMERA, HEIGHT_M)
@@ -124,6 +125,7 @@ def test_both_parts_are_looked_at(site):
     assert len(both) == pytest.approx(len(one) + len(other), rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_memory_allows(huge):
     route = lat_lon(huge, [[10, 10], [23_990, 23_990], [23_990, 10]])
     plan = plan_audit(huge, CAMERA, 20.0, AuditOptions(max_cells=500), part=MapPart(route=route, corridor_m=5.0))
@@ -170,6 +172,7 @@ def place_option(site, xy_px, radius_m):
     return f"--around={lat:.8f},{lon:.8f},{radius_m:g}"
 
 
+@pytest.mark.slow
 def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path, huge, tmp_path, capsys):
     """Its grey levels and validity would take 1,152 MB."""
     import matplotlib.figure  # noqa: F401  an import while memory is traced takes long

@@ -630,6 +630,7 @@ def test_an_interrupted_run_keeps_its_rows(flight, tmp_path, capsys, monkeypatch
 NARROW = {"COLUMNS": "30", "TERM": "dumb"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_the_console_script_in_a_narrow_pipe(flight, tmp_path):
     environment = os.environ | NARROW

@@ -237,7 +237,9 @@ def test_every_truncation_is_one_line_or_a_shorter_flight(tmp_path, kind):
         check_readable_or_one_line(path, frames)
 
 
-@pytest.mark.parametrize("kind", BAG_KINDS)
+@pytest.mark.parametrize(
+    "kind", [BAG_KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in BAG_KINDS[1:])]
+)
 def test_mutated_bags_are_one_line_or_a_flight(tmp_path, kind):
     path, frames, _ = a_bag(tmp_path, kind, count=2)
     rng = np.random.default_rng(5)

@@ -192,6 +192,7 @@ def test_uav_visloc_says_where_the_maps_own_georeference_disagrees(in_degrees, f
         assert file.bounds.top == pytest.approx(north, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_wildnav_is_followed_on_its_map_of_pictures(in_degrees, frames, truth, tmp_path, capsys):
     picture, (west, south, east, north) = in_degrees
     query, there = tmp_path / "assets" / "query", tmp_path / "assets" / "map"
@@ -270,6 +271,7 @@ def quaternion(matrix):
     return [(matrix[2, 1] - matrix[1, 2]) / (4 * w), (matrix[0, 2] - matrix[2, 0]) / (4 * w), (matrix[1, 0] - matrix[0, 1]) / (4 * w), w]  # fmt: skip  # noqa: E501
 
 
+@pytest.mark.slow
 def test_alto_is_followed_on_the_map_of_its_aerial_pictures(plan, frames, truth, tmp_path, capsys):
     """The town's coordinates count as those of ALTO's zone: as far from its meridian, as far from the equator."""
     town, val = plan.town, tmp_path / "Val"
@@ -618,6 +620,7 @@ def singles_followed(out, count):
     return found
 
 
+@pytest.mark.slow
 def test_ortholoc_becomes_flights_of_one_frame_that_are_followed(plan, frames, truth, tmp_path, capsys):
     town = plan.town
     rows, columns = town.surface_m.shape

@@ -79,7 +79,9 @@ def assert_same_peak(quick, full, search, template):
         assert quick.second_score == pytest.approx(full.score, abs=1e-5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [kind if kind in ("town", "flat") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+)
 def test_coarse_to_fine_finds_what_an_exhaustive_search_finds(kind, town):
     quicker = 0
     for number in range(CASES_A_KIND):

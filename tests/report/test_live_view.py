@@ -173,6 +173,7 @@ def matcher(sim_site, sim_flight):
 # --------------------------------------------------------------------------------------- loop and bridges
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
 def test_the_closed_loop_is_recorded_frame_by_frame(tmp_path, capsys):
     recording, out = tmp_path / "loop.rrd", tmp_path / "out"
@@ -247,7 +248,7 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
 class SilentNode:
     """A node to which nobody listens."""
 
-    maker = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
+    messages = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
 
     def now_ns(self):
         return 1

@@ -281,7 +281,7 @@ def test_without_truth_nothing_is_claimed(flown, tmp_path):
     site = OrthoMap.open(record["settings"]["map"])
     write_page(tmp_path / "report.html", FinishedTrack(rows, None, site, Ground(), summary, None))
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "Without truth nobody can say" in text
+    assert "Without truth their accuracy is unknown" in text
     assert "median error" not in text
 
 

@@ -68,6 +68,7 @@ def test_track_finds_the_way_through_it(folder, tmp_path):
     assert summary["rms_m"] < 2.0
 
 
+@pytest.mark.slow
 def test_one_seed_gives_the_same_bytes(folder, tmp_path):
     again = tmp_path / "again"
     assert run(["simulate", "--out", str(again), "--frames", "2", "--seed", "5"]) == 0

@@ -245,6 +245,7 @@ def test_the_covariance_stays_positive_definite_and_symmetric(flights):
             assert np.linalg.eigvalsh(P)[0] > 0.0
 
 
+@pytest.mark.slow
 def test_without_positions_the_sigma_grows_and_holds_the_error():
     squares, sigmas = [], []
     for seed in range(300, 304):

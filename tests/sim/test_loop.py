@@ -119,6 +119,7 @@ def test_the_engine_is_told_what_the_filter_believes():
         np.testing.assert_allclose(speed, answer.truth.velocity_mps[:2], atol=1.0)
 
 
+@pytest.mark.slow
 def test_a_long_latency_costs_little_because_fixes_are_taken_in_where_they_belong():
     flown = fly(20.0, latency_s=0.6)
     assert fly(5.0, latency_s=3.5).used  # longer than anybody's, and still kept for
@@ -135,6 +136,7 @@ def test_with_gps_the_engines_fixes_are_not_needed():
 # ------------------------------------------------------------------------------------------------------- faults
 
 
+@pytest.mark.slow
 def test_an_engine_that_is_killed_for_ten_seconds_is_coasted_over():
     flown = fly(28.0, Fault(kind="killed", start_s=12.0, duration_s=10.0))
     dead = [a for a in flown.answers if a.state is None]
@@ -187,6 +189,7 @@ def test_a_shifted_map_is_never_followed():
     assert last.estimate.sigma_m < 12.0
 
 
+@pytest.mark.slow
 def test_a_frozen_camera_is_refused_and_survived():
     flown = fly(28.0, Fault(kind="frozen", start_s=7.0, duration_s=10.0))
     frozen = [a for a in flown.answers if 8.5 < a.truth.time_s < 17.0]

@@ -74,6 +74,7 @@ def test_tilt_is_limited_and_thrust_never_pushes_down():
         assert force[2] > 0.0
 
 
+@pytest.mark.slow
 def test_drag_ends_where_the_air_and_the_push_balance():
     air = np.array([4.0, -2.0, 0.0])
     state = hovering(np.zeros(3), 0.0)
@@ -156,6 +157,7 @@ def test_beyond_its_ends_a_route_hovers(clock_s):
     assert np.hypot(*(SQUARE - point.position_m[:2]).T).min() < 0.2
 
 
+@pytest.mark.slow
 def test_the_pilot_keeps_the_route_in_gusts_and_shakes():
     route, rng = plan_route(SQUARE), np.random.default_rng(5)
     state, air, pilot = hovering(route.position_m[0], float(route.heading_deg[0])), WindField(Wind(), rng), Pilot()

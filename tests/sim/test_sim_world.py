@@ -56,6 +56,7 @@ def test_a_condition_of_light_alone_is_that_light(light):
     assert plain.ortho.tobytes() == named.ortho.tobytes()
 
 
+@pytest.mark.slow
 def test_the_map_and_the_frames_each_have_their_own_day():
     noon, winter = build_town(5, **SMALL), build_town(5, **SMALL, condition="winter")
     assert winter.ortho.tobytes() == noon.ortho.tobytes()
@@ -67,6 +68,7 @@ def test_the_map_and_the_frames_each_have_their_own_day():
     assert swapped.surface_m.sum() < noon.surface_m.sum()  # bare trees
 
 
+@pytest.mark.slow
 def test_every_condition_can_be_seen_and_differs_from_the_others():
     seen = [build_town(5, **TINY, condition=name).world.rgb.astype(np.float32) for name in CONDITIONS]
     for one, other in itertools.combinations(seen, 2):
@@ -87,6 +89,7 @@ def test_conditions_are_checked():
         build_town(relief_m=-1.0)
 
 
+@pytest.mark.slow
 def test_houses_come_and_go_between_the_map_and_the_flight():
     same, other = build_town(5, **SMALL), build_town(5, **SMALL, changed=0.4)
     lost = (same.surface_m > 3.0) & (other.surface_m == 0.0)
@@ -164,6 +167,7 @@ def test_a_patch_on_a_hillside_appears_where_geo_and_camera_put_it(slope, attitu
     assert world.ground_at(tuple(TO_CRS @ (x, y, 1.0))) == pytest.approx(45.0)
 
 
+@pytest.mark.slow
 def test_hills_carry_the_town_and_its_surface_model(hilly):
     world, ground = hilly.world, hilly.world.ground_m
     assert ground.min() == 0.0
@@ -181,6 +185,7 @@ def test_hills_carry_the_town_and_its_surface_model(hilly):
     np.testing.assert_allclose(fine.reshape(720, 2, 700, 2).mean(axis=(1, 3)), hilly.surface_m, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_river_crosses_the_town_on_the_level(hilly):
     water = hilly.world.glint.water > 0
     _, labels, stats, _ = cv2.connectedComponentsWithStats(water.astype(np.uint8))

@@ -314,4 +314,5 @@ def import_rosbags() -> tuple[Any, Any]:
     Raises:
         MissingExtraError: rosbags is not installed.
     """
+    require("rosbags", "bags")
     return require("rosbags.highlevel", "bags"), require("rosbags.typesys", "bags")
