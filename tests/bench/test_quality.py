@@ -114,7 +114,8 @@ def correlation(pair):
     return np.corrcoef(laid[inside], pair.second[inside])[0, 1]
 
 
-@pytest.mark.parametrize("size", [(150, 150), pytest.param((300, 300), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(150, 150), (300, 300)])
 def test_pairs_show_the_same_ground_where_their_map_says(size):
     assert min(correlation(pair) for pair in warped_pairs(size, 5)) > 0.85
 

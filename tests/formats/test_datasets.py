@@ -658,6 +658,7 @@ def test_ortholoc_becomes_flights_of_one_frame_that_are_followed(plan, frames, t
     assert told == pytest.approx((truth[0].roll_deg, truth[0].pitch_deg, truth[0].height_agl_m), abs=20.0)
 
 
+@pytest.mark.slow
 def test_anyvisloc_becomes_flights_of_one_frame_on_one_map(plan, truth, tmp_path, capsys):
     """Gimbals keep the roll at 0 there: the frames are drawn again without theirs."""
     town, scene = plan.town, tmp_path / "Scene_01"
