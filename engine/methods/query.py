@@ -129,12 +129,12 @@ class Query:
             covariance_m2: (3, 3) east, north, up.
             score: of the match.
             window: that was searched.
-            east_north_m: (2,) the same place as ``nadir_px`` where it is known in metres; None computes it.
+            east_north_m: (2,) of the nadir where it is known in metres; None computes it.
             up_m: height of the camera, or None where it is not measured.
-            grid_attitude: as measured, the heading from grid north; None where it is not measured.
+            grid_attitude: the heading from grid north; None where it is not measured.
         """
         east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
-        lat, lon = (float(v) for v in self.site.geodetic_from_pixel(nadir_px))
+        lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
         return Fix(
             timestamp_ns=self.frame.timestamp_ns,
             lat_deg=lat,
