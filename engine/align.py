@@ -1,4 +1,4 @@
-"""From a camera frame to a template aligned with the map: grey, enhance, rectify (equations 2 and 3).
+"""From a camera frame to a picture aligned with the map: grey, rectify (equations 2 and 3).
 
 Convention:
     A rectified patch has the map's pixels and axes. Its ``offset_px`` is the position of its top-left pixel
@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import OptionError
 from engine.geo import enu_from_body
 from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
 
 # Beyond this angle off the vertical a footprint is stretched more than 4 times and relief occludes the ground.
 MAX_RAY_DEG = 75.0
@@ -37,10 +35,6 @@ _RECTANGLES = (
     * np.stack([np.sqrt(_ASPECTS), 1.0 / np.sqrt(_ASPECTS)], axis=1)[:, None]
     * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 )
-SCORES = ("grey", "local", "gradient", "mixed")
-_MIDDLE_GREY = 127.5
-# Added to the local variance, in squared grey levels, so that sensor noise on flat ground is not amplified.
-_NOISE_VARIANCE = 4.0
 
 
 def to_gray(frame: Frame) -> NDArray[np.uint8]:
@@ -56,93 +50,6 @@ def to_gray(frame: Frame) -> NDArray[np.uint8]:
     if image.ndim == 3:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
     return np.ascontiguousarray(image)
-
-
-def check_score(score: str) -> None:
-    """Raise OptionError where no score has this name."""
-    if score not in SCORES:
-        raise OptionError(f"score: expected one of {', '.join(SCORES)}, got {score!r}")
-
-
-def enhance(
-    gray: NDArray[np.uint8], *, radius_px: int = 8, score: str = "local", valid: NDArray[np.bool_] | None = None
-) -> FloatImage:
-    """The paper's "enhance" step: what of the grey levels is correlated, the same for frame and map.
-
-    The picture is first smoothed by the binomial 1-2-1, since aliasing of sampled edges biases correlation peaks
-    towards whole pixels. ``docs/scores.md`` compares the scores.
-
-    - "local": each pixel less its neighbourhood's mean, over its standard deviation, which is robust to shadows,
-      haze and exposure.
-    - "gradient": the same of the gradient's magnitude, which is invariant to the sign of a contrast.
-    - "mixed": the sum of both.
-    - "grey": the smoothed grey levels less middle grey.
-
-    Args:
-        gray: (H, W).
-        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels; 0 is without normalisation.
-        score: one of :data:`SCORES`.
-        valid: (H, W) bool; pixels where it is False are ignored and 0 in the result.
-
-    Returns:
-        (H, W) float32.
-
-    Raises:
-        OptionError: the radius is negative, or no score has this name.
-    """
-    if radius_px < 0:
-        raise OptionError(f"radius_px: expected 0 or more, got {radius_px}")
-    check_score(score)
-    weight = None if valid is None else valid.astype(np.float32)
-    smooth = _smoothed(gray, weight)
-    if score == "grey":
-        return _masked(smooth.astype(np.float32) - _MIDDLE_GREY, weight)
-    if score == "local":
-        return _normalised(smooth, radius_px, weight)
-    # No gradient is taken across the border of the valid area.
-    inner = None if weight is None else cv2.erode(weight, np.ones((3, 3), np.uint8))
-    gradient = _normalised(_gradient_magnitude(smooth), radius_px, inner)
-    return gradient if score == "gradient" else gradient + _normalised(smooth, radius_px, weight)
-
-
-def _smoothed(gray: NDArray[np.uint8], weight: FloatImage | None) -> NDArray[np.uint8] | FloatImage:
-    """The picture smoothed by 1-2-1: in uint8, which is faster, or in float32 where there is a mask."""
-    if weight is None:
-        return np.asarray(cv2.GaussianBlur(gray, (3, 3), 0))
-    share = np.maximum(cv2.GaussianBlur(weight, (3, 3), 0), 1e-6)
-    return np.asarray(cv2.GaussianBlur(gray * weight, (3, 3), 0) / share)
-
-
-def _gradient_magnitude(picture: NDArray[np.uint8] | FloatImage) -> FloatImage:
-    """Grey levels per pixel, by central differences."""
-    across = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    down = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
-    return np.asarray(cv2.magnitude(across, down))
-
-
-def _normalised(picture: NDArray[np.uint8] | FloatImage, radius_px: int, weight: FloatImage | None) -> FloatImage:
-    """Each pixel less the mean of its neighbourhood, over its standard deviation, weighted."""
-    if radius_px == 0:
-        return _masked(picture.astype(np.float32), weight)
-    box = (2 * radius_px + 1, 2 * radius_px + 1)
-    if weight is None:
-        mean = cv2.boxFilter(picture, cv2.CV_32F, box)
-        square = cv2.sqrBoxFilter(picture, cv2.CV_32F, box)
-    else:
-        share = np.maximum(cv2.blur(weight, box), 1e-6)
-        mean = cv2.blur(picture * weight, box) / share
-        square = cv2.blur(picture * picture * weight, box) / share
-    # In place: on a patch of 228 x 228 pixels an allocation takes longer than the arithmetic.
-    square -= mean * mean
-    np.maximum(square, 0.0, out=square)
-    square += _NOISE_VARIANCE
-    normal = np.subtract(picture.astype(np.float32, copy=False), mean, out=mean)
-    normal /= np.sqrt(square, out=square)
-    return _masked(normal, weight)
-
-
-def _masked(picture: FloatImage, weight: FloatImage | None) -> FloatImage:
-    return np.asarray(picture if weight is None else picture * weight, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from engine.errors import MapError
 from engine.maps.georeference import Georeference
 from engine.maps.grids import Array, Grid, warp_between
 from engine.maps.metric_copy import ProgressCallback
-from engine.maps.opening import check_arrays, metric_grid, open_readable
+from engine.maps.preparation import check_arrays, metric_grid, open_readable
 from engine.maps.pyramid import ArrayReader, Pyramid, Reader
 from engine.maps.rasters import (
     GEOREFERENCE_TAG,

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 
 from engine import Attitude, Camera, Fix, Frame, OptionError, OrthoMap, Prior, SceneMatcher
-from engine.align import MAX_RAY_DEG, enhance, rectify, to_gray, view_of
+from engine.align import MAX_RAY_DEG, rectify, to_gray, view_of
+from engine.scores import enhance
 from tests.support.ground import Ground, ground_hits
 
 CAMERA = Camera.from_fov(300, 300, 60.0)

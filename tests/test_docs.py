@@ -44,7 +44,7 @@ def flight(tmp_path_factory):
     return folder
 
 
-@pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
+@pytest.mark.usefixtures("towns_drawn_once")
 @pytest.mark.parametrize(
     "page",
     [

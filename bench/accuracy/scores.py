@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
 from engine import Camera, Frame, OrthoMap, Prior
-from engine.align import SCORES, enhance, to_gray
+from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.confidence import PriorAgreement, peak_features
 from engine.device import set_threads
@@ -34,6 +34,7 @@ from engine.methods.options import NccOptions
 from engine.methods.query import Query
 from engine.methods.scheduler import Scheduler
 from engine.ncc_fft import match_template, prepare
+from engine.scores import SCORES, enhance
 from engine.sim import plan_flight
 from engine.window import level_for
 
@@ -238,8 +239,8 @@ def measure(data: Path) -> list[list[str]]:
 
 PAGE = f"""# Scores: what is correlated
 
-`NccOptions.score` selects the input of the zero-mean NCC. `engine.align.enhance` computes it from the grey levels,
-in the same way for the map and for each frame; matching itself does not change, and nodata is left out.
+`NccOptions.score` selects the input of the zero-mean NCC. `engine.scores.enhance` computes it from the grey
+levels, in the same way for the map and for each frame; matching itself does not change, and nodata is left out.
 
 | score | what it is | when |
 |---|---|---|

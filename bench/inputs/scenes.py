@@ -40,7 +40,7 @@ def mosaic(side: int) -> NDArray[np.uint8]:
 @cache
 def pair(window_px: int, template_px: int) -> tuple[Image, Image]:
     """A window of map, enhanced, and a noisy cut of it as template."""
-    from engine.align import enhance
+    from engine.scores import enhance
 
     gray = mosaic(max(window_px, 1000))[:window_px, :window_px]
     window = enhance(gray)

@@ -132,7 +132,8 @@ def test_bank(benchmark: Any, peer: str, threads: int) -> None:
     """36 headings x 5 scales over the paper's whole map: which place, which heading?"""
     from dataclasses import replace
 
-    from engine.align import enhance, rectify, view_of
+    from engine.align import rectify, view_of
+    from engine.scores import enhance
     from engine.values import Attitude, Window
 
     scene = flight()

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import enhance
 from engine.audit.plan import AuditPlan
 from engine.indexes.prepared import PreparedMap
 from engine.integrity import score_sigma
@@ -23,6 +22,7 @@ from engine.methods.options import NccOptions
 from engine.ncc_fft import surface
 from engine.orthomap import OrthoMap
 from engine.peaks import fit_summit
+from engine.scores import enhance
 from engine.values import Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 

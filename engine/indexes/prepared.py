@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import enhance
 from engine.ncc_fft import Search, prepare
 from engine.orthomap import OrthoMap
+from engine.scores import enhance
 from engine.values import Window
 
 CELL_PX = 256
@@ -50,8 +50,8 @@ class PreparedMap:
     Args:
         site: the map.
         device: of the regions' tensors.
-        radius_px: of the local normalisation, see :func:`engine.align.enhance`.
-        score: see :func:`engine.align.enhance`.
+        radius_px: of the local normalisation, see :func:`engine.scores.enhance`.
+        score: see :func:`engine.scores.enhance`.
     """
 
     def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:

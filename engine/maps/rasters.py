@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.tiles import local_path, openable
+from engine.maps.raster_formats import local_path, openable
 from engine.maps.xyz_tiles import is_tile_cache, open_tile_cache
 from engine.values import MAX_SIGMA_M, Window
 

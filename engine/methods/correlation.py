@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import MIN_SHRINK, GroundView, Patch, enhance, rectify, view_of
+from engine.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
 from engine.indexes.prepared import PreparedMap, Region
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
 from engine.ncc_fft import match_template, ncc
 from engine.peaks import find_peak
+from engine.scores import enhance
 from engine.values import GridPose, NoFix, Peak, Reason, Window
 from engine.window import level_crop
 

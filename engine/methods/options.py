@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from engine.align import check_score
 from engine.errors import OptionError
 from engine.integrity import AssumedErrors, PeakRule, with_map_accuracy
 from engine.learned import PairMatcher
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions
+from engine.scores import check_score
 
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from engine import OrthoMap
-from engine.align import enhance
 from engine.indexes import prepared
 from engine.indexes.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
+from engine.scores import enhance
 from engine.values import Window
 
 RADIUS_PX = 8

@@ -11,8 +11,8 @@ from rasterio.enums import Resampling
 from rasterio.shutil import copy
 
 from engine.errors import MapError
+from engine.maps.raster_formats import vrt_of_folder
 from engine.maps.rasters import GEOREFERENCE_TAG
-from engine.maps.tiles import vrt_of_folder
 from engine.orthomap import OrthoMap
 from engine.values import Window
 

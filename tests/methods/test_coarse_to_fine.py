@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from engine import ShapeError, ncc_fft
-from engine.align import enhance
 from engine.ncc_fft import match_template, prepare
+from engine.scores import enhance
 from tests.support.towns import drawn_town
 
 KINDS = ("fine", "broad", "mixed", "town", "tiles", "flat")

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from engine import Fix, Frame, MatcherOptions, OptionError, OrthoMap, SceneMatcher
-from engine.align import SCORES, enhance
 from engine.budget import Budget, Deadline
 from engine.indexes import prepared as prepared_map
 from engine.indexes.prepared import PreparedMap
@@ -18,6 +17,7 @@ from engine.methods.ncc import Ncc
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
 from engine.methods.scheduler import Scheduler
+from engine.scores import SCORES, enhance
 from engine.values import Window
 from tests.support.paths import ROOT
 

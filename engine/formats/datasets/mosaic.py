@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from engine.errors import MapError, OptionError
-from engine.maps.tiles import driver_of
+from engine.maps.raster_formats import driver_of
 
 _STRIP_PX = 512
 
