@@ -1,8 +1,10 @@
 """scenematch: position fixes from a downward camera and a georeferenced map, where GNSS is gone."""
 
 from engine import features, ncc_fft
+from engine.acceptance import PeakRule
 from engine.budget import Budget
 from engine.camera import Camera
+from engine.covariance import AssumedErrors
 from engine.device import set_threads
 from engine.errors import (
     BackendError,
@@ -17,7 +19,6 @@ from engine.errors import (
     StateError,
     TelemetryError,
 )
-from engine.integrity import AssumedErrors, PeakRule
 from engine.live import Answer, Live, LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods.options import MatcherOptions, NccOptions, SiftOptions

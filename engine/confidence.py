@@ -109,7 +109,7 @@ def peak_features(peak: Peak, sigma: float, agreement: PriorAgreement) -> PeakFe
 
     Args:
         peak: the peak.
-        sigma: one standard deviation of a score of chance, from :func:`engine.integrity.score_sigma`.
+        sigma: one standard deviation of a score of chance, from :func:`engine.covariance.score_sigma`.
         agreement: of its position with the prior.
     """
     z = math.atanh(min(max(peak.score, 0.0), 0.999))

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine import Fix, Reason
+from engine.acceptance import PeakRule, judge_peak, judge_pose
 from engine.confidence import (
     PeakFeatures,
     PoseFeatures,
@@ -19,7 +20,6 @@ from engine.confidence import (
     prior_agreement,
     probability,
 )
-from engine.integrity import PeakRule, judge_peak, judge_pose
 from engine.values import Peak, Timings, Window
 
 NEAR = PriorAgreement(prior_chi_square=4.0, spread_m=8.0)

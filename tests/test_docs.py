@@ -9,9 +9,10 @@ from typer.main import get_command
 
 from docs.draw_architecture import drawn, members, picture
 from docs.site_roles import on_page_content
+from engine.acceptance import PeakRule
 from engine.cli.app import app
+from engine.covariance import AssumedErrors
 from engine.formats.track import COLUMNS
-from engine.integrity import AssumedErrors, PeakRule
 from engine.methods.options import SiftOptions
 from engine.navigator import NavigatorOptions
 from engine.pose import PoseOptions

@@ -31,7 +31,8 @@ from engine import (
     SceneMatcher,
     Window,
 )
-from engine.integrity import AssumedErrors, PeakRule
+from engine.acceptance import PeakRule
+from engine.covariance import AssumedErrors
 from engine.methods.feature_pose import FeatureMatcher, attitude_prior
 from engine.methods.options import NccOptions, SiftOptions
 from engine.values import GridPose

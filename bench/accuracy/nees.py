@@ -22,9 +22,9 @@ from bench import DOCS, SHARED
 from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
 from bench.pages.text import paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
+from engine.covariance import AssumedErrors
 from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
-from engine.integrity import AssumedErrors
 from engine.methods.options import NccOptions, SiftOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import plan_flight

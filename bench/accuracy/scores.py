@@ -21,14 +21,15 @@ from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
 from engine import Camera, Frame, OrthoMap, Prior
+from engine.acceptance import judge_peak
 from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.confidence import PriorAgreement, peak_features
+from engine.covariance import score_sigma
 from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.indexes.prepared import PreparedMap
-from engine.integrity import judge_peak, score_sigma
 from engine.methods.correlation import Aligned, Correlator
 from engine.methods.options import NccOptions
 from engine.methods.query import Query

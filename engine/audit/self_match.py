@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from engine.audit.plan import AuditPlan
+from engine.covariance import score_sigma
 from engine.indexes.prepared import PreparedMap
-from engine.integrity import score_sigma
 from engine.methods.options import NccOptions
 from engine.ncc_fft import surface
 from engine.orthomap import OrthoMap

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from engine.integrity import are_consistent
+from engine.acceptance import are_consistent
 from engine.methods.explanation import Explanation
 from engine.methods.ncc import Ncc
 from engine.methods.options import MatcherOptions

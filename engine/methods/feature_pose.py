@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from engine.confidence import PoseFeatures, prior_agreement, probability
+from engine.covariance import AssumedErrors
 from engine.features import match, sift
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
-from engine.integrity import AssumedErrors
 from engine.learned import PairMatcher
 from engine.methods.options import MIN_HEIGHT_M, SiftOptions
 from engine.methods.query import Query

@@ -8,16 +8,11 @@ from typing import Never
 
 import torch
 
+from engine.acceptance import judge_peak
 from engine.confidence import PeakFeatures, peak_features, prior_agreement, probability
+from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
-from engine.integrity import (
-    judge_peak,
-    misalignment_covariance_px2,
-    ncc_covariance_m2,
-    peak_covariance_px,
-    score_sigma,
-)
 from engine.methods import hypothesis_search
 from engine.methods.correlation import METHOD, Aligned, Correlator
 from engine.methods.explanation import Explanation, explain_correlation

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from engine.acceptance import PeakRule
+from engine.covariance import AssumedErrors, with_map_accuracy
 from engine.errors import OptionError
-from engine.integrity import AssumedErrors, PeakRule, with_map_accuracy
 from engine.learned import PairMatcher
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.acceptance import are_consistent
 from engine.align import shrink
 from engine.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, correlation_at, covariance_of, refine
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.indexes.samples import BLOCK_PX, SampleMap
-from engine.integrity import are_consistent
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
 from engine.pose import AttitudePrior

@@ -8,8 +8,8 @@ from typing import Never
 
 import torch
 
+from engine.acceptance import judge_pose
 from engine.indexes.landmarks import LandmarkMap
-from engine.integrity import judge_pose
 from engine.methods.explanation import Explanation, explain_features
 from engine.methods.feature_pose import METHOD, FeatureMatcher, PoseCandidate
 from engine.methods.options import MatcherOptions, SiftOptions

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from engine.cli.app import run
+from engine.covariance import AssumedErrors
 from engine.errors import OptionError, TelemetryError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.telemetry import read_telemetry
-from engine.integrity import AssumedErrors
 
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
 PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]

@@ -10,10 +10,10 @@ from PIL import Image
 
 from bench.pages.browser import missing, open_browser
 from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
+from engine.acceptance import PeakRule
 from engine.formats.notes import FrameNote, frame_note, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
-from engine.integrity import PeakRule
 from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
 from engine.report.charts import ChartArea, ticks
 from engine.report.explain import choose_frames

@@ -1,7 +1,4 @@
-"""Accept or refuse a match, and say how well a fix is known.
-
-The rules are few and documented in ``docs/integrity.md``; their thresholds were fitted on simulated flights.
-"""
+"""Covariance of a fix by correlation: of its peak, and of what is assumed of telemetry, map and ground."""
 
 from __future__ import annotations
 
@@ -12,16 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.confidence import PeakFeatures, PoseFeatures
 from engine.errors import OptionError
-from engine.geo import chi_square, transport_covariance
+from engine.geo import transport_covariance
 from engine.orthomap import OrthoMap
-from engine.values import MAX_SIGMA_M, GridPose, Peak, Reason, check_positive
+from engine.values import MAX_SIGMA_M, GridPose, Peak, check_positive
 
 Array = NDArray[np.float64]
-
-CONSISTENT_CHI_SQUARE = 13.8
-"""Chi-square of the difference of two positions that chance exceeds once in a thousand, two degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,130 +76,6 @@ def score_sigma(pixels: int) -> float:
     The correlation coefficient of N independent samples about zero has the variance 1/N.
     """
     return 1.0 / math.sqrt(max(1.0, pixels / _CORRELATION_PX**2))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PeakRule:
-    """When a correlation peak is accepted.
-
-    Scores are counted in :func:`score_sigma`, so that a rule holds for small patches as for large ones. Over two
-    simulated towns right places lead by 8 and more, with a quarter of the frame hidden by 2.3 and more; on another
-    town's map the best led by 1.4, mirrored by 2.5, and where the prior pointed elsewhere by 3.4. On 324 searches
-    of heading or height the best reached 11.1 and led by at most 6.7.
-
-    Attributes:
-        min_sigmas: a peak below this may be chance.
-        min_margin_sigmas: how far the best rival must stay below the peak.
-        min_margin_sigmas_whole_map: the same where the whole map was searched, or the place contradicts the prior,
-            and nothing else vouches for it.
-        max_prior_chi_square: of a position against its prior, above which the two contradict each other; chance
-            exceeds this once in ten thousand.
-        min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
-            another town, turned until they fit, look like these.
-        min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
-        min_confidence: probability of :func:`engine.confidence.probability` below which a peak is not accepted.
-        null_test_below: confidence below which the peak must also beat the null hypothesis, its own template
-            upside down in the same window; 1 always asks for it.
-        min_deviation: standard deviation in grey levels below which a frame has no texture.
-        exclusion_m: rivals nearer than this are the peak itself.
-    """
-
-    min_sigmas: float = 5.0
-    min_margin_sigmas: float = 2.0
-    min_margin_sigmas_whole_map: float = 3.5
-    max_prior_chi_square: float = 18.4
-    min_sigmas_searched: float = 13.0
-    min_margin_sigmas_searched: float = 8.0
-    min_confidence: float = 0.98
-    null_test_below: float = 0.995
-    min_deviation: float = 3.0
-    exclusion_m: float = 6.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-        if not self.min_confidence < 1.0:
-            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
-        if not self.null_test_below <= 1.0:
-            raise OptionError(f"null_test_below: expected a probability of at most 1, got {self.null_test_below}")
-
-
-Refusal = tuple[Reason, str]
-"""Why a match is not accepted, and the figures behind it."""
-
-
-def judge_peak(
-    peak: Peak,
-    pixels: int,
-    features: PeakFeatures | None,
-    confidence: float | None,
-    rule: PeakRule,
-    *,
-    searched: bool = False,
-) -> Refusal | None:
-    """The reason to refuse a correlation peak, or None where it is accepted.
-
-    Args:
-        peak: the peak.
-        pixels: of the template.
-        features: of the confidence model; None where nothing was known of the position, or more was searched
-            than a window at one heading and height.
-        confidence: that the model gives them; None without them.
-        rule: the thresholds.
-        searched: the heading or the height was searched for.
-    """
-    sigma = score_sigma(pixels)
-    min_score = sigma * (rule.min_sigmas_searched if searched else rule.min_sigmas)
-    if peak.score < min_score:
-        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f} may be chance; {min_score:.3f} is asked for"
-    if not peak.curvature.any():
-        return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
-    # A position that contradicts the prior is vouched for by the match alone, as in a search of the whole map.
-    alone = features is None or features.agreement.prior_chi_square > rule.max_prior_chi_square
-    margin = rule.min_margin_sigmas_whole_map if alone else rule.min_margin_sigmas
-    margin = sigma * (rule.min_margin_sigmas_searched if searched else margin)
-    if peak.score - peak.second_score < margin:
-        rival = f"a rival reaches {peak.second_score:.3f}"
-        return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
-    if features is None or confidence is None or confidence >= rule.min_confidence:
-        return None
-    figures = f"NCC {features.sigmas:.1f} sigmas, rival at {features.ratio:.0%}"
-    chi_square_text = f"{features.agreement.prior_chi_square:.1f}"
-    return Reason.AMBIGUOUS, _improbable(confidence, rule.min_confidence, figures, chi_square_text)
-
-
-def judge_pose(features: PoseFeatures, confidence: float, min_confidence: float) -> Refusal | None:
-    """The reason to refuse a pose by matched features, or None where it is accepted.
-
-    Args:
-        features: of the confidence model.
-        confidence: that the model gives them.
-        min_confidence: that is asked for.
-    """
-    if confidence >= min_confidence:
-        return None
-    figures = f"log10 of false alarms {features.log10_nfa:.1f}"
-    off = features.prior_chi_square
-    return Reason.BAD_POSE, _improbable(
-        confidence, min_confidence, figures, "unknown" if off is None else f"{off:.1f}"
-    )
-
-
-def _improbable(confidence: float, min_confidence: float, figures: str, prior_chi_square: str) -> str:
-    asked = f"{min_confidence:g} is asked for ({figures}, chi-square {prior_chi_square} from the prior)"
-    return f"right with a probability of {confidence:.3f}, {asked}"
-
-
-def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
-    """Whether two estimates of one position agree.
-
-    Args:
-        apart_m: (2,) from one to the other, in metres.
-        covariance_m2: (2, 2) sum of their covariances.
-
-    Returns:
-        bool: False where chance alone would set them so far apart less than once in a thousand.
-    """
-    return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
 
 
 def peak_covariance_px(peak: Peak, pixels: int) -> Array:

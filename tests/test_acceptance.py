@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from engine import Camera, OptionError, OrthoMap, Reason
+from engine.acceptance import PeakRule, judge_peak
 from engine.confidence import PeakFeatures, PriorAgreement
-from engine.integrity import (
+from engine.covariance import (
     AssumedErrors,
-    PeakRule,
-    judge_peak,
     misalignment_covariance_px2,
     ncc_covariance_m2,
     peak_covariance_px,
