@@ -86,7 +86,7 @@ def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, told, s
 
 
 def test_the_frame_is_laid_on_the_slope_below_it(scene, ground, camera, monkeypatch):
-    """Correlation alone: laid on its slope the frame fits the map better than laid on level ground."""
+    """Correlation alone: aligned with its slope the frame fits the map better than on level ground."""
     site, frame, _ = scene
     matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
     fix = matcher.locate(frame, ground.prior(NADIR))

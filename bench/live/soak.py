@@ -89,7 +89,7 @@ def _feed(live: Live, frames: list[Frame], interval_s: float) -> float:
 
 
 class Growth:
-    """What may not grow in flight, sampled every so many frames: memory, open files, threads, one-off work."""
+    """What may not grow in flight, sampled every so many frames: memory, open files, threads, caches."""
 
     def __init__(self, matcher: SceneMatcher, frames: int) -> None:
         self._matcher = matcher
@@ -114,7 +114,7 @@ class Growth:
             "rss_slope_mb": slope(samples[:, 0], SAMPLE_EVERY) * 1e4,
             "open_files": samples[[0, -1], 1].tolist(),
             "threads": samples[[0, -1], 2].tolist(),
-            "one_off_growth": {name: count - self._work.get(name, 0) for name, count in work.items()},
+            "cache_growth": {name: count - self._work.get(name, 0) for name, count in work.items()},
         }
 
 

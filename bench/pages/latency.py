@@ -193,7 +193,7 @@ def _soak_table(rows: list[Row]) -> list[str]:
             str(row["windows"]),
             shown(row["rss_slope_mb"]),
             *(" to ".join(f"{count:.0f}" for count in row[name]) for name in ("open_files", "threads")),
-            listed(row["one_off_growth"]),
+            listed(row["cache_growth"]),
             *(shown(row[name], ".1f") for name in ("p99_first", "p99_last", "max")),
             share(row["availability"]),
             str(row["wrong"]),

@@ -22,7 +22,7 @@ from bench.pages.text import machine, table
 from bench.speed import growth, whole_map
 from engine import device
 
-BASELINE = {"peak": "OpenCV", "step": "OpenCV", "bank": "OpenCV loop"}
+BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
 INTRO = (
     "Made by `make bench`; every figure below comes from one run of it, on {machine}. A time is the median of the "
     "calls, and a ratio above 1 means faster than the peer it is counted from. Times are compared only where the "
@@ -55,7 +55,7 @@ def main() -> None:
     for name, figure in charts.items():
         figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
     page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=machine()), 115), ""]
-    page += _peak_section(rows) + _step_section(rows) + _bank_section(rows)
+    page += _peak_section(rows) + _step_section(rows) + _hypotheses_section(rows)
     page += _map_section(big) + _growth_section(curves) + sift.sections(rows)
     (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
 
@@ -141,7 +141,7 @@ def _step_section(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _bank_section(rows: list[dict[str, Any]]) -> list[str]:
+def _hypotheses_section(rows: list[dict[str, Any]]) -> list[str]:
     cells = [
         [
             r["peer"],
@@ -152,7 +152,7 @@ def _bank_section(rows: list[dict[str, Any]]) -> list[str]:
             _memory(r),
         ]
         for r in rows
-        if r["task"] == "bank"
+        if r["task"] == "hypotheses"
     ]
     return [
         "## Heading unknown, height within 10 %, the whole map of the paper",

@@ -128,7 +128,7 @@ HEADINGS, SCALES = 36, 5
 
 
 @pytest.mark.parametrize("peer", ["OpenCV loop", "scenematch"])
-def test_bank(benchmark: Any, peer: str, threads: int) -> None:
+def test_hypotheses(benchmark: Any, peer: str, threads: int) -> None:
     """36 headings x 5 scales over the paper's whole map: which place, which heading?"""
     from dataclasses import replace
 
@@ -167,9 +167,9 @@ def test_bank(benchmark: Any, peer: str, threads: int) -> None:
 
     error_m = float(np.hypot(*(call() - site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg))))
     assert error_m < 10.0
-    benchmark.group = f"bank of {HEADINGS * SCALES}, {threads} thread(s)"
+    benchmark.group = f"{HEADINGS * SCALES} hypotheses, {threads} thread(s)"
     benchmark.extra_info |= {
-        "task": "bank",
+        "task": "hypotheses",
         "peer": peer,
         "threads": threads,
         "error_m": error_m,

@@ -56,30 +56,30 @@ def some_belief() -> FilterState:
     )
 
 
-def moved(belief: FilterState, error: np.ndarray) -> FilterState:
-    """The truth where the belief is off by an error."""
+def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
+    """The truth where the estimate is off by an error."""
     return replace(
-        belief,
-        position_m=belief.position_m + error[POSITION],
-        velocity_mps=belief.velocity_mps + error[VELOCITY],
-        enu_from_body=rotation(error[TURN]) @ belief.enu_from_body,
-        accel_bias_mps2=belief.accel_bias_mps2 + error[ACCEL],
-        gyro_bias_rps=belief.gyro_bias_rps + error[GYRO],
-        baro_drift_m=belief.baro_drift_m + error[15],
-        compass_bias_rad=belief.compass_bias_rad + error[COMPASS],
+        estimate,
+        position_m=estimate.position_m + error[POSITION],
+        velocity_mps=estimate.velocity_mps + error[VELOCITY],
+        enu_from_body=rotation(error[TURN]) @ estimate.enu_from_body,
+        accel_bias_mps2=estimate.accel_bias_mps2 + error[ACCEL],
+        gyro_bias_rps=estimate.gyro_bias_rps + error[GYRO],
+        baro_drift_m=estimate.baro_drift_m + error[15],
+        compass_bias_rad=estimate.compass_bias_rad + error[COMPASS],
     )
 
 
-def apart(truth: FilterState, belief: FilterState) -> np.ndarray:
-    """The error (17,) of a belief."""
+def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
+    """The error (17,) of a estimate."""
     return np.concatenate(
         [
-            truth.position_m - belief.position_m,
-            truth.velocity_mps - belief.velocity_mps,
-            rotation_vector(truth.enu_from_body @ belief.enu_from_body.T),
-            truth.accel_bias_mps2 - belief.accel_bias_mps2,
-            truth.gyro_bias_rps - belief.gyro_bias_rps,
-            [truth.baro_drift_m - belief.baro_drift_m, truth.compass_bias_rad - belief.compass_bias_rad],
+            truth.position_m - estimate.position_m,
+            truth.velocity_mps - estimate.velocity_mps,
+            rotation_vector(truth.enu_from_body @ estimate.enu_from_body.T),
+            truth.accel_bias_mps2 - estimate.accel_bias_mps2,
+            truth.gyro_bias_rps - estimate.gyro_bias_rps,
+            [truth.baro_drift_m - estimate.baro_drift_m, truth.compass_bias_rad - estimate.compass_bias_rad],
         ]
     )
 
@@ -96,14 +96,14 @@ def a_fix(east_m, north_m, up_m=None, sigma_m=0.5) -> Fix:
 
 
 def test_prediction_carries_errors_as_differences_say():
-    belief, step = some_belief(), 1e-5
-    expected = predict(belief, SAMPLE, SUITE)
+    estimate, step = some_belief(), 1e-5
+    expected = predict(estimate, SAMPLE, SUITE)
     F = np.empty((STATES, STATES))
     for k in range(STATES):
         error = np.zeros(STATES)
         error[k] = step
-        F[:, k] = apart(predict(moved(belief, error), SAMPLE, SUITE), expected) / step
-    added = expected.covariance - F @ belief.covariance @ F.T
+        F[:, k] = apart(predict(moved(estimate, error), SAMPLE, SUITE), expected) / step
+    added = expected.covariance - F @ estimate.covariance @ F.T
     np.testing.assert_allclose(added - np.diag(np.diag(added)), 0.0, atol=2e-5)
     assert np.diag(added).min() > -2e-5  # noise is white: on the diagonal
     baro = SUITE.barometer
@@ -127,55 +127,55 @@ def test_prediction_carries_errors_as_differences_say():
     ids=["barometer", "compass"],
 )
 def test_a_measurement_moves_the_belief_as_its_differences_say(fuse, measured, variance):
-    belief, step = some_belief(), 1e-6
+    estimate, step = some_belief(), 1e-6
     H = np.empty(STATES)
     for k in range(STATES):
         error = np.zeros(STATES)
         error[k] = step
-        H[k] = (measured(moved(belief, error)) - measured(belief)) / step
-    gain = belief.covariance @ H / (H @ belief.covariance @ H + variance)
-    np.testing.assert_allclose(apart(fuse(belief, measured(belief) + 0.01), belief), 0.01 * gain, atol=2e-6)
+        H[k] = (measured(moved(estimate, error)) - measured(estimate)) / step
+    gain = estimate.covariance @ H / (H @ estimate.covariance @ H + variance)
+    np.testing.assert_allclose(apart(fuse(estimate, measured(estimate) + 0.01), estimate), 0.01 * gain, atol=2e-6)
 
 
 def test_a_heading_is_compared_the_short_way_round():
-    belief = replace(some_belief(), enu_from_body=enu_from_body(0.0, 0.0, 359.8), compass_bias_rad=0.0)
-    turned = rotation_vector(fuse_heading(belief, 0.2, SUITE).enu_from_body @ belief.enu_from_body.T)
+    estimate = replace(some_belief(), enu_from_body=enu_from_body(0.0, 0.0, 359.8), compass_bias_rad=0.0)
+    turned = rotation_vector(fuse_heading(estimate, 0.2, SUITE).enu_from_body @ estimate.enu_from_body.T)
     assert np.linalg.norm(turned) < math.radians(0.6)
 
 
 def test_joseph_is_the_textbook_where_that_is_exact():
-    belief = some_belief()
+    estimate = some_belief()
     H = np.random.default_rng(1).normal(size=(2, STATES))
     R = np.diag([0.3, 0.7])
-    after = correct(belief, np.zeros(2), H, R)
-    P = belief.covariance
+    after = correct(estimate, np.zeros(2), H, R)
+    P = estimate.covariance
     expected = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
     np.testing.assert_allclose(after.covariance, expected, atol=1e-9)
-    np.testing.assert_allclose(after.position_m, belief.position_m)
+    np.testing.assert_allclose(after.position_m, estimate.position_m)
 
 
 def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
-    belief = replace(some_belief(), covariance=np.eye(STATES))
+    estimate = replace(some_belief(), covariance=np.eye(STATES))
     np.testing.assert_allclose(
-        fuse_fix(belief, a_fix(12.0, -5.0, sigma_m=1.0)).position_m, [11.0, -5.0, 120.0], atol=1e-9
+        fuse_fix(estimate, a_fix(12.0, -5.0, sigma_m=1.0)).position_m, [11.0, -5.0, 120.0], atol=1e-9
     )
     np.testing.assert_allclose(
-        fuse_fix(belief, a_fix(10.0, -5.0, 122.0, sigma_m=1.0)).position_m, [10.0, -5.0, 121.0], atol=1e-9
+        fuse_fix(estimate, a_fix(10.0, -5.0, 122.0, sigma_m=1.0)).position_m, [10.0, -5.0, 121.0], atol=1e-9
     )
-    assert fix_chi_square(belief, a_fix(14.0, -2.0, sigma_m=1.0)) == pytest.approx(25.0 / 2.0)
+    assert fix_chi_square(estimate, a_fix(14.0, -2.0, sigma_m=1.0)) == pytest.approx(25.0 / 2.0)
 
 
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     state, rng = hovering(np.array([0.0, 0.0, 100.0]), 200.0), np.random.default_rng(9)
-    belief = replace(initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
+    estimate = replace(initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
     air = WindField(Wind(), rng)
     for k in range(500):
         state, felt = advance(
             state, np.array([1.0, math.cos(k / 60), 0.1]), 200.0 + 0.1 * k, Airframe(), air.next()
         )
-        belief = predict(belief, felt, SUITE)
-    np.testing.assert_allclose(belief.position_m, state.position_m, atol=1e-6)
-    np.testing.assert_allclose(belief.enu_from_body, state.enu_from_body, atol=1e-9)
+        estimate = predict(estimate, felt, SUITE)
+    np.testing.assert_allclose(estimate.position_m, state.position_m, atol=1e-6)
+    np.testing.assert_allclose(estimate.enu_from_body, state.enu_from_body, atol=1e-9)
 
 
 # -------------------------------------------------------------------------------------------------- consistency
@@ -193,11 +193,11 @@ def fly(seed, seconds, gps_until_s=math.inf):
     history = History(initial_state(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
     kicks, receiver, rows = list(route.kicks_s), [], []
     for k in range(1, round(seconds / STEP_S) + 1):
-        target, belief = route.at(k * STEP_S), history.now
+        target, estimate = route.at(k * STEP_S), history.now
         if kicks and k * STEP_S >= kicks[0]:
             kicks.pop(0)
             state = shaken(state, frame, shakes)
-        wanted = pilot.steer(target, belief.position_m, belief.velocity_mps)
+        wanted = pilot.steer(target, estimate.position_m, estimate.velocity_mps)
         state, felt = advance(state, wanted, target.heading_deg, frame, air.next())
         history.advance(carried.imu(felt))
         if k % 5 == 0:

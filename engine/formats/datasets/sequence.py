@@ -68,7 +68,7 @@ class DatasetSequence:
         datum: datum of their heights, one of :data:`DATUMS`; None where it is not published.
         mount: rotation (3, 3) from the camera's axes to the body's, v_body = mount * v_camera; None is the
             default, the image's top to the nose.
-        map: a georeferenced file, the pieces that it is laid together from, or None where the data set has none.
+        map: a georeferenced file, the pieces that it is composed of, or None where the data set has none.
         notes: assumptions and omissions, one line each.
     """
 
