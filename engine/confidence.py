@@ -155,9 +155,9 @@ def regressors(features: PeakFeatures | PoseFeatures) -> NDArray[np.float64]:
     return np.array([1.0, math.sqrt(alarms), *known[0], *known[1]])
 
 
-def _known(off: float | None) -> tuple[float, float]:
+def _known(chi_square: float | None) -> tuple[float, float]:
     """A chi-square, limited, and whether it is missing."""
-    return (0.0, 1.0) if off is None else (min(off, _MAX_CHI_SQUARE), 0.0)
+    return (0.0, 1.0) if chi_square is None else (min(chi_square, _MAX_CHI_SQUARE), 0.0)
 
 
 def probability(features: PeakFeatures | PoseFeatures, model: PeakModel | PoseModel | None = None) -> float:

@@ -48,11 +48,11 @@ class AssumedErrors:
                 raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
 
     def height_sigma_m(self, height_m: float) -> float:
-        """Of a height."""
+        """Standard deviation of a height, in metres."""
         return math.hypot(self.height_m, self.height_share * height_m)
 
     def tilts_deg(self, pose: GridPose) -> tuple[float, float]:
-        """Of the roll and of the pitch that a frame came with, or did not."""
+        """Standard deviations of roll and of pitch, in degrees, by whether they are known."""
         unknown, known = self.unknown_tilt_deg, self.tilt_deg
         return (unknown if pose.roll_deg is None else known, unknown if pose.pitch_deg is None else known)
 
@@ -137,7 +137,7 @@ def ncc_covariance_m2(
     Args:
         peak_px2: (2, 2) covariance of the peak in square pixels.
         pose: height and attitude by which the frame was aligned.
-        camera: its mount tells where the optical axis points.
+        camera: its mount gives the direction of the optical axis.
         enu_jacobian: (2, 2) metres east and north per pixel.
         errors: of the telemetry and the map.
 
@@ -165,7 +165,7 @@ def _aim_m(camera: Camera, values: Array) -> Array:
     """Where the optical axis meets the ground, (N, 2) metres east and north of the nadir.
 
     Args:
-        camera: its mount says which way of the body is the axis.
+        camera: its mount gives the direction of the optical axis.
         values: (N, 4) height in metres; roll, pitch and heading in degrees.
     """
     forward, right, down = camera.mount[:, 2]

@@ -22,7 +22,7 @@ _log = logging.getLogger("scenematch")
 
 _JOIN_S = 5.0  # that closing waits for abandoned workers; one that hangs for good is left behind
 _MAX_MS = 60_000.0  # of any wait in flight
-_MAX_DOUBLINGS = 10  # of the time that one attempt to create a navigator gets after another
+_MAX_DOUBLINGS = 10  # how often the time to create a navigator is doubled at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +111,7 @@ class Live:
         self._waiting: _Job | None = None
         self._working: _Job | None = None
         self._number = 0  # of the present worker
-        self._creating_since_ns: int | None = None  # its navigator; None where it has one, or pauses
+        self._creating_since_ns: int | None = None  # when the worker began to; None while it has one, or pauses
         self._hung_creations = 0  # in a row
         self._counts = Counts()
         self._closed = False

@@ -12,6 +12,7 @@ from engine import device as devices
 from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
+from engine.errors import OptionError
 from engine.features import plans_created
 from engine.kernels import loops_compiled
 from engine.methods import Method, method_type
@@ -99,7 +100,7 @@ class SceneMatcher:
         size = (round(camera.width_px * per_px), round(camera.height_px * per_px))
         place = site.inner_px
         last = (site.width_px - size[0], site.height_px - size[1])
-        x, y = (int(np.clip(v - (n - 1) / 2, 0, most)) for v, n, most in zip(place, size, last, strict=True))
+        x, y = (int(np.clip(v - (n - 1) / 2, 0, end)) for v, n, end in zip(place, size, last, strict=True))
         crop = level_crop(site, Window(x, y, max(1, size[0]), max(1, size[1])), level)
         image = cv2.resize(site.gray(crop, level), (camera.width_px, camera.height_px))
         middle = site.enu_from_pixel(place)
@@ -144,13 +145,20 @@ class SceneMatcher:
         Args:
             frame: of the camera's resolution.
             window: that was searched, in map pixels.
-            method: which of the two that "auto" is made of, "ncc" or "sift"; None takes NCC.
+            method: "ncc" or "sift"; None takes the matcher's own, and NCC of "auto".
+
+        Raises:
+            OptionError: the matcher has no such method.
         """
+        explained = self._method.parts.get(method or self.method, self._method)
+        if method not in (None, self.method, *self._method.parts):
+            known = ", ".join(self._method.parts or [self.method])
+            raise OptionError(f"method: expected one of this matcher's ({known}), got {method!r}")
         middle_px = np.array([window.x0, window.y0]) + np.array([window.width_px - 1, window.height_px - 1]) / 2.0
         east, north = self.site.enu_from_pixel(middle_px)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=0.0)
         query = self._query(frame, prior, Deadline(Budget()))
-        return self._method.parts.get(method or self.method, self._method).explain(query, window)
+        return explained.explain(query, window)
 
     def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
         scheduler = Scheduler(deadline, self.device, self._costs)

@@ -70,10 +70,10 @@ class DeadReckoning:
             return False
         if stamp in self._stamps:
             raise TelemetryError(f"timestamp_ns: expected a frame that did not come before, got {stamp} again")
-        least = newest - round(self._late_s * 1e9)
-        if stamp < least:
+        min_stamp_ns = newest - round(self._late_s * 1e9)
+        if stamp < min_stamp_ns:
             raise TelemetryError(
-                f"timestamp_ns: expected {least} or later ({newest} was the newest frame), got {stamp}"
+                f"timestamp_ns: expected {min_stamp_ns} or later ({newest} was the newest frame), got {stamp}"
             )
         return True
 
@@ -144,7 +144,7 @@ class DriftModel:
         Args:
             start: either of the two.
             end: the other.
-            velocity: that was assumed where none was measured; None where none was.
+            velocity: assumed where none was measured; None where none was assumed.
         """
         blind_s = abs(end.blind_s - start.blind_s)
         measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s)

@@ -226,11 +226,11 @@ class Navigator:
         if isinstance(result, Fix):
             result = self._judge(result, now, given, late=late)
         elif not late and result.reason is not Reason.LATE:
-            self._pending = None  # nobody confirmed it
+            self._pending = None  # no fix confirmed it
         if not late:
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
-                self._refusals += 1  # a lack of time says nothing of the position
+                self._refusals += 1  # a lack of time is no evidence about the position
             self._note_loss(now)
         return result
 

@@ -33,7 +33,8 @@ class Attitude:
     """Attitude of the body (forward-right-down), in aerospace order: yaw, then pitch, then roll.
 
     Convention:
-        ``heading_deg`` clockwise from true north in [0, 360); ``pitch_deg`` positive nose up;
+        ``heading_deg`` clockwise from true north in [0, 360), or from grid north where a name says ``grid_``;
+        ``pitch_deg`` positive nose up;
         ``roll_deg`` positive right side down.
     """
 

@@ -33,8 +33,9 @@ from engine import (
 )
 from engine.acceptance import PeakRule
 from engine.covariance import AssumedErrors
-from engine.methods.feature_pose import FeatureMatcher, attitude_prior
+from engine.methods.feature_pose import FeatureMatcher
 from engine.methods.options import NccOptions, SiftOptions
+from engine.methods.query import Query
 from engine.values import GridPose
 from tests.support.ground import Ground
 
@@ -355,7 +356,7 @@ def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, 
     known = GridPose(frame.height_agl_m, frame.heading_deg, frame.roll_deg, frame.pitch_deg)
     query = SimpleNamespace(telemetry=known, camera=replace(camera, mount=lifted))
     errors = AssumedErrors(tilt_deg=0.4, unknown_tilt_deg=5.0)
-    prior = attitude_prior(query, 40.0, 1.5, errors)
+    prior = Query.attitude_prior(query, 40.0, 1.5, errors)
     for about_body_deg in np.diag([5.0, 0.4, 1.5]):
         about_camera = lifted.T @ np.radians(about_body_deg)
         assert about_camera @ prior.precision @ about_camera == pytest.approx(1.0)

@@ -39,7 +39,10 @@ class Method(Protocol):
         """Prepare what is looked up of the map, before take-off."""
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step, so that it is compiled and its cost known; not called in flight."""
+        """Run every variant of every step, so that it is compiled and its cost known.
+
+        A query without a prior runs the search of the whole map.
+        """
 
     def locate(self, query: Query) -> Result:
         """The fix of one frame, or its refusal."""

@@ -47,7 +47,7 @@ class Auto:
         self.sift.prepare()
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step of both methods."""
+        """Run every variant of every step of both methods; without a prior, the search of the map."""
         if query.prior is None:
             self.locate(query)
             return

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from engine.confidence import PoseFeatures, prior_agreement, probability
 from engine.covariance import AssumedErrors
 from engine.features import match, sift
-from engine.geo import attitude_from_rotation, enu_from_body
+from engine.geo import attitude_from_rotation
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.learned import PairMatcher
 from engine.methods.options import MIN_HEIGHT_M, SiftOptions
 from engine.methods.query import Query
 from engine.methods.views import MapView, TelemetryHypothesis, view_in, views_of, x_axis_deg
 from engine.orthomap import OrthoMap
-from engine.pose import AttitudePrior, PoseStats, solve_pose
+from engine.pose import PoseStats, solve_pose
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ class FeatureMatcher:
         height_m = self.query.telemetry.height_agl_m
         assert height_m is not None  # without one there is no single view
         hypothesis = TelemetryHypothesis((height_m, height_m), x_axis_deg(self.query))
-        found = self._matched([view_in(self.query, window, height_m, self.options.scale)], hypothesis)[0]
+        found = self._match_views([view_in(self.query, window, height_m, self.options.scale)], hypothesis)[0]
         enough = len(found.points_px) >= self.options.pose.min_inliers
         return found.points_px, found.points_m, self._pose(found, hypothesis) if enough else None
 
@@ -142,7 +142,7 @@ class FeatureMatcher:
             views = views_of(query, hypothesis, METHOD, margin=options.margin, scale=options.scale)
         if isinstance(views, NoFix):
             return views
-        matched = self._matched(views, hypothesis)
+        matched = self._match_views(views, hypothesis)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
         if count < options.pose.min_inliers:
@@ -161,7 +161,7 @@ class FeatureMatcher:
 
     # -------------------------------------------------------------------------------------------- matching
 
-    def _matched(self, views: list[MapView], hypothesis: TelemetryHypothesis) -> list[_Matched]:
+    def _match_views(self, views: list[MapView], hypothesis: TelemetryHypothesis) -> list[_Matched]:
         if self.options.matcher is not None:
             return self._by_pair_matcher(views, self.options.matcher)
         return self._by_features(views, hypothesis)
@@ -171,7 +171,7 @@ class FeatureMatcher:
         query, options, turn = self.query, self.options, hypothesis.x_axis_deg
         upright = options.upright and turn is not None
         with query.scheduler.stage("frame features"):
-            reduced = self._reduced()
+            reduced = self._reduce()
             features = sift(
                 reduced.picture, max_keypoints=options.max_keypoints, upright=upright, up_deg=turn or 0.0
             )
@@ -200,7 +200,7 @@ class FeatureMatcher:
 
     def _by_pair_matcher(self, views: list[MapView], matcher: PairMatcher) -> list[_Matched]:
         """What the user's own matcher finds, view by view."""
-        query, reduced = self.query, self._reduced()
+        query, reduced = self.query, self._reduce()
         matched = []
         for view in views:
             with query.scheduler.stage("match"), torch.inference_mode():
@@ -212,7 +212,7 @@ class FeatureMatcher:
                 matched.append(_Matched(view, reduced.full(points), ground_m, weights))
         return matched
 
-    def _reduced(self) -> _Reduced:
+    def _reduce(self) -> _Reduced:
         query, scale = self.query, self.options.scale
         height, width = query.gray.shape
         size = (max(16, round(width * scale)), max(16, round(height * scale)))
@@ -243,7 +243,7 @@ class FeatureMatcher:
     def _pose(self, found: _Matched, hypothesis: TelemetryHypothesis) -> PoseStats | None:
         """The pose that the matches agree on and the attitude allows.
 
-        Few matches can hardly tell a tilt from a displacement. What is known of the tilt counts also where the
+        Few matches hardly separate a tilt from a displacement. What is known of the tilt counts also where the
         heading is not: that is then taken from the matches themselves.
         """
         query, options = self.query, self.options
@@ -260,7 +260,7 @@ class FeatureMatcher:
                 return None
             heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
             sigma_deg = _MATCHED_HEADING_SIGMA_DEG
-        return solve(prior=attitude_prior(query, heading_deg, sigma_deg, options.errors))
+        return solve(prior=query.attitude_prior(heading_deg, sigma_deg, options.errors))
 
     def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
         """The camera's centre as a fix; refused where a drone over this map cannot be there."""
@@ -301,22 +301,6 @@ class FeatureMatcher:
             prior_chi_square = prior_agreement(fix, prior_m, query.prior.sigma_m).prior_chi_square
         features = PoseFeatures(stats.log10_nfa, prior_chi_square, height_chi_square)
         return PoseCandidate(replace(fix, confidence=probability(features)), features)
-
-
-def attitude_prior(
-    query: Query, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors
-) -> AttitudePrior:
-    """The frame's attitude with its assumed errors about the body's axes; an unknown tilt is taken as level.
-
-    Args:
-        query: the frame.
-        grid_heading_deg: clockwise from grid north.
-        sigma_deg: of the heading.
-        errors: of the tilt.
-    """
-    known, mount = query.telemetry, query.camera.mount
-    enu_from_camera = enu_from_body(known.roll_deg or 0.0, known.pitch_deg or 0.0, grid_heading_deg) @ mount
-    return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
 
 
 def _lifted(site: OrthoMap, map_px: Array) -> Array:

@@ -33,7 +33,7 @@ _SEMIFINALISTS = 4
 _FINALISTS = 2
 _GROUP = 2  # templates in one batch, which bounds the memory of their surfaces
 _SLACK_PX = 3  # by which a place that was found on a level may be wrong, in pixels of that level
-_EDGE_PX = 1.5  # by which neighbouring hypotheses may differ at the corner of the patch
+_EDGE_PX = 1.5  # by which the nearest hypothesis may be off at the corner of the patch
 _MIDDLE_ROUNDS = 2
 _FINE_ROUNDS = 2
 

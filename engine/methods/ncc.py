@@ -76,9 +76,12 @@ class Ncc:
         """Nothing: regions of the map are prepared as they are first searched."""
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step, so that it is compiled and its cost known."""
-        if query.prior is None:
-            self.locate(query)
+        """Run every variant of every step, so that it is compiled and its cost known.
+
+        A query without a prior runs the search of the whole map.
+        """
+        if query.prior is None or not self._trusts(query):
+            self.locate(query)  # a search has one variant
             return
         for coarser in self._expected_window_px(query):
             self.refine(query, self.correlate(query, coarser))
@@ -96,7 +99,7 @@ class Ncc:
                 time for.
         """
         if query.telemetry.height_agl_m is None:
-            return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
+            return self._refuse_without_height(query)
         if query.prior is None or not self._trusts(query):
             step = "ncc search" if query.prior is None else "ncc hypotheses"
             works = {0: float(query.site.width_px * query.site.height_px)}
@@ -174,11 +177,14 @@ class Ncc:
     def _trusts(self, query: Query) -> bool:
         return self.options.trusts(query.telemetry.grid_heading_deg)
 
+    def _refuse_without_height(self, query: Query) -> NoFix:
+        return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
+
     def _refuse_unusable(self, query: Query) -> NoFix | None:
         """A refusal of a frame that lacks what the method needs."""
         pose = query.telemetry
         if pose.height_agl_m is None:
-            return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
+            return self._refuse_without_height(query)
         if pose.grid_heading_deg is None and self.options.heading_search_deg < 180.0:
             return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
         return query.refuse_flat(METHOD, self.options.rule.min_deviation)
@@ -238,7 +244,7 @@ class Ncc:
         )
 
     def _expected_window_px(self, query: Query) -> dict[int, float]:
-        """Pixels of the window, to which the cost is proportional, by how much coarser a level that serves is."""
+        """Expected pixels of the window, by levels above the frame's own; the cost is proportional to them."""
         site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
         assert height_m is not None  # asked for before
         assert query.prior is not None

@@ -34,7 +34,7 @@ class NccOptions:
             also where the frame has none.
         height_search_share: the height may be off by this share; 0 trusts it.
         refine: refine the pose densely after the peak, where heading and height are trusted.
-        rule: when a peak is believed.
+        rule: when a peak is accepted.
         errors: what is assumed of the telemetry and the map.
     """
 
@@ -95,8 +95,8 @@ class SiftOptions:
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
         use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
-            features alone can hardly tell a tilt from a displacement.
-        min_confidence: probability of :func:`engine.confidence.probability` below which a pose is not believed.
+            features alone hardly separate a tilt from a displacement.
+        min_confidence: probability of :func:`engine.confidence.probability` below which a pose is not accepted.
         pose: settings of PnP and RANSAC.
         errors: what is assumed of the telemetry and the map.
     """
@@ -135,12 +135,12 @@ class SiftOptions:
         for name in ("scale", "ratio"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
-        for name, least in (
+        for name, minimum in (
             ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M), ("max_tilt_deg", 0.0)
         ):  # fmt: skip
             value = getattr(self, name)
-            if value is not None and not value > least:
-                raise OptionError(f"{name}: expected above {least:g}, got {value}")
+            if value is not None and not value > minimum:
+                raise OptionError(f"{name}: expected above {minimum:g}, got {value}")
         if self.map_features not in MAP_FEATURES:
             raise OptionError(
                 f"map_features: expected one of {', '.join(MAP_FEATURES)}, got {self.map_features!r}"

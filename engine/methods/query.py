@@ -11,9 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.geo import wrap_heading_deg
+from engine.covariance import AssumedErrors
+from engine.geo import enu_from_body, wrap_heading_deg
 from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
+from engine.pose import AttitudePrior
 from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
@@ -31,7 +33,7 @@ class Query:
         site: the map.
         prior: where the vehicle should be, or None: anywhere on the map.
         device: where tensors live.
-        scheduler: the frame's clock.
+        scheduler: times its stages, and decides which steps there is time for.
     """
 
     frame: Frame
@@ -106,6 +108,18 @@ class Query:
         width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
         shape = (self.site.width_px, self.site.height_px)
         return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
+
+    def attitude_prior(self, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
+        """The frame's attitude with its assumed errors about the body's axes; an unknown tilt is taken as level.
+
+        Args:
+            grid_heading_deg: clockwise from grid north.
+            sigma_deg: of the heading.
+            errors: of the tilt.
+        """
+        known, mount = self.telemetry, self.camera.mount
+        enu_from_camera = enu_from_body(known.roll_deg or 0.0, known.pitch_deg or 0.0, grid_heading_deg) @ mount
+        return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
 
     # --------------------------------------------------------------------------------------------- answers
 

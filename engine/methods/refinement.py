@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from engine.acceptance import are_consistent
 from engine.align import shrink
 from engine.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, correlation_at, covariance_of, refine
-from engine.geo import attitude_from_rotation, enu_from_body
+from engine.geo import attitude_from_rotation
 from engine.indexes.samples import BLOCK_PX, SampleMap
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
-from engine.pose import AttitudePrior
 from engine.scores import enhance
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
@@ -100,16 +99,14 @@ class Refinement:
         attitude, height_m = known.grid_attitude, known.height_agl_m
         assert attitude is not None
         assert height_m is not None
-        mount = query.camera.mount
-        rotation = (enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ mount).T
+        attitude_prior = query.attitude_prior(attitude.heading_deg, errors.heading_deg, errors)
         precision = np.zeros((8, 8))
         precision[2, 2] = errors.height_sigma_m(height_m) ** -2.0
-        attitude_prior = AttitudePrior(rotation, (*errors.tilts_deg(known), errors.heading_deg), axes=mount)
         precision[3:6, 3:6] = attitude_prior.precision
         precision[[6, 7], [6, 7]] = math.tan(math.radians(errors.surface_slope_deg)) ** -2.0
         ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
         center = np.array([fix.east_m, fix.north_m, ground_m + height_m])
-        return GaussianPrior(Pose(rotation, center, np.zeros(2)), precision)
+        return GaussianPrior(Pose(attitude_prior.rotation, center, np.zeros(2)), precision)
 
     def _footprint(self, pose: Pose, height_m: float, level: int) -> Window | None:
         """The part of a level that the frame shows, or None where that is less than a few blocks."""

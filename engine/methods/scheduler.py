@@ -17,11 +17,11 @@ from engine.device import synchronise
 from engine.methods.costs import Costs
 from engine.values import Timings
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 class Scheduler:
-    """The clock of one frame.
+    """Times the stages of one frame, and decides which steps there is time for.
 
     Args:
         deadline: runs already.
@@ -39,7 +39,7 @@ class Scheduler:
         """Whether the time that is left suffices for a step of this much work; True for one that never ran."""
         return self._costs.upper_bound_ms(step, work) <= self.deadline.remaining_ms
 
-    def first_affordable(self, step: str, works: Mapping[T, float]) -> T | None:
+    def first_affordable(self, step: str, works: Mapping[_T, float]) -> _T | None:
         """The first variant of a step, by its work, that there is time for; None where there is none."""
         return next((variant for variant, work in works.items() if self.can_afford(step, work)), None)
 

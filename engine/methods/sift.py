@@ -49,7 +49,10 @@ class Sift:
             self.landmarks.prepare()
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step, so that it is compiled and its cost known."""
+        """Run every variant of every step, so that it is compiled and its cost known.
+
+        A query without a prior runs the search of the whole map.
+        """
         if query.prior is None:
             self.locate(query)
             return

@@ -78,7 +78,7 @@ def views_of(
 
     Args:
         query: the frame and its prior; without a prior every window is the whole map.
-        hypothesis: its heights determine the levels; the largest that a level serves, the window on it.
+        hypothesis: its heights determine the levels, and the greatest that a level serves its window.
         method: what a refusal names.
         margin: the 1.3 of equations 4 and 5.
         scale: of the reduced frame.

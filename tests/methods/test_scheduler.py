@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, Navigator, NoFix, OrthoMap, Prior, Reason, SceneMatcher
+from engine import Budget, Fix, MatcherOptions, Navigator, NccOptions, NoFix, OrthoMap, Prior, Reason, SceneMatcher
 from engine.methods.sift import Sift
 
 NADIR = np.array([315.0, 296.0])
@@ -190,3 +190,11 @@ def test_a_late_frame_is_no_sign_of_being_lost(ground, make, frame, prior):
     for number in range(30):
         assert navigator.update(replace(frame, timestamp_ns=number)).reason is Reason.LATE
     assert all(isinstance(p, Prior) for p in priors)
+
+
+@pytest.mark.parametrize("searched", [{"heading_search_deg": 20.0}, {"height_search_share": 0.05}])
+def test_warmup_knows_the_cost_of_a_search(site, camera, searched):
+    options = MatcherOptions(ncc=NccOptions(refine=False, **searched))
+    matcher = SceneMatcher(site, camera, "ncc", "cpu", options)
+    matcher.warmup()
+    assert matcher._costs.upper_bound_ms("ncc hypotheses", 1e5) > 0.0

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from bench.pages.browser import missing, open_browser
-from engine import Fix, NoFix, OrthoMap, Prior, SceneMatcher
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.acceptance import PeakRule
 from engine.formats.notes import FrameNote, frame_note, read_notes, write_notes
 from engine.formats.settings import changed, nested, options_from_mapping
@@ -199,10 +199,16 @@ def test_the_matches_are_those_of_the_run(sim_flight, sim_site):
     assert np.median(off) < 6.0  # houses stand above the level ground of the outline
 
 
-def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
+def test_a_method_that_the_matcher_does_not_have_is_not_explained(sim_flight, sim_site):
     matcher, frame, fix = matched(sim_flight, sim_site, "ncc")
+    with pytest.raises(OptionError, match=r"^method: expected one of this matcher's \(ncc\), got 'sift'"):
+        matcher.explain(frame, fix.window, "sift")
+
+
+def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
+    matcher, frame, fix = matched(sim_flight, sim_site, "auto")
     blind = type(frame)(frame.image)
-    for method in ("ncc", "sift"):
+    for method in (None, "ncc", "sift"):
         found = matcher.explain(blind, fix.window, method)
         assert (found.rectified, found.surface, found.matches, found.outline_px) == (None,) * 4
 
