@@ -460,6 +460,7 @@ def test_hours_of_traffic_leave_nothing_behind():
     assert growth_bytes(hours=0.05) < 20_000
 
 
+@pytest.mark.slow
 def test_minutes_of_the_hour_in_which_everything_goes_wrong():
     from bench.live.bridge_hour import hour
 
@@ -726,6 +727,7 @@ def test_fixes_come_at_4_hz_or_more(bridge_to):
     assert hz >= MIN_RATE_HZ
 
 
+@pytest.mark.slow
 def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_to):
     made = bridge_to(origin=ORIGIN)
     with Standin(made.port) as pilot:

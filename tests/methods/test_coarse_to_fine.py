@@ -19,7 +19,7 @@ from engine.scores import enhance
 from tests.support.towns import drawn_town
 
 KINDS = ("fine", "broad", "mixed", "town", "tiles", "flat")
-CASES_A_KIND = 60
+CASES_A_KIND = 30
 EXCLUSION_PX = (12.0, 5.0)
 
 

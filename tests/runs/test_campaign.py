@@ -386,6 +386,7 @@ def part(number):
     return f"said by {number}, not by {os.getppid()}"
 
 
+@pytest.mark.slow
 def test_a_job_whose_process_ends_is_answered():
     with in_processes(1) as execute:
         assert list(execute(part, [2])) == [(2, "its process ended with code 3")]
