@@ -27,7 +27,7 @@ from bench.inputs.scenes import mosaic
 from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.align import view_of
-from engine.audit.availability import Audit, audit_map, regressors
+from engine.audit.availability import Audit, audit_site, regressors
 from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.sim import build_town
@@ -186,7 +186,7 @@ def photograph(ground: Ground, nadir_px: Array, height_m: float, rng: np.random.
 def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator) -> list[Trial]:
     """Frames at random places of a map, matched by the engine, beside what the audit says of each place."""
     site = ground.site
-    found = audit_map(site, CAMERA, height_m, other=ground.other)
+    found = audit_site(site, CAMERA, height_m, other=ground.other)
     matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
     statistics = found.statistics
     at_places = regressors(statistics.texture, statistics.score, statistics.lead)
@@ -285,7 +285,7 @@ def flight_rows(quick: bool) -> list[list[str]]:
             continue
         flight = recorded(name, step * (10 if quick else 2))
         heights = [frame.height_agl_m for frame, _ in flight.frames if frame.height_agl_m is not None]
-        found = audit_map(flight.site, flight.camera, float(np.median(heights)))
+        found = audit_site(flight.site, flight.camera, float(np.median(heights)))
         first = flight.truth[0]
         start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
         navigator = Navigator(SceneMatcher(flight.site, flight.camera, "ncc", "cpu"), start)
@@ -324,7 +324,7 @@ def time_rows() -> list[list[str]]:
     for side in (1000, 4000):
         site = OrthoMap.from_arrays(mosaic(side), GRID, UTM)
         start = time.perf_counter()
-        found = audit_map(site, CAMERA, 150.0)
+        found = audit_site(site, CAMERA, 150.0)
         spent_s = time.perf_counter() - start
         rows.append([f"{side:,} x {side:,} px", str(len(found.plan)), f"{spent_s:.0f} s"])
         print(" | ".join(rows[-1]), flush=True)

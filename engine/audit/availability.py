@@ -160,7 +160,7 @@ def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:
     return Audit(plan, statistics, effective, flags)
 
 
-def audit_map(
+def audit_site(
     site: OrthoMap,
     camera: Camera,
     height_agl_m: float,

@@ -11,7 +11,7 @@ from pyproj import Transformer
 
 from bench.accuracy.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
-from engine.audit.availability import Flag, audit_map, fix_probability, predict_route
+from engine.audit.availability import Flag, audit_site, fix_probability, predict_route
 from engine.audit.plan import AuditOptions, plan_audit
 from engine.audit.self_match import measure_self_match
 from engine.cli.app import run
@@ -53,7 +53,7 @@ def site(patchwork):
 
 @pytest.fixture(scope="module")
 def found(site):
-    return audit_map(site, CAMERA, HEIGHT_M)
+    return audit_site(site, CAMERA, HEIGHT_M)
 
 
 def well_inside(found, x0, y0):
@@ -114,8 +114,8 @@ def test_another_date_finds_what_changed(town_gray):
     later = town_gray.copy()
     later[:, HALF:] = town_gray[::-1, ::-1][:, HALF:]
     sites = [OrthoMap.from_arrays(gray, GRID, "EPSG:32614") for gray in (town_gray, later)]
-    found = audit_map(sites[0], CAMERA, HEIGHT_M, other=sites[1])
-    alone = audit_map(sites[0], CAMERA, HEIGHT_M)
+    found = audit_site(sites[0], CAMERA, HEIGHT_M, other=sites[1])
+    alone = audit_site(sites[0], CAMERA, HEIGHT_M)
     x = found.plan.centers_px[..., 0]
     known = ~np.isnan(found.availability)
     reach = found.plan.view.footprint_px[0]
@@ -129,7 +129,7 @@ def test_another_date_finds_what_changed(town_gray):
 
 @pytest.mark.slow
 def test_the_same_map_gives_the_same_audit(site, found):
-    again = audit_map(site, CAMERA, HEIGHT_M)
+    again = audit_site(site, CAMERA, HEIGHT_M)
     assert np.array_equal(again.availability, found.availability, equal_nan=True)
 
 
@@ -183,7 +183,7 @@ def test_where_a_forward_camera_looks_counts_not_where_it_is(site):
     """A camera that is mounted 20 degrees ahead sees the water before it is over it, whichever way it flies."""
     turn = cv2.Rodrigues(np.array([0.0, np.radians(20.0), 0.0]))[0]
     ahead = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
-    found = audit_map(site, ahead, HEIGHT_M)
+    found = audit_site(site, ahead, HEIGHT_M)
     east = predict_route(found, *lat_lon(site, [[HALF, 250], [HALF + 20, 250]]))
     west = predict_route(found, *lat_lon(site, [[HALF + 20, 250], [HALF, 250]]))
     assert abs(east.availability - west.availability) > 0.1

@@ -13,7 +13,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
 from engine import Camera, OrthoMap
-from engine.audit.availability import Flag, audit_map, predict_route
+from engine.audit.availability import Flag, audit_site, predict_route
 from engine.audit.plan import AuditOptions, MapPart, plan_audit
 from engine.cli.app import run
 from engine.errors import OptionError
@@ -92,8 +92,8 @@ def test_a_part_at_the_edge_ends_with_the_map(site):
 @pytest.mark.slow
 def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(site):
     route = lat_lon(site, [[200, 250], [640, 300], [700, 650]])
-    whole = audit_map(site, CAMERA, HEIGHT_M)
-    part = audit_map(site, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
+    whole = audit_site(site, CAMERA, HEIGHT_M)
+    part = audit_site(site, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
     assert len(part.plan) < 0.5 * len(whole.plan)
     told, expected = (predict_route(one, *route.T) for one in (part, whole))
     assert told.length_m == expected.length_m
