@@ -49,7 +49,9 @@ def flight(tmp_path_factory):
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, id=page_name(page), marks=[pytest.mark.slow] if page.stem == "simulator" else [])
+        pytest.param(
+            page, id=page_name(page), marks=[pytest.mark.slow] if page.stem in ("simulator", "own-matcher") else []
+        )
         for page in PAGES
         if FENCE.search(page.read_text(encoding="utf-8"))
     ],

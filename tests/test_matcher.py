@@ -677,6 +677,7 @@ def town_projections(tmp_path_factory, sim_town):
     return projections(tmp_path_factory.mktemp("town"), gray, sim_town.pixel_to_crs, sim_town.crs_epsg)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "mean_m", "most_m"), [("ncc", 0.05, 0.1), ("sift", 0.2, 1.0)])
 def test_a_town_gives_the_same_fixes_in_any_projection(town_projections, sim_flight, method, mean_m, most_m):
     """SIFT picks other features of a picture that was resampled; all frames share them, and so their errors."""

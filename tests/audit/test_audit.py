@@ -98,6 +98,7 @@ def test_more_lead_and_more_score_never_make_a_fix_less_probable():
     assert np.isnan(fix_probability(20.0, 15.0, np.nan))
 
 
+@pytest.mark.slow
 def test_fine_random_texture_is_less_stable_than_a_town(town_gray):
     rng = np.random.default_rng(1)
     leaves = np.clip(90 + 25 * rng.normal(size=(600, 600)), 0, 255).astype(np.uint8)
@@ -179,6 +180,7 @@ def test_off_the_map_nothing_is_available(site, found):
     assert route.stretches[0].flag == "edge"
 
 
+@pytest.mark.slow
 def test_where_a_forward_camera_looks_counts_not_where_it_is(site):
     """A camera that is mounted 20 degrees ahead sees the water before it is over it, whichever way it flies."""
     turn = cv2.Rodrigues(np.array([0.0, np.radians(20.0), 0.0]))[0]

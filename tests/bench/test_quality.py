@@ -126,6 +126,7 @@ def test_pairs_with_the_map_show_the_same_ground_where_their_map_says(size):
     assert min(correlation(pair) for pair in map_pairs(size, 4)) > 0.8
 
 
+@pytest.mark.slow
 def test_every_detector_finds_a_blob_where_it_is():
     """OpenCV's and kornia's own biases are below half a pixel; x for y, or a corner for a centre, is more."""
     v, u = np.mgrid[:160, :160]

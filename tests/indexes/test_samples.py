@@ -48,6 +48,7 @@ def test_a_level_may_end_anywhere_beyond_a_cell(more_px, by_cells):
     assert len(blocks) == len(expected)
 
 
+@pytest.mark.slow
 def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
     """The worker that a live flight left behind may still be at work beside the one that replaced it."""
     sampled, _ = make_map(3 * CELL_PX, 3 * CELL_PX)

@@ -192,6 +192,7 @@ def sub_pixel_errors():
     return errors
 
 
+@pytest.mark.slow
 def test_positions_below_the_pixel_are_within_a_twentieth(sub_pixel_errors):
     assert np.sqrt(np.mean(sub_pixel_errors**2)) <= 0.05
 

@@ -128,6 +128,7 @@ def test_what_the_command_line_gives_holds_for_every_run(tmp_path):
     assert [settings.budget_ms for settings in runs.values()] == [121.0, 121.0]
 
 
+@pytest.mark.slow
 def test_a_chart_without_truth_and_without_a_single_fix(flight, tmp_path):
     out = tmp_path / "late"
     assert run(command(flight, out, "--run=ncc", "--budget-ms=0.001")) == 0

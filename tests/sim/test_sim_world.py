@@ -221,6 +221,7 @@ def test_the_sun_flashes_where_water_mirrors_it():
     assert dry.max() == 30
 
 
+@pytest.mark.slow
 def test_a_flight_over_hills_tells_the_height_above_the_ground_below(hilly):
     style = FlightStyle(height_agl_m=80.0)
     plan = plan_flight(3, town=hilly, frames=60, rate_hz=0.4, noise=PERFECT, style=style)
