@@ -15,9 +15,10 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.features import plans_created
 from engine.kernels import loops_compiled
-from engine.methods import Method, method_type
+from engine.methods import method_type
 from engine.methods.costs import Costs
 from engine.methods.explanation import Explanation
+from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.scheduler import Scheduler
@@ -150,7 +151,6 @@ class SceneMatcher:
         Raises:
             OptionError: the matcher has no such method.
         """
-        explained = self._method.parts.get(method or self.method, self._method)
         if method not in (None, self.method, *self._method.parts):
             known = ", ".join(self._method.parts or [self.method])
             raise OptionError(f"method: expected one of this matcher's ({known}), got {method!r}")
@@ -158,7 +158,7 @@ class SceneMatcher:
         east, north = self.site.enu_from_pixel(middle_px)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=0.0)
         query = self._query(frame, prior, Deadline(Budget()))
-        return explained.explain(query, window)
+        return self._method.parts.get(method or self.method, self._method).explain(query, window)
 
     def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
         scheduler = Scheduler(deadline, self.device, self._costs)

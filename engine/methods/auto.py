@@ -10,6 +10,7 @@ import torch
 
 from engine.acceptance import are_consistent
 from engine.methods.explanation import Explanation
+from engine.methods.method import Method
 from engine.methods.ncc import Ncc
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
@@ -18,7 +19,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Reason, Result, Window
 
 
-class Auto:
+class Auto(Method):
     """NCC where height and heading are known, then SIFT where there is time; two fixes must agree.
 
     Args:
@@ -32,7 +33,7 @@ class Auto:
         self.sift = Sift(site, device, options)
 
     @property
-    def parts(self) -> Mapping[str, Ncc | Sift]:
+    def parts(self) -> Mapping[str, Method]:
         """Both, by name."""
         return {"ncc": self.ncc, "sift": self.sift}
 
@@ -43,8 +44,8 @@ class Auto:
 
     def prepare(self) -> None:
         """Prepare both methods' indexes of the map."""
-        self.ncc.prepare()
-        self.sift.prepare()
+        for part in self.parts.values():
+            part.prepare()
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step of both methods; without a prior, the search of the map."""

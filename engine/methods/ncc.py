@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Never
 
 import torch
 
@@ -16,11 +14,12 @@ from engine.indexes.samples import SampleMap
 from engine.methods import hypothesis_search
 from engine.methods.correlation import METHOD, Aligned, Correlator
 from engine.methods.explanation import Explanation, explain_correlation
+from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.orthomap import OrthoMap
-from engine.values import Attitude, Fix, NoFix, Peak, Reason, Result, Window
+from engine.values import Fix, NoFix, Peak, Reason, Result, Window
 from engine.window import SPREAD_SIGMAS
 
 MAX_WINDOW_PX = 8 << 20
@@ -48,7 +47,7 @@ class PeakCandidate:
     searched: bool
 
 
-class Ncc:
+class Ncc(Method):
     """Normalised cross-correlation; needs height and heading, or the time to search for the heading.
 
     Args:
@@ -63,17 +62,9 @@ class Ncc:
         self.samples = SampleMap(site, self.prepared)
 
     @property
-    def parts(self) -> Mapping[str, Never]:
-        """None: it is one method."""
-        return {}
-
-    @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""
         return {"map regions": self.prepared.created, "sampled cells": self.samples.created}
-
-    def prepare(self) -> None:
-        """Nothing: regions of the map are prepared as they are first searched."""
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known.
@@ -233,14 +224,13 @@ class Ncc:
         peak_px2 = peak_covariance_px(peak, rows * columns)
         peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)
         covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
-        attitude = Attitude(pose.roll_deg or 0.0, pose.pitch_deg or 0.0, pose.grid_heading_deg or 0.0)
         return query.fix(
             METHOD,
             correlator.nadir_px(peak, aligned),
             covariance,
             score=peak.score,
             window=window,
-            grid_attitude=attitude if searched else None,
+            grid_attitude=pose.grid_attitude if searched else None,
         )
 
     def _expected_window_px(self, query: Query) -> dict[int, float]:

@@ -7,12 +7,8 @@ frame, Lowe's ratio, flat ground, ``solvePnPRansac``. Neither refuses a match th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Never
-
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
@@ -23,9 +19,8 @@ from engine.methods.explanation import (
     rectified_frame,
     score_surface,
 )
-from engine.methods.options import MatcherOptions
+from engine.methods.method import Method
 from engine.methods.query import Query
-from engine.orthomap import OrthoMap
 from engine.values import Attitude, Reason, Result, Window
 
 Array = NDArray[np.float64]
@@ -42,30 +37,7 @@ _MAX_DISTANCE_M = 1e6
 _COVARIANCE_M2 = SIGMA_M**2 / 2.0 * np.eye(3)
 
 
-class _Paper:
-    """What both recipes share: there is nothing to prepare, to compile or to keep."""
-
-    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
-        del site, device, options  # the recipe has no settings
-
-    @property
-    def parts(self) -> Mapping[str, Never]:
-        """None: it is one method."""
-        return {}
-
-    @property
-    def cache_counters(self) -> dict[str, int]:
-        """None: nothing is kept."""
-        return {}
-
-    def prepare(self) -> None:
-        """Nothing."""
-
-    def warmup(self, query: Query) -> None:
-        """Nothing."""
-
-
-class PaperNcc(_Paper):
+class PaperNcc(Method):
     """The paper's NCC."""
 
     def locate(self, query: Query) -> Result:
@@ -99,7 +71,7 @@ class PaperNcc(_Paper):
         return Explanation(query.gray, template, outline_of(corner + scores.peak_px, template), scores)
 
 
-class PaperSift(_Paper):
+class PaperSift(Method):
     """The paper's SIFT."""
 
     def locate(self, query: Query) -> Result:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Never
 
 import torch
 
@@ -12,6 +10,7 @@ from engine.acceptance import judge_pose
 from engine.indexes.landmarks import LandmarkMap
 from engine.methods.explanation import Explanation, explain_features
 from engine.methods.feature_pose import METHOD, FeatureMatcher, PoseCandidate
+from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
 from engine.orthomap import OrthoMap
@@ -20,7 +19,7 @@ from engine.values import Fix, NoFix, Result, Window
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
 
 
-class Sift:
+class Sift(Method):
     """Scale-invariant features and PnP; needs neither height nor heading.
 
     Args:
@@ -32,11 +31,6 @@ class Sift:
     def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
         self.options = options.sift
         self.landmarks = LandmarkMap(site, device)
-
-    @property
-    def parts(self) -> Mapping[str, Never]:
-        """None: it is one method."""
-        return {}
 
     @property
     def cache_counters(self) -> dict[str, int]:
