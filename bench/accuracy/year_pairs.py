@@ -1,4 +1,4 @@
-"""Pictures of one year matched on the map of another: how many are answered, and what is wrong of those without answer.
+"""Pictures of one year matched on the map of another: how many are answered, and how many answers are wrong.
 
     python -m bench.accuracy.year_pairs [--half report|fit] [--set naip-cities|naip] [--methods NCC,SIFT]
                                         [--matches N] [--seed N] [--json FILE]
@@ -49,7 +49,7 @@ def matched(source: str, half: str, methods: list[str], matches: int, seed: int 
         other = _other(drawn, index)
         bench, rng = Bench(pair.ground, other.ground), np.random.default_rng([seed, 1, index])
         for number in range(begin, end):
-            made, _ = trial(pair, other, number, rng)
+            made = trial(pair, other, number, rng)
             for method in methods:
                 start = time.perf_counter()
                 row = _plain(bench, made) if method == PLAIN else bench.judged(made, method)
@@ -107,8 +107,8 @@ def summary(rows: list[Timed]) -> list[str]:
     ]
 
 
-HEAD = ["set, method", "matches", "best candidate right", "availability", "wrong", "availability at 0 wrong (threshold)",
-        "ECE", "median error", "ms"]  # fmt: skip
+HEAD = ["set, method", "matches", "best candidate right", "availability", "wrong",
+        "availability at 0 wrong (threshold)", "ECE", "median error", "ms"]  # fmt: skip
 
 
 def main() -> None:

@@ -34,7 +34,10 @@ PRIOR_SIGMA_M = 15.0
 SIDES_M = {"naip-cities": (95.0, 144.0), "naip": (127.0, 185.0)}  # of a frame on the ground; chips are 154 m
 FOV_DEG = 60.0
 TILT_SD_DEG, HEIGHT_SHARE_SD, ATTITUDE_SD_DEG = 2.0, 0.007, (0.3, 0.3, 0.5)
+MAX_SHARE = 3.0  # of frames of a larger place
 _TRIES = 400
+# Weights of the corners of a quadrilateral: points along its edges and in its middle.
+_ALONG = np.array([np.roll([1 - t, t, 0, 0], k) for k in range(4) for t in (0.02, 0.35, 0.65)] + [[0.25] * 4])
 UNANSWERABLE = ("another place", "mirrored", "turned by 180 degrees", "prior elsewhere")
 
 
@@ -68,7 +71,7 @@ def pairs(source: str, half: str, frames: int = 8, seed: int = 0) -> Iterator[Ye
     Args:
         source: one of :data:`SETS`.
         half: "fit" or "report".
-        frames: of a single chip; a larger place has more in proportion.
+        frames: of a single chip; a larger place has up to :data:`MAX_SHARE` times as many.
         seed: of places, heights and errors.
     """
     for index, place in enumerate(places(half) if source == "naip-cities" else [source]):
@@ -82,7 +85,8 @@ def _ground(source: str, half: str, place: str, seen: str, mapped: str, frames: 
     taken, site = (opened(source, half, place, year) for year in (seen, mapped))
     shift_px = shift(place, seen, mapped) if source == "naip-cities" else np.zeros(2)
     camera, out, where = Camera.from_fov(300, 300, FOV_DEG), [], []
-    for _ in range(max(frames, round(frames * taken.width_px * taken.height_px / 256**2))):
+    share = min(MAX_SHARE, max(1.0, taken.width_px * taken.height_px / 256**2))
+    for _ in range(round(frames * share)):
         drawn = _drawn(taken, camera, SIDES_M[source], rng)
         if drawn is not None:
             frame, place_px = drawn
@@ -105,6 +109,9 @@ def _drawn(taken: OrthoMap, camera: Camera, sides_m: tuple[float, float], rng: R
         if (low > high).any():
             continue
         place_px = rng.uniform(low, high)
+        columns, rows = (place_px + _ALONG @ reach_px).astype(int).T
+        if not valid[rows, columns].all():
+            continue  # most gaps, found without drawing anything
         place_m = taken.enu_from_pixel(place_px)
         if not picture(valid, taken, camera, place_m, *pose).all():
             continue
@@ -156,26 +163,26 @@ def shift(place: str, seen: str, mapped: str) -> Array:
     return -np.median(np.array(back), axis=0) if back else np.zeros(2)
 
 
-def trial(pair: YearPair, other: YearPair, number: int, rng: Rng) -> tuple[Trial, Ground]:
-    """One match, and the ground whose map it is on: every second has an answer."""
+def trial(pair: YearPair, other: YearPair, number: int, rng: Rng) -> Trial:
+    """One match: every second has an answer."""
     here = pair.ground
     index = int(rng.integers(len(here.frames)))
     frame, place = here.frames[index], here.places_m[index]
     kind = "another year" if number % 2 == 0 else UNANSWERABLE[number // 2 % len(UNANSWERABLE)]
     if kind == "another year":
-        return Trial(kind, "own", frame, _prior(place, rng), place), here
+        return Trial(kind, "own", frame, _prior(place, rng), place)
     if kind == "mirrored":
         image = np.ascontiguousarray(np.asarray(frame.image)[:, ::-1])
-        return Trial(kind, "own", replace(frame, image=image), _prior(place, rng), None), here
+        return Trial(kind, "own", replace(frame, image=image), _prior(place, rng), None)
     if kind == "turned by 180 degrees":
         turned = replace(frame, heading_deg=(frame.heading_deg or 0.0) + 180.0)
-        return Trial(kind, "own", turned, _prior(place, rng), place), here
+        return Trial(kind, "own", turned, _prior(place, rng), place)
     far = [p for p in here.places_m if np.hypot(*(p - place)) > 4.0 * PRIOR_SIGMA_M]
     if kind == "prior elsewhere" and far:
-        return Trial(kind, "own", frame, _prior(far[int(rng.integers(len(far)))], rng), place), here
+        return Trial(kind, "own", frame, _prior(far[int(rng.integers(len(far)))], rng), place)
     there = other.ground
-    return Trial("another place", "other", frame, _prior(there.places_m[int(rng.integers(len(there.places_m)))], rng),
-                 None), there  # fmt: skip
+    there_m = there.places_m[int(rng.integers(len(there.places_m)))]
+    return Trial("another place", "other", frame, _prior(there_m, rng), None)
 
 
 def _prior(place_m: Array, rng: Rng) -> Prior:
