@@ -23,14 +23,17 @@ from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
 from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
+from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
-from engine import Frame, OrthoMap, Prior
+from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.device import set_threads
 from engine.formats.flight import Flight
-from engine.formats.track import read_track
+from engine.formats.track import TrackRow, read_track, track_row
 from engine.formats.truth import interpolate_truth
+from engine.navigator import ACCEPT_ALL
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from engine.runs import FlightFiles, TrackSettings, track
+from engine.runs.arguments import parse_position
 from engine.runs.inputs import FlightInputs, open_inputs
 from engine.values import Window
 
@@ -118,13 +121,37 @@ def fly(name: str, method: str, step: int, weights: Path | None) -> Figures:
     )
     if method == "learned":
         settings = replace(settings, sift=replace(settings.sift, weights=str(weights)))
-    with tempfile.TemporaryDirectory() as out:
-        track(files, out, settings, force=True, report=False, inputs=inputs)
-        rows = read_track(Path(out) / "track.csv")
+    rows = _middles(inputs, settings) if name in MIDDLE else _tracked(files, inputs, settings)
     errors = errors_en_m(rows, inputs.truth, inputs.site.frame)
     spent = [row.latency_ms for row in rows if row.latency_ms is not None]
     squared = None if paper else errors.normalised_squared_errors
     return figures((name, method, step), errors.distance_m, squared, spent)
+
+
+def _tracked(files: FlightFiles, inputs: FlightInputs, settings: TrackSettings) -> list[TrackRow]:
+    with tempfile.TemporaryDirectory() as out:
+        track(files, out, settings, force=True, report=False, inputs=inputs)
+        return read_track(Path(out) / "track.csv")
+
+
+def _middles(inputs: FlightInputs, settings: TrackSettings) -> list[TrackRow]:
+    """The rows of the same track with each fix moved to the ground in the middle of its frame, as the truth is.
+
+    A fix with a pose is the vehicle's position, and the file of a track does not hold the pose's attitude.
+    """
+    matcher = SceneMatcher(inputs.site, inputs.camera, settings.method, "cpu", settings.matcher_options())
+    matcher.warmup()
+    options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
+    navigator = Navigator(matcher, parse_position("start", settings.start), None, options)
+    rows = []
+    for item in inputs.flight:
+        begin = time.perf_counter()
+        result = navigator.update(item.frame, item.prior)
+        spent_ms = (time.perf_counter() - begin) * 1e3
+        if isinstance(result, Fix):
+            result = moved_to_middle(result, inputs.site, inputs.camera)
+        rows.append(track_row(item.name, result, latency_ms=spent_ms, deadline_met=None))
+    return rows
 
 
 def _start(inputs: FlightInputs) -> str | None:

@@ -34,7 +34,8 @@ INTRO = (
 FIGURES = (
     "Median and RMS are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **outside** those "
     "outside the ellipse of three of their own sigmas. In brackets: before, where it differs. The campus's truth "
-    "is good to about a metre and is the ground in the middle of each frame, not what lies below the vehicle."
+    "is good to about a metre and is the ground in the middle of each frame, not what lies below the vehicle: "
+    "fixes there that have a pose are moved to where their own axis meets the ground."
 )
 PEERS = (
     "`paper's NCC` and `paper's SIFT` are `--profile paper`: the paper's recipe by OpenCV, which refuses almost "
