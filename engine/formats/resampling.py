@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import TelemetryError
-from engine.formats.telemetry import TelemetryRow
+from engine.formats.telemetry import TelemetryRow, take_off_sigma_m
 from engine.formats.truth import truth_from_telemetry
 from engine.geo import wrap_heading_deg
 from engine.values import Truth
@@ -31,7 +31,10 @@ UTC_FROM_NS = 10**18
 HEIGHT_SOURCES = ("rangefinder", "terrain", "take-off")
 """Sources of the height above ground, best first: measured, by a terrain model, above take-off."""
 _ANGLES = ("heading_deg", "roll_deg", "lon_deg")
-_COLUMNS = ("alt_amsl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
+_COLUMNS = (
+    "alt_amsl_m", "heading_deg", "heading_sigma_deg", "roll_deg", "pitch_deg", "tilt_sigma_deg",
+    "east_velocity_mps", "north_velocity_mps",
+)  # fmt: skip
 _POSITION = ("lat_deg", "lon_deg", "sigma_m")
 
 Floats = NDArray[np.float64]
@@ -204,6 +207,9 @@ def telemetry_at(
         )
     columns = {name: _column(log, name, times_ns) for name in (*_COLUMNS, *_POSITION)}
     columns["height_agl_m"], sources = _height(log, times_ns, columns["roll_deg"], columns["pitch_deg"])
+    above_take_off = np.array([source == "take-off" for source in sources])
+    vague_m = np.array([take_off_sigma_m(height_m) for height_m in columns["height_agl_m"]])
+    columns["height_sigma_m"] = np.where(above_take_off, vague_m, np.nan)
     columns["sigma_m"][columns["sigma_m"] < 0.0] = np.nan
     unknown = np.isnan(columns["lat_deg"]) | np.isnan(columns["lon_deg"])
     for name in _POSITION:

@@ -22,8 +22,9 @@ from engine.errors import (
     TelemetryError,
 )
 from engine.formats.flight import open_flight, write_flight_folder
-from engine.formats.frames import exif_telemetry, open_frames, read_image
+from engine.formats.frames import open_frames, read_image
 from engine.formats.geotiff import write_geotiff
+from engine.formats.photos import exif_telemetry
 from engine.formats.telemetry import (
     DEFAULT_PRIOR_SIGMA_M,
     TelemetryRow,

@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 
 from engine.errors import TelemetryError
-from engine.formats.frames import nadir_attitude
+from engine.formats.photos import gimbal_columns
 from engine.formats.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
 
 _NUMBER = r"([+-]?[0-9]{1,18}(?:\.[0-9]{1,18})?)"
@@ -25,6 +25,7 @@ _GPS = re.compile(rf"\bGPS ?\( ?{_NUMBER} ?, ?{_NUMBER} ?(?:,[^)]{{0,40}})?\)")
 _HEIGHT = re.compile(rf"\bBAROMETER ?: ?{_NUMBER}|\bH {_NUMBER} ?m\b")
 _MARKUP = re.compile(r"<[^>]{0,200}>")
 _ANGLES = ("gb_roll", "gb_pitch", "gb_yaw")
+_GIMBAL_COLUMNS = ("roll_deg", "pitch_deg", "heading_deg", "heading_sigma_deg", "tilt_sigma_deg")
 
 
 def read_srt(path: Path) -> FlightLog:
@@ -52,7 +53,7 @@ def read_srt(path: Path) -> FlightLog:
     nan = [float("nan")] * len(cues)
     lat_deg = [cue.get("latitude", none) for cue, none in zip(cues, nan, strict=True)]
     lon_deg = [cue.get("longitude", none) for cue, none in zip(cues, nan, strict=True)]
-    angles = {name: series(name) for name in ("roll_deg", "pitch_deg", "heading_deg")}
+    angles = {name: series(name) for name in _GIMBAL_COLUMNS}
     known = angles | {"alt_amsl_m": series("abs_alt")} | make_position_series(stamps_ns, lat_deg, lon_deg)
     return make_log(path, known, {"take-off": series("rel_alt")})
 
@@ -73,6 +74,6 @@ def _values(cue: str) -> dict[str, float]:
     if "rel_alt" not in values and (height := _HEIGHT.search(cue)):
         values["rel_alt"] = float(height.group(1) or height.group(2))
     if all(name in values for name in _ANGLES):
-        roll_deg, pitch_deg, heading_deg = nadir_attitude(*(values[name] for name in _ANGLES))
-        values |= {"roll_deg": roll_deg, "pitch_deg": pitch_deg, "heading_deg": heading_deg}
+        columns = gimbal_columns(*(values[name] for name in _ANGLES)) or {}
+        values |= {name: value for name, value in columns.items() if value is not None}
     return values

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import OptionError, TelemetryError
-from engine.formats.frames import FrameSource, VideoFile, exif_telemetry
+from engine.formats.frames import FrameSource, VideoFile
 from engine.formats.logs.dataflash import read_dataflash
 from engine.formats.logs.dji_srt import read_srt
 from engine.formats.logs.ulog import read_ulog
+from engine.formats.photos import exif_telemetry
 from engine.formats.resampling import UTC_FROM_NS, FlightLog, truth_from_log
 from engine.formats.ros.bags import BagFrames, is_bag, read_bag
 from engine.formats.telemetry import read_telemetry
