@@ -65,7 +65,7 @@ def mount_rotation(name: str = "nadir", pitch_deg: float | None = None) -> Array
     sin_s, cos_s = np.sin(np.radians(side_deg)), np.cos(np.radians(side_deg))
     pitched = np.array([[0.0, sin_p, cos_p], [1.0, 0.0, 0.0], [0.0, cos_p, -sin_p]])
     turned = np.array([[cos_s, -sin_s, 0.0], [sin_s, cos_s, 0.0], [0.0, 0.0, 1.0]])
-    return np.round(turned @ pitched, 15) + 0.0  # quarter turns are whole numbers
+    return np.asarray(np.round(turned @ pitched, 15) + 0.0, np.float64)  # quarter turns are whole numbers
 
 
 def _nadir_mount() -> Array:

@@ -245,10 +245,14 @@ def gimbal_columns(roll_deg: float, pitch_deg: float, yaw_deg: float) -> dict[st
     """
     if roll_deg == pitch_deg == yaw_deg == 0.0:
         return None
-    columns = dict(
-        zip(("roll_deg", "pitch_deg", "heading_deg"), nadir_attitude(roll_deg, pitch_deg, yaw_deg), strict=True)
-    )
-    return columns | {"heading_sigma_deg": COMPASS_SIGMA_DEG, "tilt_sigma_deg": GIMBAL_SIGMA_DEG}
+    body_roll_deg, body_pitch_deg, heading_deg = nadir_attitude(roll_deg, pitch_deg, yaw_deg)
+    return {
+        "roll_deg": body_roll_deg,
+        "pitch_deg": body_pitch_deg,
+        "heading_deg": heading_deg,
+        "heading_sigma_deg": COMPASS_SIGMA_DEG,
+        "tilt_sigma_deg": GIMBAL_SIGMA_DEG,
+    }
 
 
 def nadir_attitude(

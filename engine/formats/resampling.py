@@ -65,6 +65,7 @@ class FlightLog:
             the body's down axis.
         captures_ns: (N,) times of camera triggers; empty where none were logged.
         utc_ns: offset that converts the log's clock to UTC; None where it is unknown.
+        frame_numbers: numbers of a video's frames, the first is 1, over time; None but for a video's subtitles.
     """
 
     path: Path
@@ -72,6 +73,7 @@ class FlightLog:
     heights: Mapping[str, TimeSeries] = field(default_factory=dict)
     captures_ns: Stamps = field(default_factory=lambda: np.empty(0, np.int64))
     utc_ns: int | None = None
+    frame_numbers: TimeSeries | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -98,6 +100,7 @@ def make_log(
     heights: Mapping[str, TimeSeries | None],
     captures_ns: ArrayLike = (),
     utc_ns: int | None = None,
+    frame_numbers: TimeSeries | None = None,
 ) -> FlightLog:
     """Create a log from the series that are not None.
 
@@ -107,6 +110,7 @@ def make_log(
         heights: height above ground in metres by source.
         captures_ns: (N,) times of camera triggers.
         utc_ns: offset that converts the log's clock to UTC, or None.
+        frame_numbers: numbers of a video's frames over time, or None.
 
     Raises:
         TelemetryError: all series are None.
@@ -117,7 +121,8 @@ def make_log(
         raise TelemetryError(
             f"{path}: expected attitude, height, velocity or position, got a log with none of them"
         )
-    return FlightLog(path, known, known_heights, np.unique(np.asarray(captures_ns, np.int64)), utc_ns)
+    captures = np.unique(np.asarray(captures_ns, np.int64))
+    return FlightLog(path, known, known_heights, captures, utc_ns, frame_numbers)
 
 
 def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True) -> TimeSeries | None:

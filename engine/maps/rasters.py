@@ -138,23 +138,22 @@ def open_source(
         transform, own_crs = dataset.transform, dataset.crs
     size = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
-    if bounds_deg is not None or bounds_crs is not None:
-        name = "bounds_deg" if bounds_deg is not None else "bounds_crs"
-        if own is not None:
-            raise MapError(f"{name}: expected none for a file with a georeference of its own, {file}")
+    if own is not None:
+        for name, bounds in (("bounds_deg", bounds_deg), ("bounds_crs", bounds_crs)):
+            if bounds is not None:
+                raise MapError(f"{name}: expected none for a file with a georeference of its own, {file}")
+        grid = Grid(*size, own, _crs_of(file, argument, own_crs, crs))
+    elif bounds_deg is not None or bounds_crs is not None:
         found = earth_crs(crs if crs is not None else "EPSG:4326", "crs")
-        if bounds_deg is not None:
-            own = _from_degrees(bounds_deg, found, *size)
-        elif bounds_crs is not None:
-            own = _from_bounds(bounds_crs, *size)
-    elif own is not None:
-        found = _crs_of(file, argument, own_crs, crs)
+        edges = bounds_crs if bounds_deg is None else _from_degrees(bounds_deg, found, *size)
+        assert edges is not None  # one of the two was given
+        grid = Grid(*size, _from_edges(edges, *size), found)
     else:
         raise MapError(
             f"{argument}: {file} is a picture without georeference; give `bounds_deg` (west, south, east, "
             "north), or a world file and its CRS (control points and RPCs are not used: gdalwarp them first)"
         )
-    return Source(file, dataset, _checked(Grid(*size, own, found), argument, file))
+    return Source(file, dataset, _checked(grid, argument, file))
 
 
 def _open_dataset(file: Path, argument: str) -> Any:
@@ -200,7 +199,8 @@ def _crs_of(file: Path, argument: str, own: Any, given: Any) -> CRS:
     )
 
 
-def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Array:
+def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Bounds:
+    """The outer edges in the units of the CRS, where the picture has upright ones there."""
     from pyproj import Transformer
 
     west, south, east, north = bounds_deg
@@ -214,10 +214,10 @@ def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Arra
         raise MapError(
             f"bounds_deg: the corners are no rectangle in crs {crs.name!r}; expected bounds in its own units"
         )
-    return _from_bounds((x[0], y[1], x[1], y[0]), width, height)
+    return float(x[0]), float(y[1]), float(x[1]), float(y[0])
 
 
-def _from_bounds(bounds: Bounds, width: int, height: int) -> Array:
+def _from_edges(bounds: Bounds, width: int, height: int) -> Array:
     """The affine of pixel centres from the outer edges."""
     west, south, east, north = bounds
     step_x, step_y = (east - west) / width, (south - north) / height

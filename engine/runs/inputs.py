@@ -249,14 +249,21 @@ def open_map(
             f"map_sigma_m: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {map_sigma_m:g}"
         )
     corners = parse_bounds("map_bounds", bounds)
-    kind = "bounds_deg" if crs is None or corners is None or is_in_degrees(corners) else "bounds_crs"
-    places = {"crs": crs} | ({} if corners is None else {kind: corners})
+    in_degrees = crs is None or corners is None or is_in_degrees(corners)
     try:
         with (
             progress.task("copying the map into the cache") as update,
             renamed_in_errors(bounds_deg="map_bounds", bounds_crs="map_bounds", crs="map_crs"),
         ):
-            return OrthoMap.open(path, surface, georeference_sigma_m=map_sigma_m, on_copy=update, **places)
+            return OrthoMap.open(
+                path,
+                surface,
+                bounds_deg=corners if in_degrees else None,
+                bounds_crs=None if in_degrees else corners,
+                crs=crs,
+                georeference_sigma_m=map_sigma_m,
+                on_copy=update,
+            )
     except MapError as error:
         if str(error).startswith(("map_bounds:", "map_crs:")):
             raise OptionError(str(error)) from None
