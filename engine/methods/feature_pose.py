@@ -154,14 +154,15 @@ class FeatureMatcher:
         )
         if not options.use_attitude:
             return solve()
-        heading_deg, sigma_deg = query.telemetry.grid_heading_deg, options.errors.heading_deg
+        errors = query.errors(options.errors)
+        heading_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
         if heading_deg is None or hypothesis.x_axis_deg is None:
             free = solve()
             if free is None:
                 return None
             heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
             sigma_deg = _MATCHED_HEADING_SIGMA_DEG
-        return solve(prior=query.attitude_prior(heading_deg, sigma_deg, options.errors))
+        return solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
 
     def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
         """The camera's centre as a fix; refused where a drone over this map cannot be there."""
@@ -190,7 +191,8 @@ class FeatureMatcher:
 
     def _with_confidence(self, fix: Fix, stats: PoseStats, hypothesis: TelemetryHypothesis) -> PoseCandidate:
         """The candidate of a fix; a height that is doubted in this hypothesis does not count."""
-        query, errors, height_m = self.query, self.options.errors, self.query.telemetry.height_agl_m
+        query, height_m = self.query, self.query.telemetry.height_agl_m
+        errors = query.errors(self.options.errors)
         height_chi_square = None
         if height_m is not None and hypothesis.height_m == height_m:
             assert fix.up_m is not None
