@@ -16,7 +16,8 @@ from engine.formats.settings import changed
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackWriter, read_track, track_row
 from engine.matcher import SceneMatcher
-from engine.navigator import ACCEPT_ALL, Navigator
+from engine.navigator import Navigator
+from engine.navigator_options import ACCEPT_ALL
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from engine.report.metrics import Ground
 from engine.runs.arguments import parse_budget, parse_position
@@ -145,8 +146,7 @@ def _follow(
         navigator: fresh.
         out: the folder of track.csv and notes.csv.
         budget: of each frame.
-        use_priors: whether the flight may begin at the telemetry's position; once it has begun, the fixes
-            carry on.
+        use_priors: whether the telemetry's own positions count; a start that was given stands in their place.
         view: is shown each frame once it is answered.
 
     Returns:
@@ -160,7 +160,6 @@ def _follow(
             begin = time.perf_counter()
             result = _update(navigator, item, prior)
             latency_ms = (time.perf_counter() - begin) * 1e3
-            use_priors = use_priors and not navigator.tracking
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
             attitudes.append(attitude_row(item.frame, result))
