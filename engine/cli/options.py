@@ -19,7 +19,11 @@ CameraOption = Annotated[
     Path, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
 ]
 MethodOption = Annotated[
-    str, typer.Option("--method", metavar="ncc|sift|auto", help="auto is ncc, and sift where ncc refuses.")
+    str, typer.Option("--method", metavar="ncc|sift|auto|learned", help="auto is ncc, and sift where ncc refuses.")
+]
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option("--weights", metavar="FILE", help="Of method learned: once for each file that it takes."),
 ]
 DeviceOption = Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live.")]
 BudgetOption = Annotated[

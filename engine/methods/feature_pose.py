@@ -16,8 +16,8 @@ from engine.covariance import AssumedErrors
 from engine.features import match, sift
 from engine.geo import attitude_from_rotation
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
-from engine.learned import PairMatcher
 from engine.methods.options import MIN_HEIGHT_M, SiftOptions
+from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import MapView, TelemetryHypothesis, view_in, views_of, x_axis_deg
 from engine.orthomap import OrthoMap
@@ -87,18 +87,22 @@ class FeatureMatcher:
 
     Attributes:
         query: the frame.
-        landmarks: of the map.
+        landmarks: of the map; None where a finder takes their place.
         options: settings.
+        finder: finds the matched points in place of features.
+        method: what fixes and refusals name.
     """
 
     query: Query
-    landmarks: LandmarkMap
+    landmarks: LandmarkMap | None
     options: SiftOptions
+    finder: PointFinder | None = None
+    method: str = METHOD
 
     def find(self) -> PoseCandidate | NoFix:
         """The pose of the frame, or a refusal where there is none."""
         query, options = self.query, self.options
-        flat = query.refuse_flat(METHOD, options.min_deviation)
+        flat = query.refuse_flat(self.method, options.min_deviation)
         if flat is not None:
             return flat
         height_m, factor = query.telemetry.height_agl_m, options.height_factor
@@ -139,17 +143,21 @@ class FeatureMatcher:
         """Match, lift and solve, with what is assumed of the telemetry."""
         query, options, scheduler = self.query, self.options, self.query.scheduler
         with scheduler.stage("window"):
-            views = views_of(query, hypothesis, METHOD, margin=options.margin, scale=options.scale)
+            views = views_of(query, hypothesis, self.method, margin=options.margin, scale=options.scale)
         if isinstance(views, NoFix):
             return views
+        if self.finder is not None and any(map(self.finder.too_large, views)):
+            pixels = max(view.crop.area_px for view in views)
+            detail = f"a window of {pixels} pixels is more than is searched; a nearer position is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method, window=views[0].window)
         matched = self._match_views(views, hypothesis)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
         if count < options.pose.min_inliers:
             detail = f"{count} matches; {options.pose.min_inliers} are asked for"
-            return query.refuse(Reason.TOO_FEW_MATCHES, detail, METHOD, window=window)
+            return query.refuse(Reason.TOO_FEW_MATCHES, detail, self.method, window=window)
         if scheduler.deadline.remaining_ms < 0:
-            return query.refuse(Reason.LATE, "the budget was spent before the pose", METHOD, window=window)
+            return query.refuse(Reason.LATE, "the budget was spent before the pose", self.method, window=window)
         for found in matched:
             with scheduler.stage("pose"):
                 stats = self._pose(found, hypothesis)
@@ -157,14 +165,15 @@ class FeatureMatcher:
                 fix = self._fix(stats, found.view.window)
                 return fix if isinstance(fix, NoFix) else self._with_confidence(fix, stats, hypothesis)
         detail = f"no pose explains enough of the {count} matches"
-        return query.refuse(Reason.BAD_POSE, detail, METHOD, window=window)
+        return query.refuse(Reason.BAD_POSE, detail, self.method, window=window)
 
     # -------------------------------------------------------------------------------------------- matching
 
     def _match_views(self, views: list[MapView], hypothesis: TelemetryHypothesis) -> list[_Matched]:
-        if self.options.matcher is not None:
-            return self._by_pair_matcher(views, self.options.matcher)
-        return self._by_features(views, hypothesis)
+        finder = self.finder
+        if finder is None and self.options.matcher is not None:
+            finder = PointFinder(self.options.matcher)
+        return self._by_features(views, hypothesis) if finder is None else self._by_finder(views, finder)
 
     def _by_features(self, views: list[MapView], hypothesis: TelemetryHypothesis) -> list[_Matched]:
         """Features of the frame among those of the map, view by view."""
@@ -198,18 +207,14 @@ class FeatureMatcher:
                 matched.append(_Matched(view, points_px, points_m, weights))
         return matched
 
-    def _by_pair_matcher(self, views: list[MapView], matcher: PairMatcher) -> list[_Matched]:
-        """What the user's own matcher finds, view by view."""
-        query, reduced = self.query, self._reduce()
+    def _by_finder(self, views: list[MapView], finder: PointFinder) -> list[_Matched]:
+        """What a matcher of pictures finds, view by view."""
+        site = self.query.site
         matched = []
         for view in views:
-            with query.scheduler.stage("match"), torch.inference_mode():
-                crop = as_picture(query.site.gray(view.crop, view.level), query.device)
-                points, places = (found.cpu().numpy() for found in matcher(reduced.picture, crop))
-                map_px = query.site.full_from_level(places + view.corner_px, view.level)
-                ground_m = _lifted(query.site, map_px)
-                weights = _roughness_weights(query.site, ground_m)
-                matched.append(_Matched(view, reduced.full(points), ground_m, weights))
+            points_px, map_px = finder.find(self.query, view, self.options.scale)
+            ground_m = _lifted(site, map_px)
+            matched.append(_Matched(view, points_px, ground_m, _roughness_weights(site, ground_m)))
         return matched
 
     def _reduce(self) -> _Reduced:
@@ -225,6 +230,7 @@ class FeatureMatcher:
         query, options, site, crop = self.query, self.options, self.query.site, view.crop
         reduced_px = query.gray.size * options.scale**2
         if options.map_features == "prepared":
+            assert self.landmarks is not None  # only a finder does without
             per_px = options.max_keypoints / reduced_px * max(1.0, view.pixel_ratio) ** 2
             return self.landmarks.find(crop, view.level, upright=upright, per_px=per_px)
         count = np.clip(
@@ -271,12 +277,12 @@ class FeatureMatcher:
         tilt = math.degrees(math.acos(float(np.clip(-stats.rotation[2, 2], -1.0, 1.0))))
         if tilt > options.max_tilt_deg or up <= float(site.surface_at(nadir)):
             detail = f"the pose is {tilt:.0f} degrees off the vertical at a height of {up:.0f} m"
-            return query.refuse(Reason.BAD_POSE, detail, METHOD, score=share, window=window)
+            return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
         if not query.telemetry.has_tilt:  # features of a coarse picture err together, as a tilt would
             covariance *= max(1.0, _NOMINAL_SCALE / options.scale) ** 2
         return query.fix(
-            METHOD,
+            self.method,
             nadir,
             covariance,
             score=share,

@@ -34,7 +34,7 @@ class RunRecord:
         image_topic: of the pictures, where the frames are a bag.
         map_sigma_m: georeferencing accuracy of the map, where it was given.
         heights: frames by the source of their height, where the telemetry is a log.
-        method: "ncc", "sift" or "auto".
+        method: "ncc", "sift", "auto" or "learned".
         profile: "engine" or "paper".
         device: where tensors lived.
         start: where the flight began, as typed.
