@@ -14,7 +14,7 @@ from engine.cli.app import app
 from engine.covariance import AssumedErrors
 from engine.formats.track import COLUMNS
 from engine.methods.options import SiftOptions
-from engine.navigator import NavigatorOptions
+from engine.navigator_options import NavigatorOptions
 from engine.pose import PoseOptions
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight

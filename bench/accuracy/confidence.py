@@ -76,9 +76,9 @@ def main() -> None:
             continue
         jobs = [(a, b, each, method) for a, b in zip(FIT_SEEDS, FIT_SEEDS[1:] + FIT_SEEDS[:1], strict=True)]
         with ProcessPoolExecutor(2) as pool:
-            found = [row for part in pool.map(matched, jobs) for row in part if row.terms]
+            found = [row for part in pool.map(matched, jobs) for row in part if row.regressors]
         right = np.array([row.right for row in found])
-        weights = model(*fitted(np.array([row.terms for row in found]), right))
+        weights = model(*fitted(np.array([row.regressors for row in found]), right))
         wrong = int((~right).sum())
         print(f"{weights}\n{each * len(jobs)} matches, {len(found)} found something, {wrong} wrong", flush=True)
 

@@ -110,6 +110,11 @@ class Bench:
             return self.row(made, method, None, False, [], [])
         return self.row(made, method, fix, True, [fix.confidence or 0.0], [])
 
+    def peak(self, made: Trial) -> PeakCandidate | NoFix:
+        """The highest peak of a match by NCC, accepted or not."""
+        matcher = self.matcher(made.on, "NCC")
+        return _part(matcher, "ncc", Ncc).find(_query(matcher, made.frame, made.prior))
+
     def posed(self, made: Trial, frame: Frame, prior: Prior | None, options: SiftOptions) -> Row:
         """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""
         matcher = self.matcher(made.on, "SIFT")

@@ -31,7 +31,7 @@ from engine.runs.results import SUMMARY, TRACK
 from engine.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
 from engine.sim import FlightStyle, Town, picture_at
 from engine.sim.faults import FAULT_KINDS, Fault
-from engine.sim.flight import grid_at
+from engine.sim.flight import NADIR_PITCH_DEG, grid_at
 from engine.sim.light import Image
 from engine.sim.loop import ClosedLoop
 from engine.sim.pilot import plan_rounds
@@ -105,10 +105,12 @@ def fly_closed_loop(
         The figures, as loop.json has them.
     """
     out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
+    if world.camera_pitch_deg != NADIR_PITCH_DEG:
+        raise OptionError(f"camera_pitch_deg: expected none in a closed loop, got {world.camera_pitch_deg:g}")
     check_folder(out, force)
     live_view.check(force=force)
     progress.message("drawing the world")
-    town, camera = world.build(), Camera.from_fov(300, 300, 60.0)
+    town, camera = world.build(), world.camera()
     site = town.site()
     matcher = SceneMatcher(site, camera, loop.method, loop.device)
     matcher.warmup()

@@ -11,7 +11,7 @@ from engine.errors import OptionError
 from engine.formats.settings import read_settings
 from engine.methods import METHODS
 from engine.methods.options import PROFILES, LearnedOptions, MatcherOptions, NccOptions, SiftOptions
-from engine.navigator import NavigatorOptions
+from engine.navigator_options import NavigatorOptions
 from engine.runs.arguments import check_choice, check_device, parse_budget, parse_position
 from engine.runs.folders import StrPath
 

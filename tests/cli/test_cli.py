@@ -212,8 +212,7 @@ def test_track_without_telemetry_reads_the_photographs_exif(copy, tmp_path):
     assert run(track(copy, out, "--method=sift", telemetry=None)) == 0
     rows = cells(out / "track.csv")
     assert [row["timestamp_ns"][-9:] for row in rows] == ["000000000"] * FRAMES
-    assert [row["reason"] for row in rows][:2] == ["unconfirmed"] * 2  # without a position three must agree
-    assert sum(row["status"] == "fix" for row in rows) >= FRAMES - 2
+    assert sum(row["status"] == "fix" for row in rows) == FRAMES  # seconds apart, each of high probability
 
 
 def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsys):

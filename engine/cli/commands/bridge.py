@@ -11,15 +11,19 @@ import typer
 from engine.cli import console
 from engine.cli.options import (
     CameraOption,
+    CameraPitchOption,
     DeadlineOption,
     DeviceOption,
     FirmwareOption,
     JsonOption,
+    MapBoundsOption,
+    MapCrsOption,
     MapOption,
     MapSigmaOption,
     MaxSigmaOption,
     MessageOption,
     MethodOption,
+    MountOption,
     RerunConnectOption,
     RerunOption,
     SecondsOption,
@@ -42,8 +46,12 @@ def mavlink(
     ],
     map_path: MapOption,
     camera: CameraOption,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     frames: Annotated[
         Path | None,
         typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
@@ -108,7 +116,8 @@ def mavlink(
     files = BridgeFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
         camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
-        map_sigma_m=map_sigma_m,
+        map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
+        camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
@@ -149,10 +158,14 @@ def ros(
     version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     camera: Annotated[
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
     ] = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     image: Annotated[
         str, typer.Option("--image-topic", metavar="NAME", help="sensor_msgs/Image.")
     ] = "/camera/image_raw",
@@ -213,7 +226,8 @@ def ros(
     )  # fmt: skip
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
-        firmware=firmware, origin=origin,
+        firmware=firmware, origin=origin, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
+        camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)

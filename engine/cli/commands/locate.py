@@ -10,12 +10,17 @@ import typer
 
 from engine.cli import console
 from engine.cli.options import (
-    CameraOption,
+    CameraPitchOption,
     DeviceOption,
+    HfovOption,
     JsonOption,
+    MapBoundsOption,
+    MapCrsOption,
     MapOption,
     MapSigmaOption,
     MethodOption,
+    MountOption,
+    OptionalCameraOption,
     SurfaceOption,
     ThreadsOption,
     WeightsOption,
@@ -29,9 +34,14 @@ if TYPE_CHECKING:
 def locate(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
     map_path: MapOption,
-    camera: CameraOption,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     height_agl_m: Annotated[
         float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground.")
     ] = None,
@@ -61,7 +71,8 @@ def locate(
 
     use_threads(threads)
     result = locate_image(
-        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, height_agl_m=height_agl_m,
+        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
+        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg, height_agl_m=height_agl_m,
         heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
         weights=weights or (), device=device, progress=console.PROGRESS,
     )  # fmt: skip
