@@ -258,8 +258,8 @@ class Fix:
         covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
         attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
             only the heading is measured; roll and pitch are the frame's, or 0.
-        score: NCC in [-1, 1], or for SIFT the share of inliers.
-        method: "ncc" or "sift".
+        score: NCC in [-1, 1], or of matched points the share of inliers.
+        method: "ncc", "sift" or "learned".
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).

@@ -45,7 +45,11 @@ CameraPitchOption = Annotated[
     typer.Option("--camera-pitch-deg", metavar="DEG", help="Of the camera: -90 looks straight down."),
 ]
 MethodOption = Annotated[
-    str, typer.Option("--method", metavar="ncc|sift|auto", help="auto is ncc, and sift where ncc refuses.")
+    str, typer.Option("--method", metavar="ncc|sift|auto|learned", help="auto is ncc, and sift where ncc refuses.")
+]
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option("--weights", metavar="FILE", help="Of method learned: once for each file that it takes."),
 ]
 DeviceOption = Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live.")]
 BudgetOption = Annotated[

@@ -19,8 +19,8 @@ from engine.align import Orthophoto, Relief, orthorectify
 from engine.features import match, sift
 from engine.geo import enu_from_body, wrap_heading_deg
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
-from engine.learned import PairMatcher
 from engine.methods.options import SiftOptions
+from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import MapView, TelemetryHypothesis, slant_factor
 from engine.methods.votes import Vote, similarity, vote
@@ -66,35 +66,46 @@ class Matched:
 
 def match_views(
     query: Query,
-    landmarks: LandmarkMap,
+    landmarks: LandmarkMap | None,
     options: SiftOptions,
     views: list[MapView],
     hypothesis: TelemetryHypothesis,
+    finder: PointFinder | None = None,
 ) -> list[Matched]:
     """What of the frame is found again in each view.
 
     Args:
         query: the frame.
-        landmarks: of the map.
+        landmarks: of the map; None where a finder takes their place.
         options: settings.
         views: where to look.
         hypothesis: what is assumed of the telemetry.
+        finder: finds the points in place of features; None takes ``options.matcher`` where there is one.
     """
+    if finder is None and options.matcher is not None:
+        finder = PointFinder(options.matcher)
+    source = finder or landmarks
+    assert source is not None  # only a finder does without landmarks
     height_m, attitude = hypothesis.height_m, query.telemetry.grid_attitude
     if height_m is not None and hypothesis.x_axis_deg is not None and attitude is not None and options.upright:
-        found = [_by_orthophoto(query, landmarks, options, view, attitude, height_m) for view in views]
+        found = [_by_orthophoto(query, source, options, view, attitude, height_m) for view in views]
         if None not in found:
             return [matched for matched in found if matched is not None]
-    if options.matcher is not None:
-        return _by_pair_matcher(query, options.matcher, options, views)
-    return _by_frame(query, landmarks, options, views, hypothesis)
+    if isinstance(source, PointFinder):
+        return _by_reduced(query, source, options, views)
+    return _by_frame(query, source, options, views, hypothesis)
 
 
 # ----------------------------------------------------------------------------------- by the orthophoto
 
 
 def _by_orthophoto(
-    query: Query, landmarks: LandmarkMap, options: SiftOptions, view: MapView, attitude: Attitude, height_m: float
+    query: Query,
+    source: LandmarkMap | PointFinder,
+    options: SiftOptions,
+    view: MapView,
+    attitude: Attitude,
+    height_m: float,
 ) -> Matched | None:
     """The whole frame drawn on a view's level, its features matched, and what they vote for."""
     with query.scheduler.stage("rectify"):
@@ -103,10 +114,11 @@ def _by_orthophoto(
         photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
     if photo is None:
         return None
-    if options.matcher is not None:
-        photo_px, map_px, scale_px = _pairs(query, photo, view, options.matcher)
+    if isinstance(source, PointFinder):
+        photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
+        scale_px = np.zeros(len(photo_px))
     else:
-        photo_px, map_px, scale_px = _feature_pairs(query, landmarks, photo, view, options)
+        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
     weights = roughness_weights(query.site, ground_m) / (1.0 + (scale_px / _BLUNT_PX) ** 2)
     # Pixels of the frame that are one of the level, in the middle of the frame.
@@ -143,17 +155,6 @@ def _feature_pairs(
         photo_px = features.xy_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
         scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
         return photo_px, known.features.xy_px[0].cpu().numpy()[pairs[:, 1]].astype(np.float64), scale_px
-
-
-def _pairs(query: Query, photo: Orthophoto, view: MapView, matcher: PairMatcher) -> tuple[Array, Array, Array]:
-    """The same by the user's own matcher, which knows no scales."""
-    with query.scheduler.stage("match"), torch.inference_mode():
-        crop = as_picture(query.site.gray(view.crop, view.level), query.device)
-        found = matcher(as_picture(photo.gray, query.device), crop)
-        photo_px, crop_px = (points.cpu().numpy().astype(np.float64) for points in found)
-    at = np.clip(np.rint(photo_px), 0, np.array(photo.valid.shape)[::-1] - 1).astype(np.intp)
-    shown = photo.valid[at[:, 1], at[:, 0]]
-    return photo_px[shown], crop_px[shown] + view.corner_px, np.zeros(int(np.count_nonzero(shown)))
 
 
 def _voted(
@@ -258,20 +259,15 @@ def _by_frame(
     return matched
 
 
-def _by_pair_matcher(
-    query: Query, matcher: PairMatcher, options: SiftOptions, views: list[MapView]
-) -> list[Matched]:
-    """What the user's own matcher finds, view by view."""
+def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: list[MapView]) -> list[Matched]:
+    """What a matcher of pictures finds with the reduced frame, view by view."""
     reduced, matched = _reduce(query, options.scale), []
+    valid = np.ones(reduced.picture.shape[2:], np.bool_)
     for view in views:
-        with query.scheduler.stage("match"), torch.inference_mode():
-            crop = as_picture(query.site.gray(view.crop, view.level), query.device)
-            points, places = (found.cpu().numpy() for found in matcher(reduced.picture, crop))
-            map_px = query.site.full_from_level(places + view.corner_px, view.level)
-            ground_m = lifted(query.site, map_px)
-            weights = roughness_weights(query.site, ground_m)
-            tolerance_px = _frame_tolerance_px(options)
-            matched.append(Matched(view, reduced.full(points), ground_m, weights, tolerance_px))
+        points_px, map_px = finder.find(query, reduced.picture, valid, view)
+        ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
+        weights = roughness_weights(query.site, ground_m)
+        matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
     return matched
 
 

@@ -16,6 +16,7 @@ from engine.geo import attitude_from_rotation
 from engine.indexes.landmarks import LandmarkMap
 from engine.methods.feature_matching import NOMINAL_SCALE, Matched, match_views
 from engine.methods.options import MIN_HEIGHT_M, SiftOptions
+from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
 from engine.methods.votes import Vote
@@ -56,18 +57,22 @@ class FeatureMatcher:
 
     Attributes:
         query: the frame.
-        landmarks: of the map.
+        landmarks: of the map; None where a finder takes their place.
         options: settings.
+        finder: finds the matched points in place of features.
+        method: what fixes and refusals name.
     """
 
     query: Query
-    landmarks: LandmarkMap
+    landmarks: LandmarkMap | None
     options: SiftOptions
+    finder: PointFinder | None = None
+    method: str = METHOD
 
     def find(self) -> PoseCandidate | NoFix:
         """The pose of the frame, or a refusal where there is none."""
         query, options = self.query, self.options
-        flat = query.refuse_flat(METHOD, options.min_deviation)
+        flat = query.refuse_flat(self.method, options.min_deviation)
         if flat is not None:
             return flat
         first: PoseCandidate | NoFix | None = None
@@ -91,7 +96,7 @@ class FeatureMatcher:
         unknown = (MIN_HEIGHT_M, options.max_height_m)
         known = TelemetryHypothesis(unknown if height_m is None else (height_m, height_m), x_axis_deg(query))
         yield self, known
-        drawn = height_m is not None and known.x_axis_deg is not None and options.upright
+        drawn = height_m is not None and known.x_axis_deg is not None and options.upright and self.finder is None
         if drawn and level_at(query, known.heights_m[0], options.scale) > level_at(query, known.heights_m[0], 1.0):
             yield replace(self, options=replace(options, scale=1.0)), known
         wide = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
@@ -113,24 +118,28 @@ class FeatureMatcher:
         assert height_m is not None  # without one there is no single view
         hypothesis = TelemetryHypothesis((height_m, height_m), x_axis_deg(self.query))
         views = [view_in(self.query, window, height_m, self.options.scale)]
-        found = match_views(self.query, self.landmarks, self.options, views, hypothesis)[0]
+        found = match_views(self.query, self.landmarks, self.options, views, hypothesis, self.finder)[0]
         return found.points_px, found.points_m, self._pose(found, hypothesis)
 
     def _find_with(self, hypothesis: TelemetryHypothesis) -> PoseCandidate | NoFix:
         """Match, lift and solve, with what is assumed of the telemetry."""
         query, options, scheduler = self.query, self.options, self.query.scheduler
         with scheduler.stage("window"):
-            views = views_of(query, hypothesis, METHOD, margin=options.margin, scale=options.scale)
+            views = views_of(query, hypothesis, self.method, margin=options.margin, scale=options.scale)
         if isinstance(views, NoFix):
             return views
-        matched = match_views(query, self.landmarks, options, views, hypothesis)
+        if self.finder is not None and any(map(self.finder.too_large, views)):
+            pixels = max(view.crop.area_px for view in views)
+            detail = f"a window of {pixels} pixels is more than is searched; a nearer position is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method, window=views[0].window)
+        matched = match_views(query, self.landmarks, options, views, hypothesis, self.finder)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
         if count < MIN_VOTES:
             detail = f"{count} matches; {MIN_VOTES} are asked for"
-            return query.refuse(Reason.TOO_FEW_MATCHES, detail, METHOD, window=window)
+            return query.refuse(Reason.TOO_FEW_MATCHES, detail, self.method, window=window)
         if scheduler.deadline.remaining_ms < 0:
-            return query.refuse(Reason.LATE, "the budget was spent before the pose", METHOD, window=window)
+            return query.refuse(Reason.LATE, "the budget was spent before the pose", self.method, window=window)
         for found in matched:
             with scheduler.stage("pose"):
                 stats = self._pose(found, hypothesis)
@@ -138,7 +147,7 @@ class FeatureMatcher:
                 fix = self._fix(stats, found.view.window)
                 return fix if isinstance(fix, NoFix) else self._with_confidence(fix, stats, found.vote, hypothesis)
         detail = f"no pose explains enough of the {count} matches"
-        return query.refuse(Reason.BAD_POSE, detail, METHOD, window=window)
+        return query.refuse(Reason.BAD_POSE, detail, self.method, window=window)
 
     # ------------------------------------------------------------------------------------------------ pose
 
@@ -178,12 +187,12 @@ class FeatureMatcher:
         tilt = math.degrees(math.acos(float(np.clip(-body_down[2], -1.0, 1.0))))
         if tilt > options.max_tilt_deg or up <= float(site.surface_at(nadir)):
             detail = f"the pose is {tilt:.0f} degrees off level at a height of {up:.0f} m"
-            return query.refuse(Reason.BAD_POSE, detail, METHOD, score=share, window=window)
+            return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
         if not query.telemetry.has_tilt:  # features of a coarse picture err together, as a tilt would
             covariance *= max(1.0, NOMINAL_SCALE / options.scale) ** 2
         return query.fix(
-            METHOD,
+            self.method,
             nadir,
             covariance,
             score=share,

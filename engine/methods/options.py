@@ -162,18 +162,49 @@ class SiftOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedOptions:
+    """Settings of the learned method; all others are SIFT's.
+
+    Attributes:
+        weights: files of LoFTR, or of LightGlue with DISK, ALIKED or SuperPoint.
+        max_picture_px: on the level of the map where a frame is matched it covers at most so many pixels.
+        max_keypoints: of a frame; LoFTR has none.
+        max_map_keypoints: of a window.
+        max_window_px: a window with more pixels of its level is not searched.
+        min_match_confidence: of a match by LoFTR.
+    """
+
+    weights: tuple[str, ...] = ()
+    max_picture_px: int = 130_000
+    max_keypoints: int = 512
+    max_map_keypoints: int = 2048
+    max_window_px: int = 1 << 21
+    min_match_confidence: float = 0.5
+
+    def __post_init__(self) -> None:
+        limits = {"max_picture_px": 4096, "max_window_px": 4096, "max_keypoints": 4, "max_map_keypoints": 4}
+        for name, minimum in limits.items():
+            if not getattr(self, name) >= minimum:
+                raise OptionError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
+        if not 0.0 <= self.min_match_confidence <= 1.0:
+            raise OptionError(f"min_match_confidence: expected 0 to 1, got {self.min_match_confidence}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatcherOptions:
-    """Settings of both methods.
+    """Settings of all methods.
 
     Attributes:
         profile: "engine", or "paper" for the paper's own recipe with OpenCV.
         ncc: settings of the NCC method.
         sift: settings of the SIFT method.
+        learned: settings of the learned method.
     """
 
     profile: str = "engine"
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
+    learned: LearnedOptions = field(default_factory=LearnedOptions)
 
     def __post_init__(self) -> None:
         if self.profile not in PROFILES:

@@ -17,7 +17,7 @@ from engine.formats.flight import write_flight_folder
 from engine.formats.track import TrackRow, read_track, track_row, write_track
 from engine.formats.truth import read_truth
 from engine.matcher import SceneMatcher
-from engine.methods import METHODS
+from engine.methods import CLASSICAL
 from engine.orthomap import OrthoMap
 from engine.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
 from engine.report.figures import draw_figures
@@ -70,7 +70,7 @@ class ClosedLoopSettings:
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
+        check_choice("method", self.method, CLASSICAL)
         check_choice("fault", self.fault, FAULT_KINDS)
         if not 0.1 <= self.minutes <= 120.0:
             raise OptionError(f"minutes: expected 0.1 to 120, got {self.minutes:g}")

@@ -13,6 +13,7 @@ from engine.formats.flight import Flight, open_flight, subtitles_beside
 from engine.formats.frames import VIDEO_SUFFIXES
 from engine.formats.logs.readers import LogClock, is_log, open_truth
 from engine.formats.ros.bags import is_bag
+from engine.learned import load_matcher
 from engine.orthomap import OrthoMap
 from engine.runs.arguments import is_in_degrees, parse_bounds, parse_position, renamed_in_errors
 from engine.runs.cameras import CameraFiles
@@ -203,6 +204,8 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     truth = open_truth(truth_path, stamp_ns) if truth_path is not None else None
     for settings in runs:
         check_needs(flight, settings.method, settings.profile)
+        if settings.method == "learned":
+            load_matcher(settings.learned.weights, device="cpu")
         start = parse_position("start", settings.start)
         check_position("start", start, site, OptionError)
         if start is None:

@@ -18,6 +18,7 @@ from engine.errors import BackendError, CalibrationError, OptionError, Telemetry
 from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
+from engine.methods.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
 from engine.runs.cameras import CameraFiles
@@ -26,6 +27,7 @@ from engine.runs.folders import StrPath, check_file
 from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
+from engine.runs.settings import with_weights
 
 if TYPE_CHECKING:
     from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
@@ -162,7 +164,8 @@ class BridgeSettings:
     """How a bridge matches frames.
 
     Attributes:
-        method: "auto", "ncc" or "sift".
+        method: "auto", "ncc", "sift" or "learned".
+        weights: files of the learned method.
         device: where tensors live.
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: age by which a frame is answered.
@@ -174,6 +177,7 @@ class BridgeSettings:
     """
 
     method: str = "auto"
+    weights: tuple[StrPath, ...] = ()
     device: str = "auto"
     start: str | None = None
     deadline_ms: float = 121.0
@@ -181,9 +185,14 @@ class BridgeSettings:
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
+        self.matcher_options()
         check_device(self.device)
         parse_position("start", self.start)
         self.live_options()
+
+    def matcher_options(self) -> MatcherOptions:
+        """What of it is the matcher's."""
+        return MatcherOptions(learned=with_weights(self.method, self.weights))
 
     def live_options(self) -> LiveOptions:
         """The deadlines of the frames."""
@@ -230,7 +239,7 @@ def run_mavlink_bridge(
     )
     camera = files.camera_files().load(None)
     check_position("start", start, site, OptionError)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):

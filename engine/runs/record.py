@@ -40,7 +40,7 @@ class RunRecord:
         mount: of the camera, by name.
         camera_pitch_deg: of the camera.
         heights: frames by the source of their height, where the telemetry is a log or the photographs' own.
-        method: "ncc", "sift" or "auto".
+        method: "ncc", "sift", "auto" or "learned".
         profile: "engine" or "paper".
         device: where tensors lived.
         start: where the flight began, as typed.

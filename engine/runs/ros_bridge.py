@@ -113,7 +113,7 @@ def run_ros_bridge(
     camera = None if ros.camera is None else described.load(None)
     node = _node(ros.version)
     camera = camera or described.mounted(_published_camera(node, ros.topics.camera_info, progress))
-    matcher = SceneMatcher(site, camera, settings.method, settings.device)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):

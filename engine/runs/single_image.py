@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from engine.errors import OptionError
 from engine.formats.frames import open_frames, read_image
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
+from engine.methods.options import MatcherOptions
 from engine.runs.arguments import check_choice, check_device, parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
 from engine.runs.progress import SILENT, Progress
+from engine.runs.settings import with_weights
 from engine.values import Fix, Frame, NoFix
 
 
@@ -37,6 +39,7 @@ def locate_image(
     pitch_deg: float | None = None,
     near: str | None = None,
     method: str = "auto",
+    weights: Sequence[StrPath] = (),
     device: str = "auto",
     progress: Progress = SILENT,
 ) -> Fix | NoFix:
@@ -58,7 +61,8 @@ def locate_image(
         roll_deg: right side down.
         pitch_deg: nose up.
         near: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
-        method: "ncc", "sift" or "auto".
+        method: "ncc", "sift", "auto" or "learned".
+        weights: files of the learned method.
         device: where tensors live.
         progress: is shown the copying of the map.
 
@@ -71,6 +75,7 @@ def locate_image(
     }  # fmt: skip
     _check_numbers(known)
     check_choice("method", method, METHODS)
+    options = MatcherOptions(learned=with_weights(method, weights))
     check_device(device)
     prior = parse_position("near", near)
     described = CameraFiles(
@@ -85,7 +90,7 @@ def locate_image(
     pixels = read_image(image)
     calibration.check_size(pixels.shape)
     frame = Frame(pixels, None, **known)
-    return SceneMatcher(site, calibration, method, device).locate(frame, prior)
+    return SceneMatcher(site, calibration, method, device, options).locate(frame, prior)
 
 
 def _check_numbers(known: Mapping[str, float | None]) -> None:

@@ -30,6 +30,7 @@ from engine.cli.options import (
     StartOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -93,6 +94,7 @@ def mavlink(
         bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is used.")
     ] = True,
     method: MethodOption = "auto",
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: DeviceOption = "auto",
     deadline_ms: DeadlineOption = 121.0,
@@ -122,7 +124,10 @@ def mavlink(
         message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
         use_velocity=use_velocity,
     )  # fmt: skip
-    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    settings = BridgeSettings(
+        method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
+        seconds=seconds,
+    )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_mavlink_bridge(files, link, settings, live_view=live_view, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
@@ -190,6 +195,7 @@ def ros(
         str | None, typer.Option("--origin", metavar="LAT,LON", help="Of the poses; without it the map's.")
     ] = None,
     method: MethodOption = "auto",
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: DeviceOption = "auto",
     deadline_ms: DeadlineOption = 121.0,
@@ -214,7 +220,10 @@ def ros(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
         velocity=velocity,
     )  # fmt: skip
-    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    settings = BridgeSettings(
+        method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
+        seconds=seconds,
+    )  # fmt: skip
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
         firmware=firmware, origin=origin, map_bounds=map_bounds, map_crs=map_crs, mount=mount,

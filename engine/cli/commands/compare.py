@@ -28,6 +28,7 @@ from engine.cli.options import (
     StartOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -59,6 +60,7 @@ def compare(
         list[str] | None,
         typer.Option("--run", metavar="METHOD[/PROFILE]|FILE", help="Once a run; without it the paper's Table I."),
     ] = None,
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: OptionalDeviceOption = None,
     budget_ms: BudgetOption = None,
@@ -76,7 +78,7 @@ def compare(
     from engine.runs.inputs import FlightFiles
 
     use_threads(threads)
-    settings = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
+    settings = parse_runs(runs or [], weights=weights or (), start=start, device=device, budget_ms=budget_ms)
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,

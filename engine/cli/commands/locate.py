@@ -23,6 +23,7 @@ from engine.cli.options import (
     OptionalCameraOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -56,6 +57,7 @@ def locate(
         typer.Option("--near", metavar="LAT,LON[,SIGMA_M]", help="Search here; without it the whole map."),
     ] = None,
     method: MethodOption = "auto",
+    weights: WeightsOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
@@ -71,8 +73,8 @@ def locate(
     result = locate_image(
         image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
         hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg, height_agl_m=height_agl_m,
-        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method, device=device,
-        progress=console.PROGRESS,
+        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
+        weights=weights or (), device=device, progress=console.PROGRESS,
     )  # fmt: skip
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms

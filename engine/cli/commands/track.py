@@ -31,6 +31,7 @@ from engine.cli.options import (
     StartOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -69,8 +70,9 @@ def track(
     settings_path: SettingsOption = None,
     method: Annotated[
         str | None,
-        typer.Option("--method", metavar="ncc|sift|auto", help="ncc, unless the settings say otherwise."),
+        typer.Option("--method", metavar="ncc|sift|auto|learned", help="ncc, unless the settings say otherwise."),
     ] = None,
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: OptionalDeviceOption = None,
     budget_ms: BudgetOption = None,
@@ -103,8 +105,9 @@ def track(
         map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     settings = load_settings(
-        settings_path, method=method, profile=profile, device=device, start=start, budget_ms=budget_ms
-    )
+        settings_path, weights=weights or (), method=method, profile=profile, device=device, start=start,
+        budget_ms=budget_ms,
+    )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     summary = track_flight(files, out, settings, force=force, live_view=live_view, progress=console.PROGRESS)
     title = f"{settings.method} ({settings.profile} profile) on {frames}"
