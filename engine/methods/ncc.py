@@ -116,8 +116,8 @@ class Ncc(Method):
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
         if not isinstance(result, Fix) or result.stage != "fine" or not self.options.refine:
             return result
-        # A height that was searched for is not the frame's, and an unknown slope would be taken for a tilt.
-        if not self._trusts(query) or not query.site.has_surface:
+        # A height that was searched for is not the frame's; an unknown slope would be taken for a tilt that is known.
+        if not self._trusts(query) or (query.telemetry.has_tilt and not query.site.has_surface):
             return result
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
