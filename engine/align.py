@@ -292,7 +292,7 @@ def orthorectify(
         :data:`MAX_FIELD_DEG`.
     """
     bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)
-    if bounds is None or not MIN_PICTURE_PX <= (bounds[1] - bounds[0]).min():
+    if bounds is None or (bounds[1] - bounds[0]).min() < MIN_PICTURE_PX:
         return None
     if np.prod(bounds[1] - bounds[0]) > MAX_PICTURE_PX:
         return None

@@ -41,6 +41,7 @@ _POSES_PER_SAMPLE = 4
 _MIRRORED_STEPS = 4  # of the other pose of a plane: enough to estimate its cost
 _PAIRED = 300  # projections that are compared with all image points for the probability of a chance inlier
 _SAME_POSE_DEG = 1.5
+_CLOSE_SHARE = 0.4  # of the inliers within a wider tolerance
 _START_SLACK = 2.0  # factor on the tolerance in the first step from a pose that fits within a wider one
 _IDENTITY = np.eye(3)
 
@@ -276,10 +277,17 @@ def _fit(problem: Problem, options: PoseOptions) -> Fit | None:
 
 
 def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
-    """The fit near an initial pose: first to all matches within its tolerance, then within the options'."""
+    """The fit near an initial pose: to all matches within its tolerance, or the fewer that agree more closely.
+
+    Where most agree only roughly, as over ground that has changed, the closer ones alone would be chance.
+    """
     wide = replace(problem, tolerance_px=max(start.tolerance_px, problem.tolerance_px))
     near = gauss_newton(wide, start.rotation, start.center_m - origin)
-    return None if near is None else gauss_newton(problem, near.rotation, near.center, slack=_START_SLACK)
+    if near is None:
+        return None
+    close = gauss_newton(problem, near.rotation, near.center, slack=_START_SLACK)
+    enough = _CLOSE_SHARE * np.count_nonzero(near.inliers)
+    return near if close is None or np.count_nonzero(close.inliers) < enough else close
 
 
 def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:

@@ -318,7 +318,9 @@ def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
     result = with_sift(ground, camera).locate(frame, prior, Budget(total_ms=budget_ms))
     assert result.reason is Reason.TOO_FEW_MATCHES
     assert [hypothesis.x_axis_deg is None for hypothesis in hypotheses] == [False, False, True][:looks]
-    assert [hypothesis.heights_m for hypothesis in hypotheses] == [(150.0, 150.0), (150.0, 150.0), (75.0, 300.0)][:looks]
+    assert [hypothesis.heights_m for hypothesis in hypotheses] == [(150.0, 150.0), (150.0, 150.0), (75.0, 300.0)][
+        :looks
+    ]
 
 
 # Where SIFT's features come from

@@ -30,7 +30,7 @@ from engine.device import set_threads
 from engine.formats.flight import Flight
 from engine.formats.track import TrackRow, read_track, track_row
 from engine.formats.truth import interpolate_truth
-from engine.navigator import ACCEPT_ALL
+from engine.navigator_options import ACCEPT_ALL
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from engine.runs import FlightFiles, TrackSettings, track
 from engine.runs.arguments import parse_position

@@ -71,11 +71,10 @@ def _flipped(pair: YearPair) -> Ground:
 
 def _plain(bench: Bench, made: Trial) -> Row:
     """The highest peak of OpenCV's plain zero-mean NCC of the rectified frame in the whole window."""
-    matcher = bench.matcher(made.on, "NCC")
-    found = bench.peak(made)
+    query, _, found = bench.peak(made)
     if isinstance(found, NoFix):
         return bench.row(made, PLAIN, None, False, [], [])
-    aligned, site = found.aligned, matcher.site
+    aligned, site = found.aligned, query.site
     crop = level_crop(site, found.fix.window, aligned.level)
     scores = cv2.matchTemplate(site.gray(crop, aligned.level), aligned.patch.gray, cv2.TM_CCOEFF_NORMED)
     _, best, _, (x, y) = cv2.minMaxLoc(scores)

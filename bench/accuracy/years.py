@@ -75,7 +75,7 @@ def pairs(source: str, half: str, frames: int = 8, seed: int = 0) -> Iterator[Ye
         seed: of places, heights and errors.
     """
     for index, place in enumerate(places(half) if source == "naip-cities" else [source]):
-        years = YEARS if source == "naip-cities" else _vintages()
+        years = YEARS if source == "naip-cities" else vintages()
         for number, (seen, mapped) in enumerate(permutations(years, 2)):
             rng = np.random.default_rng([seed, SETS.index(source), HALVES.index(half), index, number])
             yield YearPair(place, (seen, mapped), _ground(source, half, place, seen, mapped, frames, rng))
@@ -134,7 +134,8 @@ def opened(source: str, half: str, place: str, year: str) -> OrthoMap:
     return OrthoMap.from_arrays(np.ascontiguousarray(gray[:723, columns]), layout, "EPSG:32614")
 
 
-def _vintages() -> tuple[str, ...]:
+def vintages() -> tuple[str, ...]:
+    """The years of the farmland."""
     return tuple(sorted(path.stem.rsplit("_", 1)[1][:4] for path in FARMLAND.glob("*.tif")))
 
 

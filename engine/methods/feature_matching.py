@@ -23,7 +23,7 @@ from engine.methods.options import SiftOptions
 from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import MapView, TelemetryHypothesis, slant_factor
-from engine.methods.votes import similarity, vote
+from engine.methods.votes import Vote, similarity, vote
 from engine.orthomap import OrthoMap
 from engine.pose import PoseStart
 from engine.values import Attitude
@@ -52,7 +52,7 @@ class Matched:
         weights: (M,) relative inverse variances of the pixels.
         tolerance_px: reprojection distance in the frame up to which a match agrees with a pose.
         start: the pose that most voted for; None where there was no vote.
-        votes: for it.
+        vote: what was voted for; None where there was no vote.
     """
 
     view: MapView
@@ -61,7 +61,7 @@ class Matched:
     weights: Array
     tolerance_px: float
     start: PoseStart | None = None
-    votes: int = 0
+    vote: Vote | None = None
 
 
 def match_views(
@@ -185,7 +185,7 @@ def _voted(
         np.array([*site.enu_from_pixel(nadir_px), up_m]),
         radius_px / options.tolerance_px * matched.tolerance_px,
     )
-    return replace(matched, start=start, votes=found.votes)
+    return replace(matched, start=start, vote=found)
 
 
 def _relief(query: Query, level: int) -> Relief | None:

@@ -19,6 +19,7 @@ from engine.methods.options import MIN_HEIGHT_M, SiftOptions
 from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
+from engine.methods.votes import Vote
 from engine.orthomap import OrthoMap
 from engine.pose import PoseStats, solve_pose
 from engine.values import Attitude, Fix, NoFix, Reason, Window
@@ -26,6 +27,8 @@ from engine.values import Attitude, Fix, NoFix, Reason, Window
 Array = NDArray[np.float64]
 
 METHOD = "sift"
+MIN_VOTES = 4
+"""Fewest matches of a pose where they voted for it."""
 _MATCHED_HEADING_SIGMA_DEG = 30.0  # of a heading that only the matches gave: next to no information
 
 
@@ -116,8 +119,7 @@ class FeatureMatcher:
         hypothesis = TelemetryHypothesis((height_m, height_m), x_axis_deg(self.query))
         views = [view_in(self.query, window, height_m, self.options.scale)]
         found = match_views(self.query, self.landmarks, self.options, views, hypothesis, self.finder)[0]
-        enough = len(found.points_px) >= self.options.pose.min_inliers
-        return found.points_px, found.points_m, self._pose(found, hypothesis) if enough else None
+        return found.points_px, found.points_m, self._pose(found, hypothesis)
 
     def _find_with(self, hypothesis: TelemetryHypothesis) -> PoseCandidate | NoFix:
         """Match, lift and solve, with what is assumed of the telemetry."""
@@ -133,8 +135,8 @@ class FeatureMatcher:
         matched = match_views(query, self.landmarks, options, views, hypothesis, self.finder)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
-        if count < options.pose.min_inliers:
-            detail = f"{count} matches; {options.pose.min_inliers} are asked for"
+        if count < MIN_VOTES:
+            detail = f"{count} matches; {MIN_VOTES} are asked for"
             return query.refuse(Reason.TOO_FEW_MATCHES, detail, self.method, window=window)
         if scheduler.deadline.remaining_ms < 0:
             return query.refuse(Reason.LATE, "the budget was spent before the pose", self.method, window=window)
@@ -143,7 +145,7 @@ class FeatureMatcher:
                 stats = self._pose(found, hypothesis)
             if stats is not None:
                 fix = self._fix(stats, found.view.window)
-                return fix if isinstance(fix, NoFix) else self._with_confidence(fix, stats, hypothesis)
+                return fix if isinstance(fix, NoFix) else self._with_confidence(fix, stats, found.vote, hypothesis)
         detail = f"no pose explains enough of the {count} matches"
         return query.refuse(Reason.BAD_POSE, detail, self.method, window=window)
 
@@ -157,6 +159,8 @@ class FeatureMatcher:
         """
         query, options = self.query, self.options
         pose = replace(options.pose, reprojection_px=found.tolerance_px)
+        if found.vote is not None:  # by which the place is judged, not by the pose
+            pose = replace(pose, min_inliers=MIN_VOTES, max_log10_nfa=math.inf)
         matrix = query.camera.matrix
         solve = partial(
             solve_pose, found.points_m, found.points_px, matrix, pose, weights=found.weights, start=found.start
@@ -198,7 +202,9 @@ class FeatureMatcher:
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
         )
 
-    def _with_confidence(self, fix: Fix, stats: PoseStats, hypothesis: TelemetryHypothesis) -> PoseCandidate:
+    def _with_confidence(
+        self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis
+    ) -> PoseCandidate:
         """The candidate of a fix; a height that is doubted in this hypothesis does not count."""
         query, height_m = self.query, self.query.telemetry.height_agl_m
         errors = query.errors(self.options.errors)
@@ -212,7 +218,10 @@ class FeatureMatcher:
         if query.prior is not None and query.prior_px is not None:
             prior_m = query.site.enu_from_pixel(query.prior_px)
             prior_chi_square = prior_agreement(fix, prior_m, query.prior.sigma_m).prior_chi_square
-        features = PoseFeatures(stats.log10_nfa, prior_chi_square, height_chi_square)
+        log10_nfa, rival_share = stats.log10_nfa, None
+        if vote is not None:
+            log10_nfa, rival_share = vote.log10_nfa, vote.rival / vote.votes
+        features = PoseFeatures(log10_nfa, prior_chi_square, height_chi_square, rival_share)
         return PoseCandidate(replace(fix, confidence=probability(features)), features)
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from engine.acceptance import judge_peak
-from engine.confidence import PeakFeatures, peak_features, prior_agreement, probability
+from engine.acceptance import judge_peak, judge_second_look
+from engine.confidence import SECOND_LOOK_MODEL, PeakFeatures, peak_features, prior_agreement, probability
 from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
@@ -18,6 +18,7 @@ from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
+from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Peak, Reason, Result, Window
 from engine.window import SPREAD_SIGMAS
@@ -26,6 +27,7 @@ MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
 _MIN_SIDE_PX = 24  # of what is correlated there
+_SECOND_LOOK = "ncc second look"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,9 @@ class Ncc(Method):
             return
         for coarser in self._expected_window_px(query):
             self.refine(query, self.correlate(query, coarser))
+        found = self.find(query)
+        if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
+            self._costed_second_look(query, found)
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
@@ -103,6 +108,8 @@ class Ncc(Method):
         with query.scheduler.costed(step, works[coarser]):
             found = self.find(query, coarser=coarser)
             result = found if isinstance(found, NoFix) else self.judge(query, found)
+        if isinstance(found, PeakCandidate) and isinstance(result, NoFix) and found.features is not None:
+            result = self._look_again(query, found, result)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def refine(self, query: Query, result: Result) -> Result:
@@ -164,6 +171,45 @@ class Ncc(Method):
         if refusal is not None:
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
         return fix
+
+    def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
+        """The fix of the second look at the same window, where that is wanted and affordable, else the refusal."""
+        if not self.options.second_look or not query.scheduler.can_afford(_SECOND_LOOK, _window_px(found)):
+            return refusal
+        again = self._costed_second_look(query, found)
+        return refusal if again is None else self.judge_again(query, again)
+
+    def _costed_second_look(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
+        with query.scheduler.costed(_SECOND_LOOK, _window_px(found)), query.scheduler.stage("second look"):
+            return self.find_again(query, found)
+
+    def find_again(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
+        """The highest peak of the second look, see :mod:`engine.methods.second_look`.
+
+        Args:
+            query: the frame.
+            found: at the first look, with features.
+        """
+        correlator, window = Correlator(query, self.prepared, self.options), found.fix.window
+        assert query.prior is not None
+        assert query.prior_px is not None
+        looked = second_look(correlator, found.aligned, window)
+        if looked is None:
+            return None
+        fix = self._fix(correlator, found.aligned, looked.peak, window, searched=False)
+        agreement = prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+        features = peak_features(looked.peak, looked.chance_sigma, agreement)
+        fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
+        return PeakCandidate(looked.peak, found.aligned, fix, features, found.searched)
+
+    def judge_again(self, query: Query, found: PeakCandidate) -> Result:
+        """The fix where the peak of the second look is accepted, else a refusal."""
+        assert found.features is not None
+        assert found.fix.confidence is not None
+        refusal = judge_second_look(found.peak, found.features, found.fix.confidence, self.options.rule)
+        if refusal is not None:
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
+        return found.fix
 
     def _trusts(self, query: Query) -> bool:
         return self.options.trusts(query.telemetry.grid_heading_deg)
@@ -253,3 +299,8 @@ class Ncc(Method):
                 rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
                 out[coarser] = min(width, columns) * min(height, rows)
         return out
+
+
+def _window_px(found: PeakCandidate) -> float:
+    """Pixels of the window that was searched, on its level."""
+    return float(found.fix.window.area_px >> 2 * found.aligned.level)

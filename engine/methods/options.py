@@ -33,6 +33,7 @@ class NccOptions:
         heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
             also where the frame has none.
         height_search_share: the height may be off by this share; 0 trusts it.
+        second_look: correlate structure besides grey levels where the highest peak of a window is refused.
         refine: refine the pose densely after the peak, where heading and height are trusted.
         rule: when a peak is accepted.
         errors: what is assumed of the telemetry and the map.
@@ -46,6 +47,7 @@ class NccOptions:
     exhaustive: bool = False
     heading_search_deg: float = 0.0
     height_search_share: float = 0.0
+    second_look: bool = True
     refine: bool = True
     rule: PeakRule = field(default_factory=PeakRule)
     errors: AssumedErrors = field(default_factory=AssumedErrors)

@@ -22,6 +22,8 @@ SCALES = (1.0, 0.93, 1.075)
 """By which it may be scaled, since a height may be wrong."""
 _ROUNDS = 4  # of the mean shift from the fullest cells to the middle of the votes
 _MAX_SIDE = 2048  # cells along a side of the histogram
+_RIVAL_RADII = 3.0  # from the best translation: within, its own votes scatter where the tilt is not known
+_PAIRED = 300  # points that are compared with all others for the probability of a vote by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +35,16 @@ class Vote:
         scale: of the orthophoto about its middle.
         voters: (M,) bool, the matches that agree.
         shift_px: (2,) from the orthophoto, turned and scaled, to the map.
+        rival: votes of the best translation elsewhere.
+        log10_nfa: log10 of the number of false alarms, the translations that as many wrong matches would agree on.
     """
 
     turn_deg: float
     scale: float
     voters: NDArray[np.bool_]
     shift_px: Array
+    rival: int
+    log10_nfa: float
 
     @property
     def votes(self) -> int:
@@ -57,15 +63,55 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
     Returns:
         Vote | None: None without a match. Of equal ones the first, so that a turn needs more votes than none.
     """
-    best: Vote | None = None
+    best: tuple[int, float, float, NDArray[np.bool_], Array] | None = None
     for turn_deg, scale in itertools.product(TURNS_DEG, SCALES):
         shifts = map_px - photo_px @ similarity(turn_deg, scale).T
         voters = densest(shifts, radius_px)
-        if voters.any() and (best is None or np.count_nonzero(voters) > best.votes):
-            best = Vote(turn_deg, scale, voters, shifts[voters].mean(axis=0))
-        if best is not None and 2 * best.votes > len(map_px):
+        count = int(np.count_nonzero(voters))
+        if count and (best is None or count > best[0]):
+            best = (count, turn_deg, scale, voters, shifts)
+        if 2 * count > len(map_px):
             break  # a majority needs no further search
-    return best
+    if best is None:
+        return None
+    _, turn_deg, scale, voters, shifts = best
+    shift_px = shifts[voters].mean(axis=0)
+    elsewhere = ~_within(shifts, shift_px, _RIVAL_RADII * radius_px)
+    rival = int(np.count_nonzero(densest(shifts[elsewhere], radius_px)))
+    log10_nfa = _log10_nfa(photo_px @ similarity(turn_deg, scale).T, map_px, shift_px, voters, radius_px)
+    return Vote(turn_deg, scale, voters, shift_px, rival, log10_nfa)
+
+
+def _log10_nfa(
+    photo_px: Array, map_px: Array, shift_px: Array, voters: NDArray[np.bool_], radius_px: float
+) -> float:
+    """log10 of the expected number of translations with as many votes, were all matches wrong.
+
+    A match of each orthophoto point with the map point of another match is wrong, but as crowded as right ones:
+    the share of these that agree on the translation is the probability p of a vote by chance. Every match proposes
+    a translation in every turn and scale, and the others agree by a binomial law.
+    """
+    total, votes = len(map_px), int(np.count_nonzero(voters))
+    if votes < 2:
+        return math.log10(total * len(TURNS_DEG) * len(SCALES))
+    some = slice(None, None, -(-total // _PAIRED))
+    apart = map_px[None, :] - photo_px[some, None] - shift_px
+    near = np.einsum("ijk,ijk->ij", apart, apart) <= radius_px * radius_px
+    agree = int(np.count_nonzero(near)) - int(np.count_nonzero(voters[some]))
+    extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
+    uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])
+    p = min(max(agree / (near.shape[0] * max(total - 1, 1)), uniform), 1.0)
+    tests = math.log10(total * len(TURNS_DEG) * len(SCALES))
+    return tests + _log10_binomial_tail(total - 1, votes - 1, p)
+
+
+def _log10_binomial_tail(n: int, k: int, p: float) -> float:
+    """log10 of the probability of k or more of n, by Hoeffding's bound."""
+    q = k / n
+    if q <= p:
+        return 0.0
+    divergence = q * math.log(q / p) + ((1.0 - q) * math.log((1.0 - q) / (1.0 - p)) if q < 1.0 else 0.0)
+    return -n * divergence / math.log(10)
 
 
 def similarity(turn_deg: float, scale: float) -> Array:
