@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.align import Patch, Relief, orthorectify
+from engine.align import Patch, orthorectify
 from engine.geo import enu_from_body
 from engine.methods.query import Query
+from engine.methods.relief import ground_relief
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Window
 
@@ -21,7 +21,6 @@ OBLIQUE_DEG = 25.0
 """Angle of the optical axis off the vertical beyond which the ground is no plane to a frame."""
 FIELD_DEG = 60.0
 """Ground farther off the vertical is left out: walls hide it, and an error of height or tilt moves it most."""
-_BUILDING_M = 30.0  # side of what stands on the ground, which the relief leaves out
 _MIN_SIDE_PX = 8
 _CELLS = 96  # along the longer side, by which the rectangle is found
 
@@ -48,7 +47,7 @@ def oblique_patch(
         Patch | None: None where no 8 x 8 pixels are seen.
     """
     site, jacobian = query.site, query.jacobian * 2.0**level
-    relief = None if nadir_px is None or not site.has_surface else ground_relief(site, nadir_px, level)
+    relief = ground_relief(site, nadir_px, level)
     photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
     if photo is None:
         return None
@@ -60,28 +59,6 @@ def oblique_patch(
         return None
     part = photo.gray[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px]
     return Patch(np.ascontiguousarray(part), photo.offset_px + np.array([box.x0, box.y0]))
-
-
-def ground_relief(site: OrthoMap, nadir_px: Array, level: int) -> Relief:
-    """The bare ground about a place: the surface without what is narrower than 30 m.
-
-    Args:
-        site: with a surface.
-        nadir_px: (2,) full-resolution pixel that heights count from.
-        level: of whose pixels the offsets are.
-    """
-    nadir_level, ground_m = site.level_from_full(nadir_px, level), site.ground_at(nadir_px)
-
-    def heights_m(offsets_px: Array) -> Array:
-        surface_m = site.surface_at(site.full_from_level(nadir_level + offsets_px, level))
-        spacing_m = np.ptp(offsets_px, axis=(0, 1)) / (np.array(offsets_px.shape[1::-1]) - 1.0)
-        spacing_m = np.maximum(spacing_m * site.gsd_m_per_px * 2.0**level, 1e-6)
-        reach = [int(n) for n in np.clip(np.ceil(_BUILDING_M / spacing_m / 2.0), 1, 8)]
-        size = (2 * reach[0] + 1, 2 * reach[1] + 1)
-        opened = cv2.morphologyEx(surface_m.astype(np.float32), cv2.MORPH_OPEN, np.ones(size[::-1], np.uint8))
-        return np.asarray(cv2.blur(opened, size) - ground_m, np.float64)
-
-    return heights_m
 
 
 def _near(shape: tuple[int, ...], offset_px: Array, jacobian: Array, height_m: float) -> Mask:
