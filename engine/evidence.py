@@ -30,6 +30,11 @@ def log_odds(probability: float) -> float:
     return math.log(p / (1.0 - p))
 
 
+def probability(odds: float) -> float:
+    """The probability of log-odds."""
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
 def match_log_odds(fix: Fix) -> float:
     """Of a match by itself, where every second frame shows a place in its window."""
     return log_odds(UNSTATED_PROBABILITY if fix.confidence is None else fix.confidence)
@@ -71,10 +76,10 @@ def agreement_log_odds(estimate: PositionEstimate, fix: Fix, area_m2: float) -> 
         fix: the match.
         area_m2: that was searched.
     """
-    covariance = fix.covariance_m2[:2, :2] + estimate.sigma_m**2 * np.eye(2)
-    log_density = -0.5 * (estimate.chi_square(fix) + math.log(float(np.linalg.det(2.0 * math.pi * covariance))))
+    covariance = 2.0 * math.pi * estimate.difference_covariance_m2(fix)
+    log_density = -0.5 * (estimate.chi_square(fix) + math.log(float(np.linalg.det(covariance))))
     log_area = math.log(area_m2 + 2.0 * math.pi * estimate.sigma_m**2)  # an estimate that is vaguer adds nothing
-    wrong = 1.0 / (1.0 + math.exp(estimate.log_odds))
+    wrong = probability(-estimate.log_odds)
     log_right = math.log1p(-wrong) + log_area + log_density
     return min(float(np.logaddexp(log_right, math.log(wrong))), log_odds(MAX_PROBABILITY))
 

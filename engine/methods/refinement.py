@@ -61,11 +61,11 @@ class Refinement:
             fit = fit or self._through_levels(prior, _MUCH_COARSER)
             pose_covariance = None if fit is None else covariance_of(fit, prior)
         if fit is not None and pose_covariance is not None:
-            covariance = pose_covariance[:3, :3] + errors.map_m**2 * np.eye(3)
+            covariance = pose_covariance[:3, :3].copy()
             covariance[2, 2] += (_HEIGHT_SHARE * (fit.pose.center_m[2] - query.site.ground_m)) ** 2
             moved = (fit.pose.center_m - prior.pose.center_m)[:2]
-            if are_consistent(moved, fix.covariance_m2[:2, :2] + covariance[:2, :2]):
-                return self._refined_fix(fix, fit, covariance)
+            if are_consistent(moved, fix.relative_covariance_m2 + covariance[:2, :2]):
+                return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3))
         if has_tilt:
             return fix
         detail = "roll and pitch are unknown, and the picture does not determine them"
@@ -142,6 +142,7 @@ class Refinement:
             east_north_m=center_m[:2],
             up_m=float(center_m[2]),
             grid_attitude=Attitude(*attitude_from_rotation(fit.pose.rotation.T @ query.camera.mount.T)),
+            map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
 
