@@ -21,7 +21,7 @@ from engine.errors import (
 )
 from engine.live import Answer, Live, LiveOptions
 from engine.matcher import SceneMatcher
-from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
+from engine.methods.options import LearnedOptions, MatcherOptions, NccOptions, SiftOptions
 from engine.navigator import Navigator, NavigatorState
 from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
@@ -41,6 +41,7 @@ __all__ = [
     "EngineError",
     "Fix",
     "Frame",
+    "LearnedOptions",
     "Live",
     "LiveOptions",
     "MapError",

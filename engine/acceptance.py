@@ -106,6 +106,27 @@ def judge_peak(
         return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
     if features is None or confidence is None or confidence >= rule.min_confidence:
         return None
+    return _improbable_peak(features, confidence, rule)
+
+
+def judge_second_look(peak: Peak, features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal | None:
+    """The reason to refuse the peak of a second look, or None where it is accepted.
+
+    Args:
+        peak: the peak.
+        features: of the confidence model, with the sigma of chance that was measured.
+        confidence: that the model gives them.
+        rule: the thresholds.
+    """
+    if not peak.curvature.any():
+        return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
+    if features.agreement.prior_chi_square > rule.max_prior_chi_square:
+        figure = f"chi-square {features.agreement.prior_chi_square:.1f}"
+        return Reason.AMBIGUOUS, f"the best place of a second look contradicts the prior ({figure})"
+    return None if confidence >= rule.min_confidence else _improbable_peak(features, confidence, rule)
+
+
+def _improbable_peak(features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal:
     figures = f"NCC {features.sigmas:.1f} sigmas, rival at {features.ratio:.0%}"
     chi_square_text = f"{features.agreement.prior_chi_square:.1f}"
     return Reason.AMBIGUOUS, _improbable(confidence, rule.min_confidence, figures, chi_square_text)

@@ -1,9 +1,10 @@
 """The confidence model: how probable it is that a peak or a pose is of the right place.
 
-A peak is high over a wrong place too, where streets or furrows look alike. Three features tell the two apart: how
-far the peak stands out from chance, how near its best rival comes, and how well its position agrees with the
-prior. A logistic function of these gives the probability; its weights were fitted by ``python -m
-bench.accuracy.confidence`` on simulated towns. Votes of the frame's blocks, each with its shift, added nothing.
+A peak is high over a wrong place too, where streets or furrows look alike. What tells the two apart: how far the
+peak stands above its best rival, measured by chance; how much frame and map have in common there; and how well
+its position agrees with the prior. A logistic function of these gives the probability; ``python -m
+bench.accuracy.confidence`` fitted its weights on simulated towns and on real pictures of one year on the map of
+another. Votes of the frame's blocks, each with its shift, added nothing.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from engine.geo import chi_square
 from engine.values import Fix, Peak
 
 _MAX_LOG10_ALARMS = 60.0  # beyond that nothing becomes more probable
+_MAX_LEAD = 50.0  # sigmas, as well
+_MIN_SCORE = 0.02  # below that nothing becomes less probable
 _MAX_CHI_SQUARE = 12.0  # beyond that the prior may be the one that is wrong
 
 
@@ -42,11 +45,13 @@ class PeakFeatures:
     Attributes:
         sigmas: Fisher's z of the score, in standard deviations of chance.
         ratio: the best rival's score as a share of the peak's, in [0, 1].
+        score: of the peak: chance is one thing, and how much two pictures of one place have in common another.
         agreement: of its position with the prior.
     """
 
     sigmas: float
     ratio: float
+    score: float
     agreement: PriorAgreement
 
 
@@ -59,11 +64,14 @@ class PoseFeatures:
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
         height_chi_square: of the height against the telemetry's, with one degree of freedom; None where the
             height is unknown or doubted.
+        rival_share: votes of the best translation elsewhere over those of this one; None where matches did not
+            vote, and ``log10_nfa`` is of the pose.
     """
 
     log10_nfa: float
     prior_chi_square: float | None
     height_chi_square: float | None
+    rival_share: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,14 +79,19 @@ class PeakModel:
     """Weights of :func:`regressors`; their sum is log(p / (1 - p))."""
 
     constant: float
-    log_sigmas: float
-    ratio: float
+    root_lead: float
     prior_chi_square: float
     log_spread: float
+    log_score: float
 
 
-PEAK_MODEL = PeakModel(constant=16.158, log_sigmas=0.536, ratio=-14.075, prior_chi_square=-0.568, log_spread=-1.39)
-"""Fitted on 6,000 matches over six towns, half of them of frames that show no place in their window."""
+PEAK_MODEL = PeakModel(constant=4.16, root_lead=3.85, prior_chi_square=-0.43, log_spread=-1.79, log_score=0.93)
+"""Of the first look: fitted on matches over towns and of years, half of them of frames without a place there."""
+
+SECOND_LOOK_MODEL = PeakModel(
+    constant=6.6, root_lead=3.77, prior_chi_square=-0.57, log_spread=-1.64, log_score=2.42
+)
+"""Of the second look, fitted on the same matches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +104,8 @@ class PoseModel:
     no_prior: float
     height_chi_square: float
     no_height: float
+    rival_share: float
+    no_vote: float
 
 
 POSE_MODEL = PoseModel(
@@ -100,6 +115,8 @@ POSE_MODEL = PoseModel(
     no_prior=-1.819,
     height_chi_square=-0.264,
     no_height=0.511,
+    rival_share=0.0,
+    no_vote=0.0,
 )
 """Fitted on 4,200 matches, with parts of the telemetry left out in turns and frames reduced as for budgets."""
 
@@ -114,7 +131,7 @@ def peak_features(peak: Peak, sigma: float, agreement: PriorAgreement) -> PeakFe
     """
     z = math.atanh(min(max(peak.score, 0.0), 0.999))
     ratio = max(peak.second_score, 0.0) / max(peak.score, 1e-3)
-    return PeakFeatures(sigmas=z / sigma, ratio=min(ratio, 1.0), agreement=agreement)
+    return PeakFeatures(sigmas=z / sigma, ratio=min(ratio, 1.0), score=peak.score, agreement=agreement)
 
 
 def prior_agreement(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> PriorAgreement:
@@ -136,23 +153,23 @@ def prior_agreement(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> P
 def regressors(features: PeakFeatures | PoseFeatures) -> NDArray[np.float64]:
     """What the weights are multiplied by.
 
-    Sigmas and false alarms enter by their logarithms: from 10 to 20 sigmas is the same step as from 5 to 10.
+    A peak counts by its lead, the sigmas by which it stands above its best rival, a pose by its false alarms, both
+    by their roots: the first sigmas of a lead say more than the next.
 
     Args:
         features: of a peak or of a pose.
 
     Returns:
-        (5,) of a peak or (6,) of a pose, in the order of the model's weights.
+        (5,) of a peak or (8,) of a pose, in the order of the model's weights.
     """
     if isinstance(features, PeakFeatures):
         prior_chi_square, spread_m = features.agreement.prior_chi_square, features.agreement.spread_m
-        sigmas = math.log(max(features.sigmas, 0.5))
-        return np.array(
-            [1.0, sigmas, features.ratio, min(prior_chi_square, _MAX_CHI_SQUARE), math.log(max(spread_m, 1.0))]
-        )
-    known = [_known(features.prior_chi_square), _known(features.height_chi_square)]
+        lead = min(max(features.sigmas, 0.0) * (1.0 - features.ratio), _MAX_LEAD)
+        off, spread = min(prior_chi_square, _MAX_CHI_SQUARE), math.log(max(spread_m, 1.0))
+        return np.array([1.0, math.sqrt(lead), off, spread, math.log(max(features.score, _MIN_SCORE))])
+    known = [_known(features.prior_chi_square), _known(features.height_chi_square), _known(features.rival_share)]
     alarms = min(max(-features.log10_nfa, 0.0), _MAX_LOG10_ALARMS)
-    return np.array([1.0, math.sqrt(alarms), *known[0], *known[1]])
+    return np.array([1.0, math.sqrt(alarms), *known[0], *known[1], *known[2]])
 
 
 def _known(chi_square: float | None) -> tuple[float, float]:

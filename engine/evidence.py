@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from engine.motion import PositionEstimate
+from engine.orthomap import OrthoMap
 from engine.values import Fix, Prior
 
 MAX_PROBABILITY = 0.9999
@@ -38,6 +39,21 @@ def probability(odds: float) -> float:
 def match_log_odds(fix: Fix) -> float:
     """Of a match by itself, where every second frame shows a place in its window."""
     return log_odds(UNSTATED_PROBABILITY if fix.confidence is None else fix.confidence)
+
+
+def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
+    """The position of another source, as far as it can be relied on.
+
+    Args:
+        prior: by the other source.
+        site: the map, whose axes count.
+    """
+    if prior.east_m is not None and prior.north_m is not None:
+        return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m, log_odds(RELIABILITY))
+    assert prior.lat_deg is not None  # a Prior has one of the two
+    assert prior.lon_deg is not None
+    place_m = site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
+    return PositionEstimate(np.asarray(place_m[:2], np.float64), prior.sigma_m, log_odds(RELIABILITY))
 
 
 def new_ground_share(moved_m: float, height_m: float | None) -> float:

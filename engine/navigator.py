@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from engine.budget import Budget
 from engine.covariance import map_sigma_of
-from engine.evidence import MAX_PROBABILITY, RELIABILITY, Sources, log_odds, match_log_odds, probability
+from engine.evidence import (
+    MAX_PROBABILITY,
+    RELIABILITY,
+    Sources,
+    log_odds,
+    match_log_odds,
+    position_of,
+    probability,
+)
 from engine.hypotheses import Hypotheses, Hypothesis, Match
 from engine.map_offset import MapOffset, MapOffsetEstimator
 from engine.motion import (
@@ -103,7 +111,7 @@ class Navigator:
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._velocity: VelocityEstimate | None = None  # by the last fixes
         self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
-        self._anchor = None if start is None else _Anchor(self._position(start), None)
+        self._anchor = None if start is None else _Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
         self._hypotheses = Hypotheses(self._drift, o.gate)
         self._refusals = 0  # in a row
@@ -209,7 +217,7 @@ class Navigator:
 
     def _sources(self, now: OdometrySample, prior: Prior | None, *, late: bool) -> Sources:
         """What is known of the position, and where the matcher looks for it."""
-        given = None if prior is None else self._position(prior)
+        given = None if prior is None else position_of(prior, self._matcher.site)
         sources = Sources(self._reckoned(now), given, self._pending_position(now))
         chosen, chosen_prior = self._searched(sources, now, late=late)
         misled = self._refusals >= self._options.lost_after and self._is_turn(self._refusals)
@@ -247,14 +255,6 @@ class Navigator:
         """Dead reckoning from the strongest match that waits for others."""
         pending = self._hypotheses.pending
         return None if pending is None else self._hypotheses.position(pending, now)
-
-    def _position(self, prior: Prior) -> PositionEstimate:
-        if prior.east_m is not None and prior.north_m is not None:
-            return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m, log_odds(RELIABILITY))
-        assert prior.lat_deg is not None  # a Prior has one of the two
-        assert prior.lon_deg is not None
-        estimate = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
-        return PositionEstimate(np.asarray(estimate[:2], np.float64), prior.sigma_m, log_odds(RELIABILITY))
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""

@@ -15,6 +15,9 @@ _MIDDLE_GREY = 127.5
 # Added to the local variance, in squared grey levels, so that sensor noise on flat ground is not amplified.
 _NOISE_VARIANCE = 4.0
 
+_EDGE_SCALE_PX, _STRUCTURE_SCALE_PX = 1.0, 1.5  # of the gradients, and of the structure tensor
+_STRUCTURE_NOISE = 20.0  # squared grey levels, so that sensor noise on flat ground has no orientation
+
 
 def check_score(score: str) -> None:
     """Raise OptionError where no score has this name."""
@@ -61,6 +64,41 @@ def enhance(
     inner = None if weight is None else cv2.erode(weight, np.ones((3, 3), np.uint8))
     gradient = _normalised(_gradient_magnitude(smooth), radius_px, inner)
     return gradient if score == "gradient" else gradient + _normalised(smooth, radius_px, weight)
+
+
+def orientation(
+    gray: NDArray[np.uint8], *, radius_px: int = 8, valid: NDArray[np.bool_] | None = None
+) -> FloatImage:
+    """Which way edges run, and how clearly, as two channels: cosine and sine of the doubled angle.
+
+    The structure tensor's deviation from isotropy, smoothed, over its mean strength in the neighbourhood. An edge
+    whose sides swap their tones has the same orientation.
+
+    Args:
+        gray: (H, W).
+        radius_px: neighbourhoods of the normalisation are boxes of 2 radius_px + 1 pixels.
+        valid: (H, W) bool; the result is 0 where it is False.
+
+    Returns:
+        (2, H, W) float32.
+
+    References:
+        Granlund, In search of a general picture processing operator, CGIP 1978 (the doubled angle).
+    """
+    smooth = cv2.GaussianBlur(gray, (5, 5), _EDGE_SCALE_PX)
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, i, 1 - i, ksize=3) for i in (1, 0))
+    weight = None if valid is None else cv2.erode(valid.astype(np.float32), np.ones((5, 5), np.uint8))
+    sine = cv2.multiply(across, down, scale=2.0)
+    cv2.multiply(across, across, dst=across)
+    cv2.multiply(down, down, dst=down)
+    parts = [cv2.subtract(across, down), sine, cv2.add(across, down)]
+    if weight is not None:
+        parts = [part * weight for part in parts]
+    cosine, sine, strength = (cv2.GaussianBlur(part, (7, 7), _STRUCTURE_SCALE_PX) for part in parts)
+    box = (2 * radius_px + 1, 2 * radius_px + 1)
+    size = cv2.sqrt(cv2.multiply(strength, cv2.blur(strength, box)))
+    size += _STRUCTURE_NOISE
+    return np.stack([_masked(cv2.divide(part, size), weight) for part in (cosine, sine)])
 
 
 def _smoothed(gray: NDArray[np.uint8], weight: FloatImage | None) -> NDArray[np.uint8] | FloatImage:

@@ -28,7 +28,7 @@ from engine.values import GridPose, Peak
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 PIXELS = 2500  # 100 blocks of 5 x 5: one sigma of chance is 0.1
-AT_PRIOR = PeakFeatures(sigmas=10.0, ratio=0.6, agreement=PriorAgreement(0.0, 8.0))
+AT_PRIOR = PeakFeatures(sigmas=10.0, ratio=0.6, score=0.4, agreement=PriorAgreement(0.0, 8.0))
 RULE = PeakRule(min_sigmas=2.0, min_margin_sigmas=0.5, min_margin_sigmas_whole_map=1.0)
 
 

@@ -23,7 +23,7 @@ from engine.confidence import (
 from engine.values import Peak, Timings, Window
 
 NEAR = PriorAgreement(prior_chi_square=4.0, spread_m=8.0)
-MIDDLING = PeakFeatures(sigmas=10.0, ratio=0.6, agreement=NEAR)
+MIDDLING = PeakFeatures(sigmas=10.0, ratio=0.6, score=0.4, agreement=NEAR)
 
 
 def made_fix(east_m, north_m, variance_m2):
@@ -76,7 +76,7 @@ def test_more_evidence_makes_a_peak_more_probable(better, worse):
 
 def test_a_prior_that_is_far_off_does_not_outweigh_a_plain_match():
     """The prior may be the one that is wrong; how far it is off then says nothing more."""
-    plain = PeakFeatures(sigmas=25.0, ratio=0.1, agreement=PriorAgreement(50.0, 8.0))
+    plain = PeakFeatures(sigmas=25.0, ratio=0.1, score=0.6, agreement=PriorAgreement(50.0, 8.0))
     farther = replace(plain, agreement=PriorAgreement(5000.0, 8.0))
     assert probability(plain) == probability(farther) > PeakRule().min_confidence
 

@@ -50,7 +50,9 @@ def flight(tmp_path_factory):
     "page",
     [
         pytest.param(
-            page, id=page_name(page), marks=[pytest.mark.slow] if page.stem in ("simulator", "own-matcher") else []
+            page,
+            id=page_name(page),
+            marks=[pytest.mark.slow] if page.stem in ("simulator", "own-matcher", "learned") else [],
         )
         for page in PAGES
         if FENCE.search(page.read_text(encoding="utf-8"))

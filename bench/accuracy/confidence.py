@@ -1,9 +1,10 @@
 """Fit the probability that a fix is right: prints the constants of ``engine.confidence``.
 
-    python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT]
+    python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT|...]
 
-On towns that no other benchmark reports on. Half of the matches have an answer; what is left out of the telemetry
-and how coarsely SIFT looks changes from match to match.
+On towns that no other benchmark reports on, and for NCC as many matches of one year on the map of another over the
+cities' half for fitting. Half of the matches have an answer; what is left out of the telemetry and how coarsely
+SIFT looks changes from match to match.
 """
 
 from __future__ import annotations
@@ -15,14 +16,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.accuracy.judged import Bench, Row
+from bench.accuracy.judged import FIRST_LOOK, SECOND_LOOK, Bench, Row
 from bench.accuracy.trials import Trial, ground
+from bench.accuracy.year_pairs import matched as year_matched
 from engine.confidence import PeakModel, PoseModel
 from engine.device import set_threads
 from engine.methods.options import SiftOptions
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
-MODELS = {"NCC": PeakModel, "SIFT": PoseModel}
+MODELS = {FIRST_LOOK: PeakModel, SECOND_LOOK: PeakModel, "SIFT": PoseModel}
 UNTOLD = 0.25  # how often something is left out
 SCALES = (0.5, 0.35, 0.25)  # of the frame, as a budget asks for
 
@@ -51,9 +53,15 @@ def matched(job: tuple[int, int, int, str]) -> list[Row]:
     set_threads(1)
     bench, rng = Bench(ground(seed), ground(other, map_only=True)), np.random.default_rng(seed)
     trials = bench.trials(range(count), rng)
-    if method == "NCC":
+    if method in (FIRST_LOOK, SECOND_LOOK):
         return [bench.judged(made, method) for made in trials]
     return [_by_sift(bench, made, rng) for made in trials]
+
+
+def matched_years(count: int, method: str) -> list[Row]:
+    """Matches of one year on the map of another; right within the benchmark's own 5 m."""
+    set_threads(1)
+    return [row for row, _ in year_matched("naip-cities", "fit", [method], count)]
 
 
 def _by_sift(bench: Bench, made: Trial, rng: np.random.Generator) -> Row:
@@ -76,11 +84,15 @@ def main() -> None:
             continue
         jobs = [(a, b, each, method) for a, b in zip(FIT_SEEDS, FIT_SEEDS[1:] + FIT_SEEDS[:1], strict=True)]
         with ProcessPoolExecutor(2) as pool:
-            found = [row for part in pool.map(matched, jobs) for row in part if row.terms]
+            years = None if method == "SIFT" else pool.submit(matched_years, options.matches, method)
+            parts = [*pool.map(matched, jobs), *([] if years is None else [years.result()])]
+        found = [row for part in parts for row in part if row.regressors]
         right = np.array([row.right for row in found])
-        weights = model(*fitted(np.array([row.terms for row in found]), right))
+        weights = model(*fitted(np.array([row.regressors for row in found]), right))
         wrong = int((~right).sum())
-        print(f"{weights}\n{each * len(jobs)} matches, {len(found)} found something, {wrong} wrong", flush=True)
+        print(
+            f"{weights}\n{sum(map(len, parts))} matches, {len(found)} found something, {wrong} wrong", flush=True
+        )
 
 
 if __name__ == "__main__":

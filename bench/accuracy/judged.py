@@ -35,6 +35,8 @@ SCORES = {
     "SIFT": ("probability", "false alarms", "share of inliers"),
     "auto": ("probability",),
 }
+FIRST_LOOK, SECOND_LOOK = "NCC, first look", "NCC, second look"
+"""Methods for fits: the parts of NCC, of which the second is asked where the first is refused."""
 LOOSE = PoseOptions(min_inliers=4, max_log10_nfa=2.0)  # poses that chance may make, so that there is what to judge
 _PSR_PX = 11.0
 
@@ -92,23 +94,48 @@ class Bench:
         """The match by a method as the engine is set up."""
         matcher = self.matcher(made.on, method)
         if method == "NCC":
-            query = _query(matcher, made.frame, made.prior)
-            ncc = _part(matcher, "ncc", Ncc)
-            found = ncc.find(query)
-            if isinstance(found, NoFix):
-                return self.row(made, method, None, False, [], [])
-            result = ncc.judge(query, found)
-            assert found.features is not None  # there is a prior, and a heading and height to trust
-            scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found)]
-            scores.append(-found.features.ratio)
-            values = regressors(found.features).tolist()
-            return self.row(made, method, found.fix, isinstance(result, Fix), scores, values)
+            return self.peaked(made)
+        if method in (FIRST_LOOK, SECOND_LOOK):
+            return self.looked(made, method)
         if method == "SIFT":
             return self.posed(made, made.frame, made.prior, matcher.options.sift)
         fix = matcher.locate(made.frame, made.prior)
         if isinstance(fix, NoFix):
             return self.row(made, method, None, False, [], [])
         return self.row(made, method, fix, True, [fix.confidence or 0.0], [])
+
+    def peak(self, made: Trial) -> tuple[Query, Ncc, PeakCandidate | NoFix]:
+        """The highest peak of a match by NCC at the first look, accepted or not."""
+        matcher = self.matcher(made.on, "NCC")
+        query, ncc = _query(matcher, made.frame, made.prior), _part(matcher, "ncc", Ncc)
+        return query, ncc, ncc.find(query)
+
+    def peaked(self, made: Trial) -> Row:
+        """The match by NCC alone: by its second look where the first one's peak is refused."""
+        query, ncc, found = self.peak(made)
+        if isinstance(found, NoFix):
+            return self.row(made, "NCC", None, False, [], [])
+        result = ncc.judge(query, found)
+        again = None if isinstance(result, Fix) else ncc.find_again(query, found)
+        if again is not None:
+            found, result = again, ncc.judge_again(query, again)
+        assert found.features is not None  # there is a prior, and a heading and height to trust
+        scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found), -found.features.ratio]
+        values = regressors(found.features).tolist()
+        return self.row(made, "NCC", found.fix, isinstance(result, Fix), scores, values)
+
+    def looked(self, made: Trial, method: str) -> Row:
+        """The match by one look of NCC alone."""
+        query, ncc, peak = self.peak(made)
+        found = None if isinstance(peak, NoFix) else peak
+        if found is not None and method == SECOND_LOOK:
+            found = ncc.find_again(query, found)
+        if found is None:
+            return self.row(made, method, None, False, [], [])
+        result = (ncc.judge_again if method == SECOND_LOOK else ncc.judge)(query, found)
+        assert found.features is not None  # there is a prior, and a heading and height to trust
+        scores, values = [found.fix.confidence or 0.0, found.peak.score], regressors(found.features).tolist()
+        return self.row(made, method, found.fix, isinstance(result, Fix), scores, values)
 
     def posed(self, made: Trial, frame: Frame, prior: Prior | None, options: SiftOptions) -> Row:
         """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""

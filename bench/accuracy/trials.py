@@ -182,16 +182,40 @@ def _year(year: str) -> Image:
         return cv2.cvtColor(np.moveaxis(source.read([1, 2, 3]), 0, 2), cv2.COLOR_RGB2GRAY)[:723, :934]
 
 
+def ground_quad_px(
+    site: OrthoMap,
+    camera: Camera,
+    place_m: Array,
+    height_m: float,
+    heading_deg: float,
+    roll_deg: float = 0.0,
+    pitch_deg: float = 0.0,
+) -> Array:
+    """(4, 2) map pixels of flat ground that the frame's corners see, clockwise from its top left."""
+    rays = np.c_[_corners_px(camera), np.ones(4)] @ np.linalg.inv(camera.matrix).T
+    rays = rays @ (enu_from_body(roll_deg, pitch_deg, heading_deg) @ camera.mount).T
+    return site.pixel_from_enu(place_m + rays[:, :2] * (height_m / -rays[:, 2:]))
+
+
+def _corners_px(camera: Camera) -> Array:
+    right, bottom = camera.width_px - 1, camera.height_px - 1
+    return np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], np.float64)
+
+
 def picture(
-    gray: Image, site: OrthoMap, camera: Camera, place_m: Array, height_m: float, heading_deg: float
+    gray: Image,
+    site: OrthoMap,
+    camera: Camera,
+    place_m: Array,
+    height_m: float,
+    heading_deg: float,
+    roll_deg: float = 0.0,
+    pitch_deg: float = 0.0,
 ) -> Image:
-    """What a level camera without distortion sees of a flat map."""
+    """What a camera without distortion sees of a flat map."""
+    quad_px = ground_quad_px(site, camera, place_m, height_m, heading_deg, roll_deg, pitch_deg)
+    seen = cv2.getPerspectiveTransform(quad_px.astype(np.float32), _corners_px(camera).astype(np.float32))
     size = (camera.width_px, camera.height_px)
-    corners = np.array([[0, 0], [size[0] - 1, 0], [size[0] - 1, size[1] - 1], [0, size[1] - 1]], np.float64)
-    rays = np.c_[corners, np.ones(4)] @ np.linalg.inv(camera.matrix).T
-    rays = rays @ (enu_from_body(0.0, 0.0, heading_deg) @ camera.mount).T
-    ground_px = site.pixel_from_enu(place_m + rays[:, :2] * (height_m / -rays[:, 2:]))
-    seen = cv2.getPerspectiveTransform(ground_px.astype(np.float32), corners.astype(np.float32))
     return np.asarray(cv2.warpPerspective(gray, seen, size, flags=cv2.INTER_LINEAR), np.uint8)
 
 

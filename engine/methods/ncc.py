@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from engine.acceptance import judge_peak
-from engine.confidence import PeakFeatures, peak_features, prior_agreement, probability
+from engine.acceptance import judge_peak, judge_second_look
+from engine.confidence import SECOND_LOOK_MODEL, PeakFeatures, peak_features, prior_agreement, probability
 from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
@@ -19,6 +19,7 @@ from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
+from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
 from engine.values import Fix, NoFix, Peak, Reason, Result, Window
@@ -29,6 +30,7 @@ MAX_WINDOW_PX = 8 << 20
 _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
 _MIN_SIDE_PX = 24  # of what is correlated there
 _MAX_CANDIDATES = 4  # of a refused frame
+_SECOND_LOOK = "ncc second look"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,9 @@ class Ncc(Method):
             return
         for coarser in self._expected_window_px(query):
             self.refine(query, self.correlate(query, coarser))
+        found = self.find(query)
+        if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
+            self._costed_second_look(query, found)
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
@@ -106,6 +111,10 @@ class Ncc(Method):
         with query.scheduler.costed(step, works[coarser]):
             found = self.find(query, coarser=coarser)
             result = found if isinstance(found, NoFix) else self.judge(query, found)
+        if isinstance(found, PeakCandidate) and isinstance(result, NoFix) and found.features is not None:
+            result = self._look_again(query, found, result)
+        if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
+            result = replace(result, candidates=self._candidates(query, found))
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def refine(self, query: Query, result: Result) -> Result:
@@ -165,8 +174,7 @@ class Ncc(Method):
         rule, confidence = self.options.rule, fix.confidence
         refusal = judge_peak(found.peak, pixels, found.features, confidence, rule, searched=found.searched)
         if refusal is not None:
-            refused = query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
-            return replace(refused, candidates=self._candidates(query, found))
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
         return fix
 
     def _candidates(self, query: Query, found: PeakCandidate) -> tuple[Fix, ...]:
@@ -177,7 +185,8 @@ class Ncc(Method):
         if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
             return ()
         correlator, aligned = Correlator(query, self.prepared, self.options), found.aligned
-        surface = correlator.surface(aligned, found.fix.window)
+        with query.scheduler.stage("candidates"):
+            surface = correlator.surface(aligned, found.fix.window)
         if surface is None:
             return (found.fix,)
         scores, corner_px = surface
@@ -189,6 +198,45 @@ class Ncc(Method):
             fix = self._fix(correlator, aligned, peak, found.fix.window, searched=False)
             fixes.append(replace(fix, confidence=probability(self._features(query, aligned, peak, fix))))
         return tuple(fixes)
+
+    def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
+        """The fix of the second look at the same window, where that is wanted and affordable, else the refusal."""
+        if not self.options.second_look or not query.scheduler.can_afford(_SECOND_LOOK, _window_px(found)):
+            return refusal
+        again = self._costed_second_look(query, found)
+        return refusal if again is None else self.judge_again(query, again)
+
+    def _costed_second_look(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
+        with query.scheduler.costed(_SECOND_LOOK, _window_px(found)), query.scheduler.stage("second look"):
+            return self.find_again(query, found)
+
+    def find_again(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
+        """The highest peak of the second look, see :mod:`engine.methods.second_look`.
+
+        Args:
+            query: the frame.
+            found: at the first look, with features.
+        """
+        correlator, window = Correlator(query, self.prepared, self.options), found.fix.window
+        assert query.prior is not None
+        assert query.prior_px is not None
+        looked = second_look(correlator, found.aligned, window)
+        if looked is None:
+            return None
+        fix = self._fix(correlator, found.aligned, looked.peak, window, searched=False)
+        agreement = prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+        features = peak_features(looked.peak, looked.chance_sigma, agreement)
+        fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
+        return PeakCandidate(looked.peak, found.aligned, fix, features, found.searched)
+
+    def judge_again(self, query: Query, found: PeakCandidate) -> Result:
+        """The fix where the peak of the second look is accepted, else a refusal."""
+        assert found.features is not None
+        assert found.fix.confidence is not None
+        refusal = judge_second_look(found.peak, found.features, found.fix.confidence, self.options.rule)
+        if refusal is not None:
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
+        return found.fix
 
     def _trusts(self, query: Query) -> bool:
         return self.options.trusts(query.telemetry.grid_heading_deg)
@@ -245,7 +293,8 @@ class Ncc(Method):
 
     def _fix(self, correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
         """The camera's nadir and its covariance; the heading too where it was searched for."""
-        query, pose, errors = correlator.query, aligned.pose, self.options.errors
+        query, pose = correlator.query, aligned.pose
+        errors = query.errors(self.options.errors)
         height_m = pose.height_agl_m
         assert height_m is not None  # asked for before
         rows, columns = aligned.template.shape
@@ -281,3 +330,8 @@ class Ncc(Method):
                 rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
                 out[coarser] = min(width, columns) * min(height, rows)
         return out
+
+
+def _window_px(found: PeakCandidate) -> float:
+    """Pixels of the window that was searched, on its level."""
+    return float(found.fix.window.area_px >> 2 * found.aligned.level)

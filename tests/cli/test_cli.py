@@ -629,6 +629,19 @@ def test_an_interrupted_run_keeps_its_rows(flight, tmp_path, capsys, monkeypatch
 NARROW = {"COLUMNS": "30", "TERM": "dumb"}
 
 
+def test_the_learned_method_says_what_is_wrong_with_its_weights(flight, tmp_path, capsys):
+    out, learned = tmp_path / "out", ("--method=learned",)
+    wanted = "--weights: expected the files of LoFTR, or LightGlue with DISK, ALIKED or SuperPoint, got none"
+    refused(capsys, flight, out, 2, wanted, more=learned)
+    refused(capsys, flight, out, 2, "--weights: no such file: ", more=(*learned, "--weights=none.pth"))
+    refused(
+        capsys, flight, out, 2, "--weights: ", "camera.yaml", more=(*learned, f"--weights={flight}/camera.yaml")
+    )
+    refused(capsys, flight, out, 2, "--weights: expected them with method learned", more=("--weights=none.pth",))
+    locate = ["locate", next(flight.joinpath("frames").iterdir()), f"--map={flight}/map.tif", *learned]
+    assert wanted in error_line(capsys, [*locate, f"--camera={flight}/camera.yaml"], 2)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_the_console_script_in_a_narrow_pipe(flight, tmp_path):

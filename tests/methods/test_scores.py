@@ -146,8 +146,8 @@ def test_regions_of_a_large_map_join_without_a_seam(score, nodata, ground, monke
 
 
 def locate(ground, camera, frame, score):
-    """The NCC method on a map that was prepared for a score."""
-    options = MatcherOptions(ncc=NccOptions(score=score))
+    """The NCC method on a map that was prepared for a score, at the first look."""
+    options = MatcherOptions(ncc=NccOptions(score=score, second_look=False))
     scheduler = Scheduler(Deadline(Budget()), CPU)
     query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, scheduler)
     return Ncc(ground.site, CPU, options).locate(query)
