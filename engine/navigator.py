@@ -276,8 +276,8 @@ class Navigator:
         required, against = self._options.min_log_odds, self._against(fix, now)
         own, given = (self._vouching(source, fix, sources) for source in (sources.own, sources.given))
         disputed = given < 0.0
-        if disputed and self._anchor is not None and self._anchor.disputed:
-            given = 0.0  # an error of the other source lasts
+        if self._anchor is not None and self._anchor.disputed:
+            given = 0.0  # an error of the other source lasts: until it agrees again it counts neither way
         others = match_log_odds(fix) + given
         if against is None and own + others >= required:
             self._accept(fix, now, 1, own + others, jump=False, disputed=disputed)
