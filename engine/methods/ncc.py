@@ -16,6 +16,7 @@ from engine.methods import hypothesis_search
 from engine.methods.correlation import METHOD, Aligned, Correlator
 from engine.methods.explanation import Explanation, explain_correlation
 from engine.methods.method import Method
+from engine.methods.oblique import is_oblique
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
@@ -121,8 +122,8 @@ class Ncc(Method):
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
         if not isinstance(result, Fix) or result.stage != "fine" or not self.options.refine:
             return result
-        # A height that was searched for is not the frame's, and an unknown slope would be taken for a tilt.
-        if not self._trusts(query) or not query.site.has_surface:
+        # A height that was searched for is not the frame's; an unknown slope would pass for a wrong tilt.
+        if not self._trusts(query) or (query.telemetry.has_tilt and not query.site.has_surface):
             return result
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
@@ -157,6 +158,7 @@ class Ncc(Method):
             peak, aligned = hypothesis_search.search(correlator, aligned, window)
         else:
             peak = correlator.search(aligned, window)
+            peak, aligned = self._over_its_ground(correlator, aligned, window, peak)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
             return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
@@ -167,6 +169,17 @@ class Ncc(Method):
         found = PeakCandidate(peak, aligned, fix, None, searched)
         no_features = searched or wide or query.prior is None
         return found if no_features else self._with_confidence(correlator, found)
+
+    def _over_its_ground(
+        self, correlator: Correlator, aligned: Aligned, window: Window, peak: Peak | None
+    ) -> tuple[Peak | None, Aligned]:
+        """The peak of an oblique frame that is drawn once more, over the ground where it was found."""
+        attitude = aligned.pose.grid_attitude
+        if peak is None or attitude is None or not is_oblique(correlator.query, attitude):
+            return peak, aligned
+        again = correlator.align(aligned.pose, aligned.level, correlator.nadir_px(peak, aligned))
+        second = None if isinstance(again, NoFix) else correlator.search(again, window)
+        return (peak, aligned) if second is None or isinstance(again, NoFix) else (second, again)
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where its peak is accepted, else a refusal."""
