@@ -62,14 +62,14 @@ class Refinement:
             fit = fit or self._through_levels(prior, _MUCH_COARSER)
             pose_covariance = None if fit is None else covariance_of(fit, prior)
         if fit is not None and pose_covariance is not None:
-            covariance = pose_covariance[:3, :3] + errors.map_m**2 * np.eye(3)
+            covariance = pose_covariance[:3, :3].copy()
             height_m = fit.pose.center_m[2] - query.site.ground_m
             covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
             if not query.site.has_surface:  # a slope of the ground was taken for a tilt
                 covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
             moved = (fit.pose.center_m - prior.pose.center_m)[:2]
-            if are_consistent(moved, fix.covariance_m2[:2, :2] + covariance[:2, :2]):
-                return self._refined_fix(fix, fit, covariance)
+            if are_consistent(moved, fix.relative_covariance_m2 + covariance[:2, :2]):
+                return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3))
         if has_tilt or not query.site.has_surface:
             return fix
         detail = "roll and pitch are unknown, and the picture does not determine them"
@@ -147,6 +147,7 @@ class Refinement:
             east_north_m=center_m[:2],
             up_m=float(center_m[2]),
             grid_attitude=Attitude(*attitude_from_rotation(fit.pose.rotation.T @ query.camera.mount.T)),
+            map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
 
