@@ -17,6 +17,7 @@ from engine.values import Attitude, NoFix, Window
 from engine.window import level_crop, level_for
 
 _CROP_STEP_PX = 32
+_NO_LARGER = 2.0**-0.25  # level_for allows pixels that are larger by this
 _MIN_DOWN = 0.2  # cosine of the optical axis off the vertical
 _LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
 
@@ -87,7 +88,10 @@ def views_of(
     """
     site, heights_m = query.site, hypothesis.heights_m
     per_height = _slant(query) / (query.camera.focal_px * scale * site.gsd_m_per_px)
-    first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
+    if hypothesis.height_m is not None:
+        first = last = level_at(query, hypothesis.height_m, scale)
+    else:
+        first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
     views: dict[int, MapView] = {}
     for level in range(first, last + 1):
         served_m = heights_m[1] if level == last else 2 ** (level + _LEVEL_ENDS) / per_height
@@ -106,9 +110,9 @@ def view_in(query: Query, window: Window, height_m: float, scale: float) -> MapV
 
 
 def level_at(query: Query, height_m: float, scale: float) -> int:
-    """The level whose pixels are like those of a frame that was reduced to a scale."""
+    """The level whose pixels are like those of a frame that was reduced to a scale, and no larger."""
     per_px = height_m * _slant(query) / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
-    return level_for(1.0, per_px, query.site.levels)
+    return level_for(1.0, per_px * _NO_LARGER, query.site.levels)
 
 
 def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
