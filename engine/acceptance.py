@@ -42,8 +42,6 @@ class PeakRule:
             another town, turned until they fit, look like these.
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
         min_confidence: probability of :func:`engine.confidence.probability` below which a peak is not accepted.
-        min_confidence_second_look: as ``min_confidence``, of the peak of a second look: it is asked for where the
-            first look was refused, and two tries give chance two.
         null_test_below: confidence below which the peak must also beat the null hypothesis, its own template
             upside down in the same window; 1 always asks for it.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
@@ -56,17 +54,15 @@ class PeakRule:
     max_prior_chi_square: float = 18.4
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
-    min_confidence: float = 0.98
-    min_confidence_second_look: float = 0.99
-    null_test_below: float = 0.995
+    min_confidence: float = 0.99
+    null_test_below: float = 0.9999
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 
     def __post_init__(self) -> None:
         check_positive(self, *self.__dataclass_fields__)
-        for name in ("min_confidence", "min_confidence_second_look"):
-            if not getattr(self, name) < 1.0:
-                raise OptionError(f"{name}: expected a probability below 1, got {getattr(self, name)}")
+        if not self.min_confidence < 1.0:
+            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
         if not self.null_test_below <= 1.0:
             raise OptionError(f"null_test_below: expected a probability of at most 1, got {self.null_test_below}")
 
@@ -110,7 +106,7 @@ def judge_peak(
         return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
     if features is None or confidence is None or confidence >= rule.min_confidence:
         return None
-    return _improbable_peak(features, confidence, rule.min_confidence)
+    return _improbable_peak(features, confidence, rule)
 
 
 def judge_second_look(peak: Peak, features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal | None:
@@ -127,14 +123,13 @@ def judge_second_look(peak: Peak, features: PeakFeatures, confidence: float, rul
     if features.agreement.prior_chi_square > rule.max_prior_chi_square:
         figure = f"chi-square {features.agreement.prior_chi_square:.1f}"
         return Reason.AMBIGUOUS, f"the best place of a second look contradicts the prior ({figure})"
-    asked = rule.min_confidence_second_look
-    return None if confidence >= asked else _improbable_peak(features, confidence, asked)
+    return None if confidence >= rule.min_confidence else _improbable_peak(features, confidence, rule)
 
 
-def _improbable_peak(features: PeakFeatures, confidence: float, asked: float) -> Refusal:
+def _improbable_peak(features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal:
     figures = f"NCC {features.sigmas:.1f} sigmas, rival at {features.ratio:.0%}"
     chi_square_text = f"{features.agreement.prior_chi_square:.1f}"
-    return Reason.AMBIGUOUS, _improbable(confidence, asked, figures, chi_square_text)
+    return Reason.AMBIGUOUS, _improbable(confidence, rule.min_confidence, figures, chi_square_text)
 
 
 def judge_pose(features: PoseFeatures, confidence: float, min_confidence: float) -> Refusal | None:
