@@ -21,8 +21,9 @@ from engine.errors import (
 )
 from engine.live import Answer, Live, LiveOptions
 from engine.matcher import SceneMatcher
-from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
-from engine.navigator import Navigator, NavigatorOptions, NavigatorState
+from engine.methods.options import LearnedOptions, MatcherOptions, NccOptions, SiftOptions
+from engine.navigator import Navigator, NavigatorState
+from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
@@ -40,6 +41,7 @@ __all__ = [
     "EngineError",
     "Fix",
     "Frame",
+    "LearnedOptions",
     "Live",
     "LiveOptions",
     "MapError",

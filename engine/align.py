@@ -1,5 +1,8 @@
 """From a camera frame to a picture aligned with the map: grey, rectify (equations 2 and 3).
 
+A part of the frame is rectified on a plane for correlation (:func:`rectify`), the whole frame over the
+ground's relief for features (:func:`orthorectify`).
+
 Convention:
     A rectified patch has the map's pixels and axes. Its ``offset_px`` is the position of its top-left pixel
     relative to the camera's nadir, so that nadir = (matched position on the map) - offset.
@@ -8,6 +11,7 @@ Convention:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -191,3 +195,146 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...], fraction: float) -
     else:
         return None
     return (width, height) if min(width, height) >= 8 else None
+
+
+# ----------------------------------------------------------------------------------------- the whole frame
+
+MAX_FIELD_DEG = 70.0
+"""Of an oblique frame the ground is used up to this angle off the vertical; beyond it is far and foreshortened."""
+MIN_PICTURE_PX = 32
+"""Least side of an orthorectified frame."""
+MAX_PICTURE_PX = 8 << 20
+"""Most pixels of one: where it would cover more, its height is out of proportion to the map."""
+_NODES = 17  # along each side of the lattice on which the projection is computed; bilinear between
+_BORDER_RAYS = 16  # along each side of the frame
+_RIM_PX = 5  # of an orthorectified frame: gradients there would be those of its edge
+
+Relief = Callable[[Array], Array]
+"""Heights (...,) in metres above the ground below the camera, at offsets (..., 2) from the nadir in map pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orthophoto:
+    """The whole frame in the map's pixels and axes, by an assumed pose.
+
+    Attributes:
+        gray: (h, w) uint8; the edge is repeated where the frame shows nothing.
+        valid: (h, w) bool, where the frame shows the ground, its rim left out.
+        offset_px: (2,) of its top-left pixel from the assumed nadir, in map pixels.
+        frame_px: (h, w, 2) float32, the place in the frame that each pixel was taken from.
+    """
+
+    gray: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    offset_px: Array
+    frame_px: NDArray[np.float32]
+
+    def to_frame(self, xy_px: Array) -> Array:
+        """Places in the frame, bilinear.
+
+        Args:
+            xy_px: (N, 2) pixels of the orthophoto.
+
+        Returns:
+            (N, 2) pixels of the frame.
+        """
+        if not len(xy_px):
+            return np.zeros((0, 2))
+        at = xy_px.astype(np.float32)
+        found = cv2.remap(self.frame_px, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)
+        return np.asarray(found.reshape(-1, 2), np.float64)
+
+
+def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array) -> Array | None:
+    """The box about the ground that a frame shows, on a level plane, up to :data:`MAX_FIELD_DEG`.
+
+    Args:
+        camera: pinhole (the frame is undistorted).
+        attitude: of the body.
+        height_m: above the plane.
+        enu_jacobian: (2, 2) metres east and north per map pixel x and y.
+
+    Returns:
+        (2, 2) lower and upper corner in map pixels from the nadir; None where the middle of the frame looks beyond
+        that angle.
+    """
+    rays = _border_rays(camera) @ _enu_from_camera(camera, attitude).T
+    reach = np.hypot(rays[:, 0], rays[:, 1])
+    limit = math.tan(math.radians(MAX_FIELD_DEG))
+    if rays[-1, 2] >= 0.0 or reach[-1] > -rays[-1, 2] * limit * (1.0 - 1e-9):
+        return None
+    far = reach > -rays[:, 2] * limit
+    along = rays[:, :2] / np.where(far, reach / limit, -rays[:, 2])[:, None]
+    ground_px = np.linalg.solve(enu_jacobian, height_m * along.T).T
+    return np.stack([np.floor(ground_px.min(axis=0)), np.ceil(ground_px.max(axis=0))])
+
+
+def orthorectify(
+    gray: NDArray[np.uint8],
+    camera: Camera,
+    attitude: Attitude,
+    height_m: float,
+    enu_jacobian: Array,
+    relief: Relief | None = None,
+) -> Orthophoto | None:
+    """Draw the whole frame as the map would show it.
+
+    Args:
+        gray: (H, W) undistorted.
+        camera: its pinhole.
+        attitude: assumed of the body.
+        height_m: assumed above the ground below the camera.
+        enu_jacobian: (2, 2) metres east and north per map pixel x and y.
+        relief: of the ground; None is level.
+
+    Returns:
+        Orthophoto | None: None where it would be too small or too large, or the middle of the frame looks beyond
+        :data:`MAX_FIELD_DEG`.
+    """
+    bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)
+    if bounds is None or (bounds[1] - bounds[0]).min() < MIN_PICTURE_PX:
+        return None
+    if np.prod(bounds[1] - bounds[0]) > MAX_PICTURE_PX:
+        return None
+    width, height = (int(n) + 1 for n in bounds[1] - bounds[0])
+    nodes = np.stack(np.meshgrid(*(np.linspace(*ends, _NODES) for ends in bounds.T)), axis=-1)
+    up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
+    seen = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1) @ _enu_from_camera(camera, attitude)
+    ahead = seen[..., 2] > 0.0
+    steep = -up_m >= np.linalg.norm(seen, axis=-1) * math.cos(math.radians(MAX_FIELD_DEG + 1.0))
+    projected = seen @ camera.matrix.T / np.where(ahead, seen[..., 2], 1.0)[..., None]
+    projected[..., 2] = ahead & steep
+    between = _between_nodes(projected.astype(np.float32), (width, height))
+    frame_px = np.ascontiguousarray(between[..., :2])
+    slant_m = height_m / max(-_enu_from_camera(camera, attitude)[2, 2], 1e-3)
+    scale = slant_m / camera.focal_px / math.sqrt(abs(float(np.linalg.det(enu_jacobian))))
+    picture, picture_from_image = shrink(gray, scale)
+    factor, shift = np.diag(picture_from_image)[:2], picture_from_image[:2, 2]
+    at = frame_px * factor.astype(np.float32) + shift.astype(np.float32)
+    drawn = cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    limit = np.array([gray.shape[1] - 1, gray.shape[0] - 1], np.float32)
+    inside = (((frame_px >= 0) & (frame_px <= limit)).all(axis=-1) & (between[..., 2] > 0.999)).astype(np.uint8)
+    rim = np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)
+    valid = cv2.erode(inside, rim, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    return Orthophoto(np.asarray(drawn, np.uint8), valid, bounds[0], frame_px)
+
+
+def _enu_from_camera(camera: Camera, attitude: Attitude) -> Array:
+    turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
+    return np.asarray(turn @ camera.mount)
+
+
+def _border_rays(camera: Camera) -> Array:
+    """Rays (N, 3) through the border of the frame, and last the one through its middle."""
+    share = np.linspace(0.0, 1.0, _BORDER_RAYS, endpoint=False)
+    zero, one = np.zeros_like(share), np.ones_like(share)
+    sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
+    xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
+    pixels = xy * [camera.width_px - 1, camera.height_px - 1]
+    return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(camera.matrix).T
+
+
+def _between_nodes(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """A lattice (n, n, C) from corner to corner, bilinear at every pixel of a size (width, height)."""
+    columns, rows = (np.linspace(0.0, _NODES - 1.0, n, dtype=np.float32) for n in size)
+    return np.asarray(cv2.remap(values, *np.meshgrid(columns, rows), cv2.INTER_LINEAR), np.float32)

@@ -25,8 +25,51 @@ DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidist
 """Names of ROS camera_info, and the valid numbers of coefficients of each."""
 
 
+NADIR_PITCH_DEG = -90.0
+"""Pitch of a camera that looks straight down."""
+MOUNTS = {
+    "nadir": (0.0, NADIR_PITCH_DEG),
+    "nadir-right": (90.0, NADIR_PITCH_DEG),
+    "nadir-tail": (180.0, NADIR_PITCH_DEG),
+    "nadir-left": (270.0, NADIR_PITCH_DEG),
+    "forward-45": (0.0, -45.0),
+}
+"""Mounts by name: the side of the vehicle, clockwise from the nose, to which the top of the picture points in a
+camera that looks down, and the pitch; both in degrees."""
+
+
+def mount_rotation(name: str = "nadir", pitch_deg: float | None = None) -> Array:
+    """Rotation from the optical frame to the body of a camera that is mounted as a name says.
+
+    Args:
+        name: a key of :data:`MOUNTS`.
+        pitch_deg: of the optical axis against the body's horizontal: -90 looks straight down, -60 is turned up
+            from there by 30 degrees towards the side to which the top of the picture pointed. None is the name's.
+
+    Returns:
+        (3, 3) v_body = mount @ v_camera.
+
+    Raises:
+        CalibrationError: there is no such mount, or the camera would not look down.
+    """
+    if name not in MOUNTS:
+        raise CalibrationError(f"mount: expected one of {', '.join(MOUNTS)}, or 9 numbers, got {name!r}")
+    side_deg, named_pitch_deg = MOUNTS[name]
+    if pitch_deg is None:
+        pitch_deg = named_pitch_deg
+    elif named_pitch_deg != NADIR_PITCH_DEG and pitch_deg != named_pitch_deg:
+        raise CalibrationError(f"camera_pitch_deg: expected none with the mount {name}, got {pitch_deg:g}")
+    if not NADIR_PITCH_DEG <= pitch_deg < 0.0:  # NaN fails too
+        raise CalibrationError(f"camera_pitch_deg: expected -90 (straight down) to below 0, got {pitch_deg:g}")
+    sin_p, cos_p = np.sin(np.radians(pitch_deg)), np.cos(np.radians(pitch_deg))
+    sin_s, cos_s = np.sin(np.radians(side_deg)), np.cos(np.radians(side_deg))
+    pitched = np.array([[0.0, sin_p, cos_p], [1.0, 0.0, 0.0], [0.0, cos_p, -sin_p]])
+    turned = np.array([[cos_s, -sin_s, 0.0], [sin_s, cos_s, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(np.round(turned @ pitched, 15) + 0.0, np.float64)  # quarter turns are whole numbers
+
+
 def _nadir_mount() -> Array:
-    return np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return mount_rotation()
 
 
 @dataclass(frozen=True, eq=False)  # == of arrays is elementwise
@@ -94,6 +137,8 @@ class Camera:
     def load(cls, path: str | Path) -> Camera:
         """Read a ROS camera_info YAML file, with an optional ``mount``.
 
+        That is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
+
         Raises:
             CalibrationError: the file is missing or not YAML, or a field is missing or invalid.
         """
@@ -139,7 +184,13 @@ class Camera:
         distortion = numbers("distortion_coefficients") if "distortion_coefficients" in info else np.zeros(0)
         if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
             distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
-        mount = numbers("mount") if "mount" in info else _nadir_mount().ravel()
+        named, pitch_deg = info.get("mount", "nadir"), info.get("camera_pitch_deg")
+        if not isinstance(named, str) and pitch_deg is not None:
+            raise CalibrationError("camera_pitch_deg: expected with a mount by name, got one of numbers")
+        if isinstance(named, str):
+            mount = mount_rotation(named, None if pitch_deg is None else float(pitch_deg)).ravel()
+        else:
+            mount = numbers("mount")
         if mount.size != 9:
             raise CalibrationError(f"mount: expected 9 numbers, got {mount.size}")
         return cls(

@@ -64,11 +64,14 @@ class PoseFeatures:
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
         height_chi_square: of the height against the telemetry's, with one degree of freedom; None where the
             height is unknown or doubted.
+        rival_share: votes of the best translation elsewhere over those of this one; None where matches did not
+            vote, and ``log10_nfa`` is of the pose.
     """
 
     log10_nfa: float
     prior_chi_square: float | None
     height_chi_square: float | None
+    rival_share: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +104,8 @@ class PoseModel:
     no_prior: float
     height_chi_square: float
     no_height: float
+    rival_share: float
+    no_vote: float
 
 
 POSE_MODEL = PoseModel(
@@ -110,6 +115,8 @@ POSE_MODEL = PoseModel(
     no_prior=-1.819,
     height_chi_square=-0.264,
     no_height=0.511,
+    rival_share=0.0,
+    no_vote=0.0,
 )
 """Fitted on 4,200 matches, with parts of the telemetry left out in turns and frames reduced as for budgets."""
 
@@ -153,16 +160,16 @@ def regressors(features: PeakFeatures | PoseFeatures) -> NDArray[np.float64]:
         features: of a peak or of a pose.
 
     Returns:
-        (5,) of a peak or (6,) of a pose, in the order of the model's weights.
+        (5,) of a peak or (8,) of a pose, in the order of the model's weights.
     """
     if isinstance(features, PeakFeatures):
         prior_chi_square, spread_m = features.agreement.prior_chi_square, features.agreement.spread_m
         lead = min(max(features.sigmas, 0.0) * (1.0 - features.ratio), _MAX_LEAD)
         off, spread = min(prior_chi_square, _MAX_CHI_SQUARE), math.log(max(spread_m, 1.0))
         return np.array([1.0, math.sqrt(lead), off, spread, math.log(max(features.score, _MIN_SCORE))])
-    known = [_known(features.prior_chi_square), _known(features.height_chi_square)]
+    known = [_known(features.prior_chi_square), _known(features.height_chi_square), _known(features.rival_share)]
     alarms = min(max(-features.log10_nfa, 0.0), _MAX_LOG10_ALARMS)
-    return np.array([1.0, math.sqrt(alarms), *known[0], *known[1]])
+    return np.array([1.0, math.sqrt(alarms), *known[0], *known[1], *known[2]])
 
 
 def _known(chi_square: float | None) -> tuple[float, float]:

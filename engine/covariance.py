@@ -12,7 +12,7 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import transport_covariance
 from engine.orthomap import OrthoMap
-from engine.values import MAX_SIGMA_M, GridPose, Peak, check_positive
+from engine.values import MAX_SIGMA_M, Frame, GridPose, Peak, check_positive
 
 Array = NDArray[np.float64]
 
@@ -66,6 +66,16 @@ def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
     )
 
 
+def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
+    """The errors with the standard deviations that the frame states in place of those assumed of any telemetry."""
+    stated = {"heading_deg": frame.heading_sigma_deg, "tilt_deg": frame.tilt_sigma_deg}
+    if frame.height_sigma_m is not None:
+        stated |= {"height_m": frame.height_sigma_m, "height_share": _NO_SHARE}
+    known = {name: value for name, value in stated.items() if value is not None}
+    return replace(errors, **known) if known else errors
+
+
+_NO_SHARE = 1e-6  # of a height whose standard deviation is stated as a whole
 # Neighbouring pixels share their noise: so many of them, squared, count as one.
 _CORRELATION_PX = 5.0
 

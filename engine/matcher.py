@@ -27,7 +27,6 @@ from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
 
 _WARMUP_SHARES = (0.25, 0.12)  # of the map's shorter side that a synthetic frame sees
-_WARMUP_ROUNDS = 3
 _WARMUP_SIDE_PX = 4096  # of a larger map it is a part of this side
 
 
@@ -46,8 +45,9 @@ class SceneMatcher:
     Args:
         site: the map.
         camera: as calibrated, with its distortion; frames are undistorted by a lookup computed once.
-        method: "ncc" (needs height and heading), "sift" (needs neither), or "auto": NCC where height and heading
-            are known, then SIFT where there is time; where both have a fix they must agree.
+        method: "ncc" (needs height and heading), "sift" (needs neither), "auto": NCC where height and heading are
+            known, then SIFT where there is time; where both have a fix they must agree; or "learned": networks
+            with the weights of ``options.learned``.
         device: "cpu", "cuda" or "auto".
         options: settings; the defaults serve. The accuracy that the map states counts more than theirs.
 
@@ -82,7 +82,10 @@ class SceneMatcher:
         a map that comes from a file are kept for the next start. The frames that are matched are the map's own.
         """
         self._method.prepare()
-        for rounds in (1, _WARMUP_ROUNDS):  # what compiles and plans in the first is no cost of a flight's
+        for rounds in (
+            1,
+            self._method.warmup_rounds,
+        ):  # what compiles and plans in the first is no cost of a flight's
             self._costs = Costs()
             for share in _WARMUP_SHARES:
                 frame, prior = self._synthetic_frame(share)
@@ -146,7 +149,7 @@ class SceneMatcher:
         Args:
             frame: of the camera's resolution.
             window: that was searched, in map pixels.
-            method: "ncc" or "sift"; None takes the matcher's own, and NCC of "auto".
+            method: "ncc", "sift" or "learned"; None takes the matcher's own, and NCC of "auto".
 
         Raises:
             OptionError: the matcher has no such method.

@@ -154,8 +154,8 @@ class DriftModel:
             blind_m = min(velocity.sigma_mps * blind_s + changed_m, 2.0 * blind_m)
         return self.measured_sigma_mps * measured_s + blind_m
 
-    def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate:
-        """The velocity at the later of two fixes.
+    def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate | None:
+        """The velocity at the later of two fixes; None where they are so far apart that it predicts nothing.
 
         Args:
             apart_m: (2,) from one to the other.
@@ -163,18 +163,27 @@ class DriftModel:
             interval_s: between them.
 
         Returns:
-            VelocityEstimate: (2,) m/s to the east and north, and its standard deviation.
+            VelocityEstimate | None: (2,) m/s to the east and north, and its standard deviation.
         """
         changed_mps = self.acceleration_mps2 * math.sqrt(interval_s / 3.0)
+        if 2.0 * changed_mps >= 0.5 * self.max_speed_mps:  # over as long an interval it changes as much again
+            return None
         return VelocityEstimate(apart_m / interval_s, sigma_m / interval_s + changed_mps)
 
 
 @dataclass(frozen=True, slots=True)
 class PositionEstimate:
-    """A position (2,) east and north, and one standard deviation of each."""
+    """A position by other means than the match that it is compared with.
+
+    Attributes:
+        en_m: (2,) east and north.
+        sigma_m: one standard deviation of each.
+        log_odds: log(p / (1 - p)) of the probability that it holds within its standard deviation.
+    """
 
     en_m: Array
     sigma_m: float
+    log_odds: float = 0.0
 
     def chi_square(self, fix: Fix) -> float:
         """Squared distance of a fix in units of both covariances: two degrees of freedom."""

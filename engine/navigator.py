@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.budget import Budget
-from engine.errors import OptionError
+from engine.evidence import (
+    MAX_PROBABILITY,
+    RELIABILITY,
+    Sources,
+    agreement_log_odds,
+    log_odds,
+    match_log_odds,
+    new_ground_share,
+    repeated_log_odds,
+)
 from engine.motion import (
     DeadReckoning,
     DriftModel,
@@ -22,8 +31,9 @@ from engine.motion import (
     en_m,
     is_valid,
 )
+from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
-from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, check_positive
+from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
 Array = NDArray[np.float64]
 
@@ -53,54 +63,6 @@ class NavigatorState(enum.Enum):
     LOST = "lost"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NavigatorOptions:
-    """How a position is carried from frame to frame, and what is accepted; ``docs/integrity.md`` has the rules.
-
-    Attributes:
-        measured_velocity_sigma_mps: of a velocity that came with the frame.
-        acceleration_mps2: how hard the vehicle accelerates, for a second at a time, while its velocity is taken
-            from its last fixes.
-        max_speed_mps: assumed while nothing is known of the velocity.
-        growth: factor on the uncertainty that the window is made for, for every refusal in a row.
-        default_interval_s: time between frames that carry no stamp.
-        gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
-        trusted_sigma_m: a prediction that is better known than this may confirm or contradict a fix.
-        confirm: fixes in a row that must agree where no such prediction confirms them.
-        lost_after: refusals in a row after which the whole map is searched again.
-        lost_sigma_m: uncertainty of the prediction at which the same is done.
-        search_every: while lost, of so many frames one searches the whole map; the others look where dead
-            reckoning leads.
-        hold_s: how long dead reckoning by measured velocities may contradict fixes that agree with each other.
-        late_s: how much older than the newest frame a frame may be.
-        healthy_s: age of the last fix up to which the navigator calls itself healthy.
-    """
-
-    measured_velocity_sigma_mps: float = 0.5
-    acceleration_mps2: float = 3.0
-    max_speed_mps: float = 15.0
-    growth: float = 1.4
-    default_interval_s: float = 0.2
-    gate: float = 18.4
-    trusted_sigma_m: float = 50.0
-    confirm: int = 3
-    lost_after: int = 12
-    lost_sigma_m: float = 100.0
-    search_every: int = 3
-    hold_s: float = 15.0
-    late_s: float = 2.0
-    healthy_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-        if self.growth < 1.0:
-            raise OptionError(f"growth: expected 1 or more, got {self.growth}")
-
-
-ACCEPT_ALL = NavigatorOptions(gate=1e12, confirm=1)
-"""Every match is accepted, as by the paper's recipe: the baseline."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Anchor:
     """Where dead reckoning starts: the last accepted fix, or the start of the flight.
@@ -110,27 +72,31 @@ class _Anchor:
         sample: its odometry; None before the first frame.
         fix: None for a start.
         support: fixes that agreed one after the other up to this one.
+        disputed: the other source contradicted it, and its log-odds count that already.
     """
 
     position: PositionEstimate
     sample: OdometrySample | None
     fix: Fix | None = None
     support: int = 0
+    disputed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class _PendingFix:
-    """The last of some fixes that agree with each other and are not accepted yet."""
+    """The last of some fixes that agree and are not accepted yet, with the log-odds of them all."""
 
     fix: Fix
     sample: OdometrySample
     count: int
+    log_odds: float
 
 
 class Navigator:
     """Follows a flight: each frame is matched in the window that dead reckoning from the last fix gives.
 
-    A fix is accepted where a prediction or several fixes in a row confirm it; see ``docs/integrity.md``.
+    A fix is accepted where the evidence for it is enough: its own, and its agreement with predictions, other
+    sources and other fixes; see ``docs/integrity.md``.
 
     Args:
         matcher: matches single frames.
@@ -206,7 +172,8 @@ class Navigator:
         Args:
             frame: the newest, or one that comes late by at most ``late_s``. A late one is matched where the
                 vehicle was then, and moves nothing back.
-            prior: of this frame's position by another source; used where it is tighter than dead reckoning.
+            prior: of this frame's position by another source; searched about where it is tighter than dead
+                reckoning, and evidence for or against a match in any case.
             budget: of this frame, in place of the navigator's.
 
         Raises:
@@ -215,16 +182,13 @@ class Navigator:
         """
         late = self._odometry.is_late(frame)
         now = self._odometry.sample(frame, self._velocity)
-        given = None if prior is None else self._position(prior)
-        chosen = self._matcher_prior(now, late=late)
-        if prior is not None and given is not None and (chosen is None or prior.sigma_m < chosen.sigma_m):
-            chosen = prior
-        result = self._matcher.locate(self._with_height(frame), chosen, budget or self._budget)
+        sources = self._sources(now, prior, late=late)
+        result = self._matcher.locate(self._with_height(frame), sources.prior, budget or self._budget)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
         if isinstance(result, Fix):
-            result = self._judge(result, now, given, late=late)
+            result = self._judge(result, now, sources, frame.height_agl_m, late=late)
         elif not late and result.reason is not Reason.LATE:
             self._pending = None  # no fix confirmed it
         if not late:
@@ -243,40 +207,57 @@ class Navigator:
             return None if anchor is None else anchor.position
         drift_m = self._drift.sigma_m(anchor.sample, now, self._velocity)
         sigma_m = min(math.hypot(anchor.position.sigma_m, drift_m), MAX_SIGMA_M)
-        return PositionEstimate(anchor.position.en_m + now.moved_m - anchor.sample.moved_m, sigma_m)
+        odds = 0.0 if self._refusals >= self._options.lost_after else anchor.position.log_odds
+        if now.blind_s != anchor.sample.blind_s:
+            odds = min(odds, log_odds(RELIABILITY))
+        return PositionEstimate(anchor.position.en_m + now.moved_m - anchor.sample.moved_m, sigma_m, odds)
 
-    def _matcher_prior(self, now: OdometrySample, *, late: bool) -> Prior | None:
-        """The prior for the matcher; None to search the whole map."""
-        estimate, options = self._reckoned(now), self._options
+    def _sources(self, now: OdometrySample, prior: Prior | None, *, late: bool) -> Sources:
+        """What is known of the position, and where the matcher looks for it."""
+        given = None if prior is None else self._position(prior)
+        sources = Sources(self._reckoned(now), given, self._pending_position(now))
+        chosen, chosen_prior = self._searched(sources, now, late=late)
+        misled = self._refusals >= self._options.lost_after and self._is_turn(self._refusals)
+        if prior is not None and not misled and (chosen_prior is None or prior.sigma_m < chosen_prior.sigma_m):
+            chosen, chosen_prior = given, prior
+        return replace(sources, searched=chosen, prior=chosen_prior)
+
+    def _searched(
+        self, sources: Sources, now: OdometrySample, *, late: bool
+    ) -> tuple[PositionEstimate | None, Prior | None]:
+        """About which estimate of its own the matcher searches, and by which prior; None for the whole map."""
+        estimate, options = sources.own, self._options
         if self._lost or estimate is None:
-            pending = self._pending_position(now)
-            if pending is not None:
-                return pending.prior()
+            pending = sources.pending
+            if pending is not None and pending.sigma_m <= options.trusted_sigma_m:
+                return pending, pending.prior()
             vague = estimate is None or estimate.sigma_m > options.lost_sigma_m
-            turn = vague or self._frames_lost % options.search_every == 0
-            if estimate is None or (turn and self._matcher.site.is_searchable):
-                return None
+            if estimate is None or self._is_turn(0 if vague else self._frames_lost):
+                return None, None
         growth = options.growth ** min(self._refusals, options.lost_after)
         last = self._odometry.last
-        return estimate.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
+        return estimate, estimate.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
+
+    def _is_turn(self, count: int) -> bool:
+        """Whether this one of the frames that know no better searches the whole map."""
+        return self._matcher.site.is_searchable and count % self._options.search_every == 0
 
     def _pending_position(self, now: OdometrySample) -> PositionEstimate | None:
-        """Dead reckoning from the pending fix, or None where it is too uncertain."""
+        """Dead reckoning from the pending fix."""
         pending = self._pending
         if pending is None:
             return None
-        sigma_m = math.hypot(pending.fix.sigma_m, self._drift.sigma_m(pending.sample, now))
-        if sigma_m > self._options.trusted_sigma_m:
-            return None
-        return PositionEstimate(en_m(pending.fix) + now.moved_m - pending.sample.moved_m, sigma_m)
+        sigma_m = min(math.hypot(pending.fix.sigma_m, self._drift.sigma_m(pending.sample, now)), MAX_SIGMA_M)
+        moved_m = now.moved_m - pending.sample.moved_m
+        return PositionEstimate(en_m(pending.fix) + moved_m, sigma_m, log_odds(RELIABILITY))
 
     def _position(self, prior: Prior) -> PositionEstimate:
         if prior.east_m is not None and prior.north_m is not None:
-            return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
+            return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m, log_odds(RELIABILITY))
         assert prior.lat_deg is not None  # a Prior has one of the two
         assert prior.lon_deg is not None
         estimate = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
-        return PositionEstimate(np.asarray(estimate[:2], np.float64), prior.sigma_m)
+        return PositionEstimate(np.asarray(estimate[:2], np.float64), prior.sigma_m, log_odds(RELIABILITY))
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
@@ -289,32 +270,53 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
-    def _judge(self, fix: Fix, now: OdometrySample, given: PositionEstimate | None, *, late: bool) -> Fix | NoFix:
-        """The fix where it is accepted; else it is pending, and refused for now."""
+    def _judge(
+        self, fix: Fix, now: OdometrySample, sources: Sources, height_m: float | None, *, late: bool
+    ) -> Fix | NoFix:
+        """The fix where the evidence for it is enough; else it is pending, and refused for now."""
         if not is_valid(fix):
             return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
-        own, against = self._reckoned(now), self._against(fix, now)
-        contradicted = against is not None
-        confirmed = own is not None and not self._lost and not contradicted and self._confirms(own, fix)
-        if given is not None and (own is None or self._lost or given.sigma_m < own.sigma_m):
-            confirmed = self._confirms(given, fix)
-        if confirmed:
-            self._accept(fix, now, 1, jump=contradicted)
+        required, against = self._options.min_log_odds, self._against(fix, now)
+        own, given = (self._vouching(source, fix, sources) for source in (sources.own, sources.given))
+        disputed = given < 0.0
+        if disputed and self._anchor is not None and self._anchor.disputed:
+            given = 0.0  # an error of the other source lasts
+        others = match_log_odds(fix) + given
+        if against is None and own + others >= required:
+            self._accept(fix, now, 1, own + others, jump=False, disputed=disputed)
             return fix
         if late:
-            return self._refuse_match(fix, against, 0)
-        before = self._pending_position(now)
-        agree = before is not None and self._confirms(before, fix)
-        pending = _PendingFix(fix, now, self._pending.count + 1 if agree and self._pending is not None else 1)
-        outweighed = contradicted and self._dead_reckoning_outweighs(now, pending.count)
-        if pending.count >= self._options.confirm and not outweighed:
-            self._accept(fix, now, pending.count, jump=contradicted)
+            return self._refuse_match(fix, against, own + others)
+        pending = self._chained(fix, now, sources, height_m, others if against is not None else own + others)
+        outweighed = against is not None and self._dead_reckoning_outweighs(now, pending.count)
+        if pending.count > 1 and pending.log_odds >= required and not outweighed:
+            self._accept(fix, now, pending.count, pending.log_odds, jump=against is not None, disputed=disputed)
             return fix
         self._pending = pending
-        return self._refuse_match(fix, against, pending.count)
+        return self._refuse_match(fix, against, pending.log_odds)
 
-    def _confirms(self, estimate: PositionEstimate, fix: Fix) -> bool:
-        return estimate.sigma_m <= self._options.trusted_sigma_m and estimate.chi_square(fix) <= self._options.gate
+    def _vouching(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
+        """What an estimate adds to the log-odds of a match."""
+        options = self._options
+        return sources.vouching(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
+
+    def _map_m2(self, fix: Fix) -> float:
+        """Area of the window."""
+        return float(fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
+
+    def _chained(
+        self, fix: Fix, now: OdometrySample, sources: Sources, height_m: float | None, alone: float
+    ) -> _PendingFix:
+        """The match with the pending ones that it agrees with; where there is none, with its log-odds alone."""
+        pending, before = self._pending, sources.pending
+        if pending is None or before is None or before.chi_square(fix) > self._options.gate:
+            return _PendingFix(fix, now, 1, alone)
+        agreement = 0.0
+        if before is not sources.searched:
+            agreement = agreement_log_odds(before, fix, sources.searched_m2(self._map_m2(fix)))
+        share = new_ground_share(float(np.hypot(*(en_m(fix) - en_m(pending.fix)))), height_m)
+        odds = pending.log_odds + repeated_log_odds(fix, agreement, share)
+        return _PendingFix(fix, now, pending.count + 1, odds)
 
     def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
         """A trusted prediction that a fix contradicts: from the last fix, or from one some seconds ago.
@@ -337,8 +339,10 @@ class Navigator:
             return False  # it was not measured
         return against <= anchor.support and now.time_s - anchor.sample.time_s <= self._options.hold_s
 
-    def _accept(self, fix: Fix, now: OdometrySample, count: int, *, jump: bool) -> None:
-        """Dead reckoning goes on from this fix."""
+    def _accept(
+        self, fix: Fix, now: OdometrySample, count: int, odds: float, *, jump: bool, disputed: bool
+    ) -> None:
+        """Dead reckoning goes on from this fix, by the log-odds of all that speaks for it."""
         last = self._anchor
         known = last is not None and last.fix is not None
         if known and last is not None and last.sample is not None and now.time_s < last.sample.time_s:
@@ -346,7 +350,8 @@ class Navigator:
         jump = jump or self._lost
         self._resets += known and jump
         support = count if last is None or jump else last.support + count
-        self._anchor = _Anchor(PositionEstimate(en_m(fix), fix.sigma_m), now, fix, support)
+        odds = min(odds, log_odds(MAX_PROBABILITY))
+        self._anchor = _Anchor(PositionEstimate(en_m(fix), fix.sigma_m, odds), now, fix, support, disputed)
         self._note_velocity(self._anchor, jump=jump)
         self._refusals, self._frames_lost, self._pending, self._lost = 0, 0, None, False
 
@@ -366,14 +371,15 @@ class Navigator:
             sigma_m = math.hypot(anchor.position.sigma_m, first.position.sigma_m)
             self._velocity = self._drift.velocity(anchor.position.en_m - first.position.en_m, sigma_m, interval_s)
 
-    def _refuse_match(self, fix: Fix, against: PositionEstimate | None, count: int) -> NoFix:
+    def _refuse_match(self, fix: Fix, against: PositionEstimate | None, odds: float) -> NoFix:
         """The refusal of a match that is not accepted."""
         if against is not None:
             apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
             sigma_m = math.hypot(against.sigma_m, fix.sigma_m)
             detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
             return fix.refused(Reason.INCONSISTENT, detail)
-        detail = f"{count} of the {self._options.confirm} matches in a row that must agree"
+        probability = 1.0 / (1.0 + math.exp(-odds))
+        detail = f"right with a probability of {probability:.4f}, {self._options.min_confidence:g} is asked for"
         return fix.refused(Reason.UNCONFIRMED, detail)
 
     def _note_loss(self, now: OdometrySample) -> None:

@@ -24,6 +24,7 @@ from engine.maps.pyramid import ArrayReader, Pyramid, Reader
 from engine.maps.rasters import (
     GEOREFERENCE_TAG,
     SLOPE_TAG,
+    Bounds,
     Gray,
     Mask,
     Source,
@@ -81,7 +82,8 @@ class OrthoMap(Georeference):
         path: str | os.PathLike[str],
         surface: str | os.PathLike[str] | None = None,
         *,
-        bounds_deg: tuple[float, float, float, float] | None = None,
+        bounds_deg: Bounds | None = None,
+        bounds_crs: Bounds | None = None,
         crs: Any = None,
         cache_dir: str | os.PathLike[str] | None = None,
         georeference_sigma_m: float | None = None,
@@ -96,6 +98,7 @@ class OrthoMap(Georeference):
             path: the map; see :func:`engine.maps.rasters.open_source` for what may be opened.
             surface: heights in any grid and CRS.
             bounds_deg: west, south, east, north of the outer edges of a picture without georeference.
+            bounds_crs: the same in the units of ``crs``.
             crs: of a file that names none.
             cache_dir: None is ``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``.
             georeference_sigma_m: georeferencing accuracy; None is that of the file's metadata.
@@ -106,7 +109,7 @@ class OrthoMap(Georeference):
             MapError: a file cannot be read or has no georeference, or the surface does not overlap the map.
             OptionError: an accuracy is not a number above 0.
         """
-        original = open_source(path, bounds_deg=bounds_deg, crs=crs)
+        original = open_source(path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
         used, reader, facts = open_readable(original, cache_dir, on_copy)
         facts["surface_path"] = None if surface is None else os.fspath(surface)
         site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)

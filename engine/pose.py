@@ -15,7 +15,7 @@ References:
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,8 @@ _POSES_PER_SAMPLE = 4
 _MIRRORED_STEPS = 4  # of the other pose of a plane: enough to estimate its cost
 _PAIRED = 300  # projections that are compared with all image points for the probability of a chance inlier
 _SAME_POSE_DEG = 1.5
+_CLOSE_SHARE = 0.4  # of the inliers within a wider tolerance
+_START_SLACK = 2.0  # factor on the tolerance in the first step from a pose that fits within a wider one
 _IDENTITY = np.eye(3)
 
 
@@ -119,6 +121,21 @@ class AttitudePrior:
 
 
 @dataclass(frozen=True, slots=True)
+class PoseStart:
+    """An initial pose, in place of RANSAC's.
+
+    Attributes:
+        rotation: (3, 3) of cam_from_map.
+        center_m: (3,) the camera's centre in the map's axes.
+        tolerance_px: within which it may be expected to reproject right matches.
+    """
+
+    rotation: Array
+    center_m: Array
+    tolerance_px: float
+
+
+@dataclass(frozen=True, slots=True)
 class PoseStats:
     """A pose with its uncertainty.
 
@@ -156,6 +173,7 @@ def solve_pose(
     *,
     weights: Array | None = None,
     prior: AttitudePrior | None = None,
+    start: PoseStart | None = None,
 ) -> PoseStats | None:
     """Estimate the pose with the most inliers.
 
@@ -166,6 +184,7 @@ def solve_pose(
         options: Thresholds; the defaults suit frames of a few hundred pixels.
         weights: (N,) relative inverse variances of the image points; None is 1 for all.
         prior: Attitude for the refinement, which separates tilt from displacement at a small field of view.
+        start: Where the refinement begins; None searches for an initial pose.
 
     Returns:
         None where the matches are few, collinear, behind the camera, ambiguous or not significant.
@@ -181,7 +200,7 @@ def solve_pose(
         return None
     origin = points_m[known].mean(0)
     problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
-    fit = _fit(problem, options)
+    fit = _fit(problem, options) if start is None else _fit_from(problem, start, origin)
     if fit is None or not _supported(problem, fit, options) or _ambiguous(problem, fit, options):
         return None
     log10_nfa, covariance = _log10_nfa(problem, fit, options), match_covariance(problem, fit)
@@ -255,6 +274,20 @@ def _fit(problem: Problem, options: PoseOptions) -> Fit | None:
         return fit
     start = ransac(problem, options.max_iterations, options.confidence, options.seed)
     return None if start is None else gauss_newton(problem, *start)
+
+
+def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
+    """The fit near an initial pose: to all matches within its tolerance, or the fewer that agree more closely.
+
+    Where most agree only roughly, as over ground that has changed, the closer ones alone would be chance.
+    """
+    wide = replace(problem, tolerance_px=max(start.tolerance_px, problem.tolerance_px))
+    near = gauss_newton(wide, start.rotation, start.center_m - origin)
+    if near is None:
+        return None
+    close = gauss_newton(problem, near.rotation, near.center, slack=_START_SLACK)
+    enough = _CLOSE_SHARE * np.count_nonzero(near.inliers)
+    return near if close is None or np.count_nonzero(close.inliers) < enough else close
 
 
 def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:

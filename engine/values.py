@@ -45,6 +45,7 @@ class Attitude:
 
 # Fields of a frame that are finite or None.
 _FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
+_SIGMAS = ("height_sigma_m", "heading_sigma_deg", "tilt_sigma_deg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +61,14 @@ class Frame:
         pitch_deg: positive nose up; None is treated as level.
         east_velocity_mps: velocity over ground, or None where unknown.
         north_velocity_mps: velocity over ground, or None where unknown.
+        height_sigma_m: standard deviation of the height; None is what the matcher assumes, as of the next two.
+        heading_sigma_deg: standard deviation of the heading.
+        tilt_sigma_deg: standard deviation of roll and of pitch.
 
     Raises:
         ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
         DtypeError: the image is not uint8.
-        TelemetryError: a number is not finite, or the height is not positive.
+        TelemetryError: a number is not finite, or the height or a standard deviation is not positive.
     """
 
     image: NDArray[np.uint8] | Tensor
@@ -75,6 +79,9 @@ class Frame:
     pitch_deg: float | None = None
     east_velocity_mps: float | None = None
     north_velocity_mps: float | None = None
+    height_sigma_m: float | None = None
+    heading_sigma_deg: float | None = None
+    tilt_sigma_deg: float | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.image.shape)
@@ -86,6 +93,10 @@ class Frame:
             _check_finite(name, getattr(self, name))
         if self.height_agl_m is not None and self.height_agl_m <= 0:
             raise TelemetryError(f"height_agl_m: expected a height above 0 m, got {self.height_agl_m}")
+        for name in _SIGMAS:
+            sigma = getattr(self, name)
+            if sigma is not None and not 0.0 < sigma <= MAX_SIGMA_M:
+                raise TelemetryError(f"{name}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {sigma}")
 
     @property
     def attitude(self) -> Attitude | None:
@@ -247,8 +258,8 @@ class Fix:
         covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
         attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
             only the heading is measured; roll and pitch are the frame's, or 0.
-        score: NCC in [-1, 1], or for SIFT the share of inliers.
-        method: "ncc" or "sift".
+        score: NCC in [-1, 1], or of matched points the share of inliers.
+        method: "ncc", "sift" or "learned".
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).

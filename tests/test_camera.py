@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from engine.camera import Camera
+from engine.camera import MOUNTS, Camera, mount_rotation
 from engine.errors import CalibrationError
 
 K = [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]
@@ -188,3 +188,65 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
         Camera.load(tmp_path / "none.yaml")
     with pytest.raises(CalibrationError, match="not a readable"):
         Camera.load(tmp_path)
+
+
+# -------------------------------------------------------------------------------------------------- mounts
+
+DOWN, NOSE, RIGHT, TAIL, LEFT = [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "top"),
+    [
+        ("nadir", DOWN, NOSE),
+        ("nadir-right", DOWN, RIGHT),
+        ("nadir-tail", DOWN, TAIL),
+        ("nadir-left", DOWN, LEFT),
+        ("forward-45", [math.sqrt(0.5), 0, math.sqrt(0.5)], [math.sqrt(0.5), 0, -math.sqrt(0.5)]),
+    ],
+)
+def test_a_mount_by_name_says_where_axis_and_top_point(name, axis, top):
+    mount = mount_rotation(name)
+    assert np.linalg.det(mount) == pytest.approx(1.0)
+    assert np.allclose(mount @ [0, 0, 1], axis)
+    assert np.allclose(mount @ [0, -1, 0], top)
+
+
+@pytest.mark.parametrize("name", [name for name in MOUNTS if name.startswith("nadir")])
+def test_pitch_turns_the_axis_up_towards_the_top_of_the_picture(name):
+    top = mount_rotation(name) @ [0, -1, 0]
+    axis = mount_rotation(name, -60.0) @ [0, 0, 1]
+    assert np.allclose(axis, math.sin(math.radians(60.0)) * np.array(DOWN) + 0.5 * top)
+    assert np.allclose(mount_rotation(name, -90.0), mount_rotation(name))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("front",), "mount: expected one of nadir, nadir-right"),
+        (("nadir", 30.0), "camera_pitch_deg: expected -90"),
+        (("nadir", -91.0), "camera_pitch_deg: expected -90"),
+        (("nadir", math.nan), "camera_pitch_deg: expected -90"),
+        (("forward-45", -60.0), "camera_pitch_deg: expected none with the mount forward-45"),
+    ],
+)
+def test_a_mount_that_is_none_is_refused(arguments, words):
+    with pytest.raises(CalibrationError, match=words):
+        mount_rotation(*arguments)
+
+
+def test_a_calibration_may_name_its_mount(save):
+    assert np.allclose(Camera.load(save(INFO + "mount: nadir-tail\n")).mount, mount_rotation("nadir-tail"))
+    pitched = Camera.load(save(INFO + "mount: nadir\ncamera_pitch_deg: -30\n"))
+    assert np.allclose(pitched.mount, mount_rotation("nadir", -30.0))
+    assert np.allclose(Camera.load(save(INFO + "camera_pitch_deg: -30\n")).mount, pitched.mount)
+    for text, words in (
+        ("mount: up\n", "mount: expected one of nadir"),
+        (
+            "mount: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ncamera_pitch_deg: -30\n",
+            "camera_pitch_deg: expected with a mount by",
+        ),
+        ("camera_pitch_deg: steep\n", "could not convert"),
+    ):
+        with pytest.raises(CalibrationError, match=words):
+            Camera.load(save(INFO + text))

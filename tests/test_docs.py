@@ -14,7 +14,7 @@ from engine.cli.app import app
 from engine.covariance import AssumedErrors
 from engine.formats.track import COLUMNS
 from engine.methods.options import SiftOptions
-from engine.navigator import NavigatorOptions
+from engine.navigator_options import NavigatorOptions
 from engine.pose import PoseOptions
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
@@ -50,7 +50,9 @@ def flight(tmp_path_factory):
     "page",
     [
         pytest.param(
-            page, id=page_name(page), marks=[pytest.mark.slow] if page.stem in ("simulator", "own-matcher") else []
+            page,
+            id=page_name(page),
+            marks=[pytest.mark.slow] if page.stem in ("simulator", "own-matcher", "learned") else [],
         )
         for page in PAGES
         if FENCE.search(page.read_text(encoding="utf-8"))

@@ -10,7 +10,9 @@ from kornia.feature import DISK, LightGlue, LoFTR
 from torch import nn
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.learned import DiskLightGlue, Loftr, load_disk_lightglue, load_loftr
+from engine.learned import KeypointMatcher, Loftr, load_disk_lightglue, load_loftr, load_matcher
+from engine.learned.keypoints import Disk, SuperPointKeypoints
+from engine.learned.superpoint import SuperPoint, sample, strongest
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +32,7 @@ def files(tmp_path_factory):
     torch.manual_seed(0)
     torch.save({"state_dict": LoFTR(pretrained=None).state_dict()}, folder / "loftr.ckpt")
     torch.save({"extractor": DISK().state_dict()}, folder / "disk.pth")
-    torch.save(LightGlue(features=None, input_dim=128).state_dict(), folder / "lightglue.pth")
+    torch.save(LightGlue(features=None, input_dim=128, n_layers=2).state_dict(), folder / "lightglue.pth")
     return folder
 
 
@@ -94,12 +96,20 @@ class Corners(nn.Module):
         assert images.shape[1] == 3
         points = self.points.pop(0)
         features = type("Features", (), {})()
-        features.keypoints, features.descriptors = torch.tensor(points), torch.ones(len(points), 128)
+        features.keypoints, features.descriptors = (
+            torch.tensor(points).reshape(-1, 2),
+            torch.ones(len(points), 128),
+        )
+        features.detection_scores = torch.arange(len(points), 0, -1)
         return [features]
 
 
 class Reversed(nn.Module):
     """Stands for LightGlue: the first with the last; the last has no partner."""
+
+    def __init__(self):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(1))
 
     def forward(self, data):
         self.sizes = [data[name]["image_size"].tolist() for name in ("image0", "image1")]
@@ -112,7 +122,7 @@ class Reversed(nn.Module):
 def test_sparse_points_come_back_in_pairs_and_unmoved():
     points = [[[0.0, 0.0], [5.0, 6.0], [9.0, 3.0]], [[1.0, 1.0], [20.0, 30.0], [40.0, 7.0]]]
     lightglue = Reversed()
-    matcher = DiskLightGlue(Corners(points), lightglue)
+    matcher = KeypointMatcher(Disk(Corners(points)), lightglue)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.tolist() == [[0, 0], [5, 6]]
     assert second.tolist() == [[40, 7], [20, 30]]
@@ -120,7 +130,7 @@ def test_sparse_points_come_back_in_pairs_and_unmoved():
 
 
 def test_nothing_found_is_no_match():
-    matcher = DiskLightGlue(Corners([[[0.0, 0.0]], []]), Reversed())
+    matcher = KeypointMatcher(Disk(Corners([[[0.0, 0.0]], []])), Reversed())
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.shape == second.shape == (0, 2)
 
@@ -154,9 +164,85 @@ def test_disk_and_lightglue_are_what_the_files_say(files, tmp_path):
         if name != "confidence_thresholds"
     }
     assert "self_attn.0.Wqkv.weight" in published
+    published |= {f"log_assignment.{i}.r": torch.ones(1) for i in range(2)}  # left over from training
     torch.save(published, tmp_path / "published.pth")
     again = load_disk_lightglue(files / "disk.pth", tmp_path / "published.pth", device="cpu")
     assert all(torch.equal(value, now[name]) for name, value in again.lightglue.state_dict().items())
+
+
+def test_files_are_recognised_in_any_order(files):
+    for first, second in (("disk.pth", "lightglue.pth"), ("lightglue.pth", "disk.pth")):
+        matcher = load_matcher([files / first, files / second], device="cpu", max_keypoints=20)
+        assert isinstance(matcher.extractor, Disk)
+    assert isinstance(load_matcher([files / "loftr.ckpt"], device="cpu"), Loftr)
+
+
+@pytest.mark.parametrize("name", ["aliked-t16", "aliked-n16", "aliked-n32"])
+def test_aliked_is_of_the_size_of_its_file(name, tmp_path):
+    from kornia.feature import ALIKED
+
+    torch.manual_seed(2)
+    aliked = ALIKED(name)
+    torch.save(aliked.state_dict(), tmp_path / "aliked.pth")
+    dim = 64 if name == "aliked-t16" else 128
+    torch.save(LightGlue(features=None, input_dim=dim, n_layers=2).state_dict(), tmp_path / "lightglue.pth")
+    matcher = load_matcher([tmp_path / "aliked.pth", tmp_path / "lightglue.pth"], device="cpu")
+    assert matcher.extractor.network.model_name == name
+    found = matcher.extract(picture(64, 96), 30)
+    assert 2 <= len(found) <= 30
+    assert found.descriptors.shape == (len(found), dim)
+    assert (found.strength.diff() <= 0).all()
+
+
+def test_what_makes_no_matcher_is_told(files, tmp_path):
+    disk, lightglue, loftr = (files / name for name in ("disk.pth", "lightglue.pth", "loftr.ckpt"))
+    with pytest.raises(OptionError, match=r"weights: expected the files of LoFTR, or LightGlue .* got none"):
+        load_matcher([])
+    for paths, got in (
+        ([disk], "DISK"),
+        ([disk, disk], "DISK and DISK"),
+        ([loftr, lightglue], "LightGlue and LoFTR"),
+    ):
+        with pytest.raises(OptionError, match=rf"weights: expected .*, got {got}$"):
+            load_matcher(paths, device="cpu")
+    torch.save({"layer.weight": torch.zeros(2)}, tmp_path / "other.pth")
+    with pytest.raises(OptionError, match=r"other.pth: expected DISK, ALIKED, .* got tensors named layer.weight"):
+        load_matcher([disk, tmp_path / "other.pth"], device="cpu")
+    torch.save(LightGlue(features=None, input_dim=256, n_layers=1).state_dict(), tmp_path / "wide.pth")
+    with pytest.raises(OptionError, match=r"wide.pth: expected LightGlue for descriptors of 128 numbers, .* 256"):
+        load_matcher([disk, tmp_path / "wide.pth"], device="cpu")
+    scaled = LightGlue(features=None, input_dim=128, n_layers=1, add_scale_ori=True)
+    torch.save(scaled.state_dict(), tmp_path / "scaled.pth")
+    with pytest.raises(OptionError, match=r"scaled.pth: expected LightGlue for DISK.* scales or shapes"):
+        load_matcher([disk, tmp_path / "scaled.pth"], device="cpu")
+
+
+# SuperPoint.
+
+
+def test_superpoint_finds_the_same_places_in_a_picture_moved_by_a_cell():
+    torch.manual_seed(3)
+    extract = SuperPointKeypoints(SuperPoint().eval())
+    whole = picture(120, 136)
+    with torch.inference_mode():
+        found, moved = extract(whole, 400), extract(whole[..., 8:, 16:], 400)
+    places = {tuple(map(int, xy)): d for xy, d in zip(found.xy_px, found.descriptors, strict=True)}
+    again = {(int(x) + 16, int(y) + 8): d for (x, y), d in zip(moved.xy_px, moved.descriptors, strict=True)}
+    inner = [at for at in again if all(44 + 8 <= v < n - 44 for v, n in zip(at, (136, 120), strict=True))]
+    assert inner  # beyond the reach of the edges
+    assert all(at in places for at in inner)
+    assert all(torch.allclose(places[at], again[at], atol=1e-4) for at in inner)
+
+
+def test_superpoint_keeps_the_strongest_of_neighbours_and_reads_descriptors_at_cell_middles():
+    scores = torch.zeros(40, 40)
+    scores[20, 10], scores[22, 12], scores[30, 30], scores[1, 1] = 0.9, 0.8, 0.5, 0.99
+    xy, strength = strongest(scores, 10)
+    assert xy.tolist() == [[10, 20], [30, 30]]  # the neighbour is weaker, the corner too near to the edge
+    assert strength.tolist() == pytest.approx([0.9, 0.5])
+    cells = nn.functional.normalize(torch.randn(256, 5, 5, generator=torch.Generator().manual_seed(0)), dim=0)
+    at = torch.tensor([[3.5 + 8 * 2, 3.5 + 8 * 4], [3.5, 3.5]])
+    assert torch.allclose(sample(cells, at), torch.stack([cells[:, 4, 2], cells[:, 0, 0]]), atol=1e-6)
 
 
 class Malicious:

@@ -28,6 +28,7 @@ PUBLIC = [
     "EngineError",
     "Fix",
     "Frame",
+    "LearnedOptions",
     "Live",
     "LiveOptions",
     "MapError",

@@ -32,7 +32,8 @@ from engine.formats.track import TrackRow, track_row
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
 from engine.methods.options import SiftOptions
-from engine.navigator import ACCEPT_ALL, Matcher
+from engine.navigator import Matcher
+from engine.navigator_options import ACCEPT_ALL
 from engine.report.metrics import Ground, errors_en_m, summarise
 from engine.sim import plan_flight
 from engine.values import Attitude, Truth

@@ -26,7 +26,7 @@ from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatc
 from engine.device import set_threads
 from engine.formats.track import track_row
 from engine.geo import LocalFrame
-from engine.navigator import ACCEPT_ALL
+from engine.navigator_options import ACCEPT_ALL
 from engine.report.metrics import Ground, summarise
 from engine.sim import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
 from engine.sim.render import transformer

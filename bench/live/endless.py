@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Budget, Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.navigator import ACCEPT_ALL
+from engine.navigator_options import ACCEPT_ALL
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import plan_flight
 

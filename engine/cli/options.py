@@ -15,11 +15,41 @@ MapSigmaOption = Annotated[
     float | None,
     typer.Option("--map-sigma-m", metavar="M", help="Georeferencing accuracy, per axis; else as the map says."),
 ]
+MapBoundsOption = Annotated[
+    str | None,
+    typer.Option("--map-bounds", metavar="W,S,E,N", help="Edges of a bare picture, in degrees or in --map-crs."),
+]
+MapCrsOption = Annotated[
+    str | None, typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.")
+]
 CameraOption = Annotated[
     Path, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
 ]
+OptionalCameraOption = Annotated[
+    Path | None,
+    typer.Option("--camera", metavar="FILE", help="Calibration, a YAML file; without it a bag's own, or EXIF."),
+]
+HfovOption = Annotated[
+    float | None, typer.Option("--hfov-deg", metavar="DEG", help="Horizontal field of view, without --camera.")
+]
+MountOption = Annotated[
+    str | None,
+    typer.Option(
+        "--mount",
+        metavar="NAME",
+        help="nadir, nadir-right, nadir-tail, nadir-left (where the top of the picture points), forward-45.",
+    ),
+]
+CameraPitchOption = Annotated[
+    float | None,
+    typer.Option("--camera-pitch-deg", metavar="DEG", help="Of the camera: -90 looks straight down."),
+]
 MethodOption = Annotated[
-    str, typer.Option("--method", metavar="ncc|sift|auto", help="auto is ncc, and sift where ncc refuses.")
+    str, typer.Option("--method", metavar="ncc|sift|auto|learned", help="auto is ncc, and sift where ncc refuses.")
+]
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option("--weights", metavar="FILE", help="Of method learned: once for each file that it takes."),
 ]
 DeviceOption = Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live.")]
 BudgetOption = Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.formats.frames import FrameSource, VideoFile, exif_telemetry, open_frames
+from engine.formats.frames import VIDEO_SUFFIXES, FrameSource, VideoFile, open_frames
 from engine.formats.geotiff import write_geotiff
 from engine.formats.logs.readers import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
+from engine.formats.photos import photo_telemetry
 from engine.formats.resampling import telemetry_at
 from engine.formats.ros.bags import BagFrames, is_bag
 from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
@@ -52,14 +53,18 @@ class Flight:
     Attributes:
         source: source of the images.
         rows: the telemetry, one row per frame; empty where there is none.
-        heights: where a log was read, the number of rows whose height comes from each source.
+        heights: where a log or photographs were read, the number of rows whose height comes from each source.
         names: names of the frames, in order.
         unused: number of images without a row of telemetry.
+        has_gimbal: whether the attitude is that of a gimbal, and says by itself where the camera looks.
+        remarks: what is doubtful about the telemetry, a sentence each.
     """
 
     source: FrameSource
     rows: list[TelemetryRow]
     heights: Mapping[str, int] = field(default_factory=dict)
+    has_gimbal: bool = False
+    remarks: Sequence[str] = ()
     names: list[str] = field(init=False)
     unused: int = field(init=False)
 
@@ -97,6 +102,9 @@ def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
         pitch_deg=row.pitch_deg,
         east_velocity_mps=row.east_velocity_mps,
         north_velocity_mps=row.north_velocity_mps,
+        height_sigma_m=row.height_sigma_m,
+        heading_sigma_deg=row.heading_sigma_deg,
+        tilt_sigma_deg=row.tilt_sigma_deg,
     )
 
 
@@ -112,8 +120,8 @@ def open_flight(
     Args:
         frames: a folder of images, a video, or a ROS bag.
         telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT, a bag) that is interpolated at the frames' times.
-            None uses the bag's own telemetry or the EXIF of photographs; without EXIF times the images come in
-            natural order and without telemetry.
+            None uses the bag's own telemetry, the .SRT beside a video, or the EXIF of photographs; without EXIF
+            times the images come in natural order and without telemetry.
         camera: checked against the size of the first image.
         clock: capture times of the frames, where the telemetry is a log.
         image_topic: topic of a bag's images; None where there is only one.
@@ -128,7 +136,11 @@ def open_flight(
     source = BagFrames(Path(frames), image_topic) if is_bag(frames) else open_frames(frames)
     if telemetry is None and isinstance(source, BagFrames):
         telemetry = frames
+    if telemetry is None:
+        telemetry = subtitles_beside(frames)
     heights: dict[str, int] = {}
+    remarks: list[str] = []
+    of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"
     if telemetry is not None and is_log(telemetry):
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
@@ -137,11 +149,22 @@ def open_flight(
     elif isinstance(source, VideoFile):
         rows = []
     else:
-        rows = exif_telemetry([source.path / name for name in source.names])
-    flight = Flight(source, rows, heights)
+        rows, remarks = photo_telemetry([source.path / name for name in source.names])
+        heights = {"take-off": sum(row.height_agl_m is not None for row in rows)}
+    has_gimbal = of_gimbal and any(row.roll_deg is not None for row in rows)
+    flight = Flight(source, rows, {name: n for name, n in heights.items() if n}, has_gimbal, remarks)
     if camera is not None:
         camera.check_size(source.read(flight.names[0]).shape)
     return flight
+
+
+def subtitles_beside(frames: str | Path) -> Path | None:
+    """The .SRT of a video's name beside it, as DJI writes it; None where there is none."""
+    path = Path(frames)
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        return None
+    beside = (path.with_suffix(suffix) for suffix in (".SRT", ".srt"))
+    return next((file for file in beside if file.is_file()), None)
 
 
 def write_flight_folder(
@@ -206,6 +229,9 @@ def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow
         pitch_deg=frame.pitch_deg,
         east_velocity_mps=frame.east_velocity_mps,
         north_velocity_mps=frame.north_velocity_mps,
+        height_sigma_m=frame.height_sigma_m,
+        heading_sigma_deg=frame.heading_sigma_deg,
+        tilt_sigma_deg=frame.tilt_sigma_deg,
         lat_deg=prior.lat_deg if prior else None,
         lon_deg=prior.lon_deg if prior else None,
         sigma_m=prior.sigma_m if prior else None,

@@ -1,4 +1,4 @@
-"""Images of a flight, read one at a time from a folder or a video; and the telemetry in their EXIF.
+"""Images of a flight, read one at a time from a folder or a video.
 
 Convention:
     Images are RGB uint8 as stored: an EXIF orientation is ignored, since the camera's calibration refers to the
@@ -11,25 +11,17 @@ import itertools
 import math
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
-from engine.formats.telemetry import TelemetryRow
-from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes of image files, in lower or upper case."""
-_GPS_IFD, _EXIF_IFD = 0x8825, 0x8769
-_XMP_BYTES = 512 * 1024
-_XMP_VALUE = re.compile(rb"drone-dji:(\w+)(?:=\"|>)\s*([+-]?[0-9]+(?:\.[0-9]+)?)")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".ts")
+"""Suffixes of videos beside which subtitles may lie, in lower or upper case."""
 
 
 class FrameSource(ABC):
@@ -223,152 +215,6 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise TelemetryError(f"{path}: expected a readable picture: {reason}") from None
-
-
-def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryRow]:
-    """Telemetry from photographs' EXIF and DJI's XMP.
-
-    ==================================  =====================================================================
-    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC where there is no offset
-    GPSLatitude, GPSLongitude           the prior; GPSHPositioningError its sigma
-    GPSAltitude                         alt_amsl_m
-    GPSImgDirection                     heading_deg, where its reference is true north
-    drone-dji:RelativeAltitude          height_agl_m, above the take-off point
-    drone-dji:Gimbal*Degree             heading, roll and pitch of a body with the camera mounted nadir
-    drone-dji:FlightYawDegree           heading_deg, where there are no gimbal angles
-    ==================================  =====================================================================
-
-    Args:
-        source: a folder, or paths of images.
-
-    Returns:
-        Rows in the order of time, named by file name; photographs without a capture time are omitted.
-        Photographs of the same second without sub-seconds are spaced evenly within it.
-
-    Raises:
-        TelemetryError: an image cannot be opened.
-    """
-    if isinstance(source, (str, Path)):
-        folder = PictureFolder(Path(source))
-        source = [folder.path / name for name in folder.names]
-    rows = [row for path in source if (row := _exif_row(Path(path))) is not None]
-    rows.sort(key=lambda row: row.timestamp_ns)  # stable: equal stamps keep the order of the names
-    counts, seen = Counter(row.timestamp_ns for row in rows), Counter[int]()
-    for i, row in enumerate(rows):
-        shift_ns = seen[row.timestamp_ns] * 1_000_000_000 // counts[row.timestamp_ns]
-        seen[row.timestamp_ns] += 1
-        rows[i] = replace(row, timestamp_ns=row.timestamp_ns + shift_ns)
-    return rows
-
-
-def _exif_row(path: Path) -> TelemetryRow | None:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as picture:
-            exif = picture.getexif()
-            gps, captured = exif.get_ifd(_GPS_IFD), exif.get_ifd(_EXIF_IFD)
-        with path.open("rb") as file:
-            xmp = {key.decode(): float(value) for key, value in _XMP_VALUE.findall(file.read(_XMP_BYTES))}
-    except (OSError, SyntaxError, ValueError) as error:
-        raise TelemetryError(f"{path}: expected a readable picture: {str(error).splitlines()[0]}") from None
-    stamp_ns = _capture_ns(captured)
-    if stamp_ns is None:
-        return None
-    attitude = _gimbal_attitude(xmp) or {"heading_deg": _heading_deg(gps, xmp)}
-    height_m = xmp.get("RelativeAltitude", 0.0)
-    return TelemetryRow(
-        timestamp_ns=stamp_ns,
-        frame=path.name,
-        height_agl_m=height_m if height_m > 0.0 else None,
-        alt_amsl_m=_altitude_m(gps),
-        **attitude,
-        **_position(gps),
-    )
-
-
-def _capture_ns(exif: Mapping[int, Any]) -> int | None:
-    """Nanoseconds since 1970 of DateTimeOriginal (0x9003), its sub-seconds (0x9291) and offset (0x9011)."""
-    offset = str(exif.get(0x9011, "")).strip("\0 ") or "+00:00"
-    try:
-        time = datetime.strptime(f"{str(exif[0x9003]).strip(chr(0) + ' ')} {offset}", "%Y:%m:%d %H:%M:%S %z")
-    except (KeyError, ValueError):
-        return None
-    fraction = re.match(r"[0-9]*", str(exif.get(0x9291, "")).strip())
-    nanoseconds = int(fraction.group().ljust(9, "0")[:9]) if fraction else 0
-    since = time - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + nanoseconds
-
-
-def _finite(value: Any) -> float | None:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _position(gps: Mapping[int, Any]) -> dict[str, float | None]:
-    lat_deg, lon_deg = _degrees(gps.get(2), gps.get(1) == "S"), _degrees(gps.get(4), gps.get(3) == "W")
-    # Receivers without a fix write zeros.
-    if lat_deg is None or lon_deg is None or (lat_deg == 0.0 and lon_deg == 0.0):
-        return {}
-    if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
-        return {}
-    sigma_m = _finite(gps.get(0x1F))
-    return {"lat_deg": lat_deg, "lon_deg": lon_deg, "sigma_m": sigma_m if sigma_m and sigma_m > 0.0 else None}
-
-
-def _degrees(parts: Any, negative: bool) -> float | None:
-    values = [_finite(part) for part in parts or ()]
-    if len(values) != 3 or None in values:
-        return None
-    degrees = sum(
-        value / unit for value, unit in zip(values, (1.0, 60.0, 3600.0), strict=True) if value is not None
-    )
-    return -degrees if negative else degrees
-
-
-def _altitude_m(gps: Mapping[int, Any]) -> float | None:
-    altitude_m = _finite(gps.get(6))
-    below_sea = gps.get(5) in (1, b"\x01")
-    return -altitude_m if altitude_m is not None and below_sea else altitude_m
-
-
-def _heading_deg(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> float | None:
-    if "FlightYawDegree" in xmp:
-        return wrap_heading_deg(xmp["FlightYawDegree"])
-    heading_deg = _finite(gps.get(17))
-    return wrap_heading_deg(heading_deg) if heading_deg is not None and gps.get(16) == "T" else None
-
-
-def _gimbal_attitude(xmp: Mapping[str, float]) -> dict[str, float | None] | None:
-    try:
-        angles = (xmp["GimbalRollDegree"], xmp["GimbalPitchDegree"], xmp["GimbalYawDegree"])
-    except KeyError:
-        return None
-    return dict(zip(("roll_deg", "pitch_deg", "heading_deg"), nadir_attitude(*angles), strict=True))
-
-
-def nadir_attitude(
-    gimbal_roll_deg: float, gimbal_pitch_deg: float, gimbal_yaw_deg: float
-) -> tuple[float, float, float]:
-    """Attitude of a body on which the gimbal's camera would be mounted nadir, the image's top to the nose.
-
-    DJI's angles rotate the camera's forward, right and down axes; a pitch of -90 degrees is nadir. The camera's
-    forward is the body's down, its up the body's forward. The result is the same with a roll of 180 degrees, as
-    some models write it.
-
-    Args:
-        gimbal_roll_deg: roll in degrees.
-        gimbal_pitch_deg: pitch in degrees, -90 looks straight down.
-        gimbal_yaw_deg: yaw in degrees, clockwise from true north.
-
-    Returns:
-        Roll, pitch and heading in degrees.
-    """
-    forward, right, down = enu_from_body(gimbal_roll_deg, gimbal_pitch_deg, gimbal_yaw_deg).T
-    return attitude_from_rotation(np.stack([-down, right, forward], axis=1))
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

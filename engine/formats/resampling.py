@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import TelemetryError
-from engine.formats.telemetry import TelemetryRow
+from engine.formats.telemetry import TelemetryRow, take_off_sigma_m
 from engine.formats.truth import truth_from_telemetry
 from engine.geo import wrap_heading_deg
 from engine.values import Truth
@@ -31,7 +31,10 @@ UTC_FROM_NS = 10**18
 HEIGHT_SOURCES = ("rangefinder", "terrain", "take-off")
 """Sources of the height above ground, best first: measured, by a terrain model, above take-off."""
 _ANGLES = ("heading_deg", "roll_deg", "lon_deg")
-_COLUMNS = ("alt_amsl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
+_COLUMNS = (
+    "alt_amsl_m", "heading_deg", "heading_sigma_deg", "roll_deg", "pitch_deg", "tilt_sigma_deg",
+    "east_velocity_mps", "north_velocity_mps",
+)  # fmt: skip
 _POSITION = ("lat_deg", "lon_deg", "sigma_m")
 
 Floats = NDArray[np.float64]
@@ -62,6 +65,7 @@ class FlightLog:
             the body's down axis.
         captures_ns: (N,) times of camera triggers; empty where none were logged.
         utc_ns: offset that converts the log's clock to UTC; None where it is unknown.
+        frame_numbers: numbers of a video's frames, the first is 1, over time; None but for a video's subtitles.
     """
 
     path: Path
@@ -69,6 +73,7 @@ class FlightLog:
     heights: Mapping[str, TimeSeries] = field(default_factory=dict)
     captures_ns: Stamps = field(default_factory=lambda: np.empty(0, np.int64))
     utc_ns: int | None = None
+    frame_numbers: TimeSeries | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -95,6 +100,7 @@ def make_log(
     heights: Mapping[str, TimeSeries | None],
     captures_ns: ArrayLike = (),
     utc_ns: int | None = None,
+    frame_numbers: TimeSeries | None = None,
 ) -> FlightLog:
     """Create a log from the series that are not None.
 
@@ -104,6 +110,7 @@ def make_log(
         heights: height above ground in metres by source.
         captures_ns: (N,) times of camera triggers.
         utc_ns: offset that converts the log's clock to UTC, or None.
+        frame_numbers: numbers of a video's frames over time, or None.
 
     Raises:
         TelemetryError: all series are None.
@@ -114,7 +121,8 @@ def make_log(
         raise TelemetryError(
             f"{path}: expected attitude, height, velocity or position, got a log with none of them"
         )
-    return FlightLog(path, known, known_heights, np.unique(np.asarray(captures_ns, np.int64)), utc_ns)
+    captures = np.unique(np.asarray(captures_ns, np.int64))
+    return FlightLog(path, known, known_heights, captures, utc_ns, frame_numbers)
 
 
 def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True) -> TimeSeries | None:
@@ -204,6 +212,9 @@ def telemetry_at(
         )
     columns = {name: _column(log, name, times_ns) for name in (*_COLUMNS, *_POSITION)}
     columns["height_agl_m"], sources = _height(log, times_ns, columns["roll_deg"], columns["pitch_deg"])
+    above_take_off = np.array([source == "take-off" for source in sources])
+    vague_m = np.array([take_off_sigma_m(height_m) for height_m in columns["height_agl_m"]])
+    columns["height_sigma_m"] = np.where(above_take_off, vague_m, np.nan)
     columns["sigma_m"][columns["sigma_m"] < 0.0] = np.nan
     unknown = np.isnan(columns["lat_deg"]) | np.isnan(columns["lon_deg"])
     for name in _POSITION:

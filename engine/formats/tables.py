@@ -46,6 +46,7 @@ LONGITUDE = Bounds(-180.0, 360.0, "degrees from -180 to 360")
 POSITIVE = Bounds(math.ulp(0.0), math.inf, "a finite number above 0")
 NOT_NEGATIVE = Bounds(0.0, math.inf, "a finite number of 0 or more")
 SIGMA = Bounds(0.0, MAX_SIGMA_M, f"a number from 0 to {MAX_SIGMA_M:g}")
+POSITIVE_SIGMA = Bounds(math.ulp(0.0), MAX_SIGMA_M, f"a number above 0 and at most {MAX_SIGMA_M:g}")
 """Ranges of the columns of telemetry, truth and track."""
 
 

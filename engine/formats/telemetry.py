@@ -6,6 +6,7 @@ Convention:
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from engine.formats.tables import (
     HEADING,
     LONGITUDE,
     POSITIVE,
+    POSITIVE_SIGMA,
     QUARTER_TURN,
     SIGMA,
     CsvRow,
@@ -44,10 +46,13 @@ class TelemetryRow:
         timestamp_ns: capture time on the vehicle's clock.
         frame: file name of the image, or for a video the index of the frame from 0.
         height_agl_m: height above the ground.
+        height_sigma_m: standard deviation of it, where it is known.
         alt_amsl_m: height above mean sea level.
         heading_deg: clockwise from true north in [0, 360).
+        heading_sigma_deg: standard deviation of it, where it is known.
         roll_deg: positive right side down.
         pitch_deg: positive nose up.
+        tilt_sigma_deg: standard deviation of roll and of pitch, where it is known.
         east_velocity_mps: velocity over ground.
         north_velocity_mps: velocity over ground.
         lat_deg: WGS84 latitude of a prior.
@@ -58,10 +63,13 @@ class TelemetryRow:
     timestamp_ns: int
     frame: str
     height_agl_m: float | None = None
+    height_sigma_m: float | None = None
     alt_amsl_m: float | None = None
     heading_deg: float | None = None
+    heading_sigma_deg: float | None = None
     roll_deg: float | None = None
     pitch_deg: float | None = None
+    tilt_sigma_deg: float | None = None
     east_velocity_mps: float | None = None
     north_velocity_mps: float | None = None
     lat_deg: float | None = None
@@ -77,19 +85,34 @@ class TelemetryRow:
         return Prior(lat_deg=self.lat_deg, lon_deg=self.lon_deg, sigma_m=sigma_m)
 
 
+def take_off_sigma_m(height_m: float) -> float:
+    """Standard deviation of a height above take-off, taken as one above the ground: that lies elsewhere.
+
+    Five metres of ground and barometer, and a twentieth of the height, by which a barometer errs on a day 15
+    degrees off the standard atmosphere.
+    """
+    return math.hypot(_TAKE_OFF_M, _TAKE_OFF_SHARE * height_m)
+
+
+_TAKE_OFF_M, _TAKE_OFF_SHARE = 5.0, 0.05
 _BOUNDS = {
     "height_agl_m": POSITIVE,
+    "height_sigma_m": POSITIVE_SIGMA,
     "alt_amsl_m": ANY,
     "heading_deg": HEADING,
+    "heading_sigma_deg": POSITIVE_SIGMA,
     "roll_deg": HALF_TURN,
     "pitch_deg": QUARTER_TURN,
+    "tilt_sigma_deg": POSITIVE_SIGMA,
     "east_velocity_mps": ANY,
     "north_velocity_mps": ANY,
     "lat_deg": QUARTER_TURN,
     "lon_deg": LONGITUDE,
     "sigma_m": SIGMA,
 }
-_DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(("height_agl_m", "alt_amsl_m", "sigma_m"), 3)
+_DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
+    ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3
+)
 _REQUIRED = ("timestamp_ns", "frame")
 
 

@@ -34,8 +34,8 @@ class TrackRow:
         sigma_east_m: standard deviation east.
         sigma_north_m: standard deviation north.
         covariance_en_m2: covariance of east and north.
-        score: NCC, or the ratio of inliers for SIFT.
-        method: "ncc" or "sift".
+        score: NCC, or of matched points the ratio of inliers.
+        method: "ncc", "sift" or "learned".
         window_width_px: width of the map window that was searched.
         window_height_px: height of the map window that was searched.
         latency_ms: from the frame's arrival to its result.

@@ -22,8 +22,10 @@ from engine.values import Window
 
 Array = NDArray[np.float64]
 
-DETECTOR_VERSION = 2
+DETECTOR_VERSION = 3
 """Part of the key of cached landmarks; to be raised with every change of detector or descriptor."""
+MIN_CONTRAST = 0.005
+"""Lowe's contrast threshold: bare ground has little, and where there is more the strongest are taken."""
 TILE_PX = 256
 """Tiles begin on multiples of this in every level."""
 HALO_PX = 64
@@ -179,6 +181,7 @@ class LandmarkMap:
             max_keypoints=_SLOTS,
             upright=upright,
             mask=torch.from_numpy(mask)[None, None].to(self._device),
+            contrast_threshold=MIN_CONTRAST,
             spread=1,  # by strength alone; landmarks are spread by the cells of the level
         )
         count = int(found.valid.sum())

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 Gray = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Bounds = tuple[float, float, float, float]
+"""West, south, east, north."""
 
 DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 COLLAR_SHARE = 0.005
@@ -112,7 +114,8 @@ def open_source(
     path: str | os.PathLike[str],
     argument: str = "map",
     *,
-    bounds_deg: tuple[float, float, float, float] | None = None,
+    bounds_deg: Bounds | None = None,
+    bounds_crs: Bounds | None = None,
     crs: Any = None,
 ) -> Source:
     """Open a local raster with its georeference.
@@ -123,6 +126,7 @@ def open_source(
         argument: name of the file in messages.
         bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
             and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).
+        bounds_crs: the same in the units of ``crs``.
         crs: coordinate reference system of a file that names none; else that of a ``.prj`` beside it.
 
     Raises:
@@ -134,19 +138,22 @@ def open_source(
         transform, own_crs = dataset.transform, dataset.crs
     size = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
-    if bounds_deg is not None:
-        if own is not None:
-            raise MapError(f"bounds_deg: expected none for a file with a georeference of its own, {file}")
+    if own is not None:
+        for name, bounds in (("bounds_deg", bounds_deg), ("bounds_crs", bounds_crs)):
+            if bounds is not None:
+                raise MapError(f"{name}: expected none for a file with a georeference of its own, {file}")
+        grid = Grid(*size, own, _crs_of(file, argument, own_crs, crs))
+    elif bounds_deg is not None or bounds_crs is not None:
         found = earth_crs(crs if crs is not None else "EPSG:4326", "crs")
-        own = _from_bounds(bounds_deg, found, *size)
-    elif own is not None:
-        found = _crs_of(file, argument, own_crs, crs)
+        edges = bounds_crs if bounds_deg is None else _from_degrees(bounds_deg, found, *size)
+        assert edges is not None  # one of the two was given
+        grid = Grid(*size, _from_edges(edges, *size), found)
     else:
         raise MapError(
-            f"{argument}: {file} is a picture without georeference; give bounds_deg=(west, south, east, "
+            f"{argument}: {file} is a picture without georeference; give `bounds_deg` (west, south, east, "
             "north), or a world file and its CRS (control points and RPCs are not used: gdalwarp them first)"
         )
-    return Source(file, dataset, _checked(Grid(*size, own, found), argument, file))
+    return Source(file, dataset, _checked(grid, argument, file))
 
 
 def _open_dataset(file: Path, argument: str) -> Any:
@@ -188,11 +195,12 @@ def _crs_of(file: Path, argument: str, own: Any, given: Any) -> CRS:
     if beside.is_file():
         return earth_crs(beside.read_text(encoding="utf-8", errors="replace"), argument)
     raise MapError(
-        f"{argument}: {file} names no CRS; give crs=, such as 'EPSG:32636', or put {beside.name} beside it"
+        f"{argument}: {file} names no CRS; give `crs`, such as EPSG:32636, or put {beside.name} beside it"
     )
 
 
-def _from_bounds(bounds_deg: tuple[float, float, float, float], crs: CRS, width: int, height: int) -> Array:
+def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Bounds:
+    """The outer edges in the units of the CRS, where the picture has upright ones there."""
     from pyproj import Transformer
 
     west, south, east, north = bounds_deg
@@ -204,9 +212,16 @@ def _from_bounds(bounds_deg: tuple[float, float, float, float], crs: CRS, width:
     slant_x, slant_y = np.abs([x[2] - x[0], x[3] - x[1]]).max(), np.abs([y[3] - y[0], y[2] - y[1]]).max()
     if not (slant_x <= step_x / 2 and slant_y <= -step_y / 2):
         raise MapError(
-            f"bounds_deg: the corners are no rectangle in crs {crs.name!r}; expected one of its own bounds"
+            f"bounds_deg: the corners are no rectangle in crs {crs.name!r}; expected bounds in its own units"
         )
-    return np.array([[step_x, 0.0, x[0] + step_x / 2.0], [0.0, step_y, y[0] + step_y / 2.0]])
+    return float(x[0]), float(y[1]), float(x[1]), float(y[0])
+
+
+def _from_edges(bounds: Bounds, width: int, height: int) -> Array:
+    """The affine of pixel centres from the outer edges."""
+    west, south, east, north = bounds
+    step_x, step_y = (east - west) / width, (south - north) / height
+    return np.array([[step_x, 0.0, west + step_x / 2.0], [0.0, step_y, north + step_y / 2.0]])
 
 
 class GrayReader:

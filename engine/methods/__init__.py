@@ -10,16 +10,19 @@ from collections.abc import Mapping
 
 from engine.errors import OptionError
 from engine.methods.auto import Auto
+from engine.methods.learned import Learned
 from engine.methods.method import Method
 from engine.methods.ncc import Ncc
 from engine.methods.paper import PaperNcc, PaperSift
 from engine.methods.sift import Sift
 
 BY_PROFILE: Mapping[str, Mapping[str, type[Method]]] = {
-    "engine": {"ncc": Ncc, "sift": Sift, "auto": Auto},
+    "engine": {"ncc": Ncc, "sift": Sift, "auto": Auto, "learned": Learned},
     "paper": {"ncc": PaperNcc, "sift": PaperSift},
 }
 METHODS = tuple(BY_PROFILE["engine"])
+CLASSICAL = tuple(name for name in METHODS if name != "learned")
+"""Those that need no file of weights."""
 
 
 def method_type(name: str, profile: str) -> type[Method]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 
@@ -30,6 +31,9 @@ class Method(ABC):
     def parts(self) -> Mapping[str, Method]:
         """The methods that it is made of, by name."""
         return {}
+
+    warmup_rounds: ClassVar[int] = 3
+    """How often each frame of the warm-up is matched to learn what the steps cost."""
 
     @property
     def cache_counters(self) -> dict[str, int]:

@@ -263,7 +263,8 @@ class Ncc(Method):
 
     def _fix(self, correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
         """The camera's nadir and its covariance; the heading too where it was searched for."""
-        query, pose, errors = correlator.query, aligned.pose, self.options.errors
+        query, pose = correlator.query, aligned.pose
+        errors = query.errors(self.options.errors)
         height_m = pose.height_agl_m
         assert height_m is not None  # asked for before
         rows, columns = aligned.template.shape

@@ -79,10 +79,15 @@ class SiftOptions:
     Attributes:
         margin: the 1.3 of equations 4 and 5.
         scale: the frame is reduced to this before detection; the paper's 0.5.
-        max_keypoints: features taken from the frame; the map's are as dense.
+        max_keypoints: features taken from a frame of usual size; the map's are as dense.
+        keypoints_per_px: features taken from a larger one, per pixel of the map's level that it covers.
+        contrast_threshold: Lowe's, of frame and map; bare ground has little contrast.
         map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
         max_map_keypoints: upper limit for a window that is described per frame.
-        ratio: best against second-best descriptor distance (Lowe's test).
+        ratio: best against second-best descriptor distance (Lowe's test), where RANSAC must find what agrees.
+        vote_ratio: the same where matches vote for a translation, which finds it among many wrong ones.
+        vote_share: matches agree on a translation within this share of the distance to the ground.
+        tolerance_px: pixels of the map's level within which matches agree on the pose that was voted for.
         upright: where the heading is known, turn the descriptors by it and not by each keypoint's gradients.
         max_turn_deg: where the heading is known and descriptors are not upright, how far the angles of a match may
             contradict it; None does not ask.
@@ -106,9 +111,14 @@ class SiftOptions:
     margin: float = 1.3
     scale: float = 0.5
     max_keypoints: int = 300
+    keypoints_per_px: float = 0.01
+    contrast_threshold: float = 0.005
     map_features: str = "prepared"
     max_map_keypoints: int = 6000
     ratio: float = 0.8
+    vote_ratio: float = 0.9
+    vote_share: float = 0.03
+    tolerance_px: float = 1.0
     upright: bool = True
     max_turn_deg: float | None = 30.0
     max_scale_factor: float | None = 1.5
@@ -124,7 +134,7 @@ class SiftOptions:
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
-        for name in ("margin", "height_factor", "max_height_m", "min_deviation"):
+        for name in ("margin", "height_factor", "max_height_m", "min_deviation", "tolerance_px"):
             if math.isinf(getattr(self, name)):
                 raise OptionError(f"{name}: expected a finite number, got {getattr(self, name)}")
         for name in ("margin", "height_factor"):
@@ -134,11 +144,12 @@ class SiftOptions:
             raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
         if not 0.0 <= self.min_confidence < 1.0:
             raise OptionError(f"min_confidence: expected 0 or more and below 1, got {self.min_confidence}")
-        for name in ("scale", "ratio"):
+        for name in ("scale", "ratio", "vote_ratio", "vote_share"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
         for name, minimum in (
-            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M), ("max_tilt_deg", 0.0)
+            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M),
+            ("max_tilt_deg", 0.0), ("keypoints_per_px", 0.0), ("contrast_threshold", 0.0), ("tolerance_px", 0.0),
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > minimum:
@@ -153,18 +164,49 @@ class SiftOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedOptions:
+    """Settings of the learned method; all others are SIFT's.
+
+    Attributes:
+        weights: files of LoFTR, or of LightGlue with DISK, ALIKED or SuperPoint.
+        max_picture_px: on the level of the map where a frame is matched it covers at most so many pixels.
+        max_keypoints: of a frame; LoFTR has none.
+        max_map_keypoints: of a window.
+        max_window_px: a window with more pixels of its level is not searched.
+        min_match_confidence: of a match by LoFTR.
+    """
+
+    weights: tuple[str, ...] = ()
+    max_picture_px: int = 130_000
+    max_keypoints: int = 512
+    max_map_keypoints: int = 2048
+    max_window_px: int = 1 << 21
+    min_match_confidence: float = 0.5
+
+    def __post_init__(self) -> None:
+        limits = {"max_picture_px": 4096, "max_window_px": 4096, "max_keypoints": 4, "max_map_keypoints": 4}
+        for name, minimum in limits.items():
+            if not getattr(self, name) >= minimum:
+                raise OptionError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
+        if not 0.0 <= self.min_match_confidence <= 1.0:
+            raise OptionError(f"min_match_confidence: expected 0 to 1, got {self.min_match_confidence}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatcherOptions:
-    """Settings of both methods.
+    """Settings of all methods.
 
     Attributes:
         profile: "engine", or "paper" for the paper's own recipe with OpenCV.
         ncc: settings of the NCC method.
         sift: settings of the SIFT method.
+        learned: settings of the learned method.
     """
 
     profile: str = "engine"
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
+    learned: LearnedOptions = field(default_factory=LearnedOptions)
 
     def __post_init__(self) -> None:
         if self.profile not in PROFILES:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.covariance import AssumedErrors
+from engine.covariance import AssumedErrors, with_frame_accuracy
 from engine.geo import enu_from_body, wrap_heading_deg
 from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
@@ -108,6 +108,10 @@ class Query:
         width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
         shape = (self.site.width_px, self.site.height_px)
         return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
+
+    def errors(self, assumed: AssumedErrors) -> AssumedErrors:
+        """What is assumed of telemetry and map, less what the frame states of its own telemetry."""
+        return with_frame_accuracy(self.frame, assumed)
 
     def attitude_prior(self, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
         """The frame's attitude with its assumed errors about the body's axes; an unknown tilt is taken as level.

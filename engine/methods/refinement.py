@@ -54,7 +54,8 @@ class Refinement:
         Without a known roll and pitch the picture must determine them, or the fix is refused: its error is
         unknown then.
         """
-        query, errors, has_tilt = self.query, self.options.errors, self.query.telemetry.has_tilt
+        query, has_tilt = self.query, self.query.telemetry.has_tilt
+        errors = query.errors(self.options.errors)
         prior = self._prior(fix)
         with query.scheduler.stage("dense"):
             fit = self._through_levels(prior, _COARSER) if has_tilt else None
@@ -95,7 +96,8 @@ class Refinement:
 
     def _prior(self, fix: Fix) -> GaussianPrior:
         """The telemetry's height and attitude; the position by correlation is a start without any weight."""
-        query, errors, known = self.query, self.options.errors, self.query.telemetry
+        query, known = self.query, self.query.telemetry
+        errors = query.errors(self.options.errors)
         attitude, height_m = known.grid_attitude, known.height_agl_m
         assert attitude is not None
         assert height_m is not None

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.align import view_of
+from engine.align import ground_bounds_px
+from engine.camera import Camera
 from engine.geo import enu_from_body
 from engine.indexes.landmarks import PREPARED_PX
 from engine.methods.query import Query
@@ -16,6 +17,7 @@ from engine.values import Attitude, NoFix, Window
 from engine.window import level_crop, level_for
 
 _CROP_STEP_PX = 32
+_MIN_DOWN = 0.2  # cosine of the optical axis off the vertical
 _LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
 
 
@@ -84,7 +86,7 @@ def views_of(
         scale: of the reduced frame.
     """
     site, heights_m = query.site, hypothesis.heights_m
-    per_height = 1.0 / (query.camera.focal_px * scale * site.gsd_m_per_px)
+    per_height = _slant(query) / (query.camera.focal_px * scale * site.gsd_m_per_px)
     first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
     views: dict[int, MapView] = {}
     for level in range(first, last + 1):
@@ -99,8 +101,14 @@ def views_of(
 
 def view_in(query: Query, window: Window, height_m: float, scale: float) -> MapView:
     """The view of a window that is known, at one height; see :func:`views_of`."""
-    per_px = height_m / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
-    return _view(query, window, level_for(1.0, per_px, query.site.levels), per_px)
+    per_px = height_m * _slant(query) / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
+    return _view(query, window, level_at(query, height_m, scale), per_px)
+
+
+def level_at(query: Query, height_m: float, scale: float) -> int:
+    """The level whose pixels are like those of a frame that was reduced to a scale."""
+    per_px = height_m * _slant(query) / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
+    return level_for(1.0, per_px, query.site.levels)
 
 
 def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
@@ -117,11 +125,21 @@ def _window(query: Query, height_m: float, has_heading: bool, method: str, margi
     if nadir is None:
         return Window(0, 0, query.site.width_px, query.site.height_px)
     attitude = query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0)
-    view = view_of(query.camera, attitude, height_m, query.jacobian)
-    if view is None:
+    bounds = ground_bounds_px(query.camera, attitude, height_m, query.jacobian)
+    if bounds is None:
         return query.refuse_tilted(attitude, method)
-    width, height = view.footprint_px
+    width, height = (float(n) for n in bounds[1] - bounds[0])
     if not has_heading:  # at any heading the footprint fits the square of its diagonal
         width = height = math.hypot(width, height)
-    window = query.window(nadir + view.center_px, (width, height), (width, height), margin=margin)
+    window = query.window(nadir + bounds.mean(axis=0), (width, height), (width, height), margin=margin)
     return window or query.refuse_outside(method)
+
+
+def slant_factor(camera: Camera, attitude: Attitude) -> float:
+    """Distance to the ground along the optical axis over the height; bounded near the horizon."""
+    turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
+    return 1.0 / max(-float((turn @ camera.mount)[2, 2]), _MIN_DOWN)
+
+
+def _slant(query: Query) -> float:
+    return slant_factor(query.camera, query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0))

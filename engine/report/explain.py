@@ -158,7 +158,7 @@ def match_again(
     if window is None:
         return None
     matched = _as_matched(frame, row, note, matcher.site)
-    method = row.method if row.method in ("ncc", "sift") else None
+    method = row.method if row.method in ("ncc", "sift", "learned") else None
     try:
         return window, matcher.explain(matched, window, method)
     except EngineError:  # an image of another size, which the run has reported

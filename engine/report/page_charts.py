@@ -114,7 +114,7 @@ def _score(rows: Sequence[TrackRow], plot_data: TrackPlotData, time: Limits) -> 
     score, methods = _column(rows, "score"), [row.method for row in rows]
     area = ChartArea(time, (min(0.0, float(np.nanmin(score))), 1.0))
     fixed = np.array([row.fixed for row in rows])
-    sift = np.array([method == "sift" for method in methods])
+    sift = np.array([method in ("sift", "learned") for method in methods])
     both = sift.any() and not sift.all()
     kinds = (("refused", ~fixed), ("fix", fixed & ~sift), ("sift" if both else "fix", fixed & sift))
     marks = [area.dots(plot_data.time[chosen], score[chosen], kind) for kind, chosen in kinds]

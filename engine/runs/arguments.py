@@ -52,13 +52,35 @@ def parse_circle(name: str, text: str | None) -> tuple[float, float, float] | No
     return lat_deg, lon_deg, radius_m
 
 
-def _numbers(name: str, text: str, form: str, counts: Sequence[int]) -> list[float]:
+def parse_bounds(name: str, text: str | None) -> tuple[float, float, float, float] | None:
+    """Read W,S,E,N; None where nothing was given.
+
+    Raises:
+        OptionError: the text is of another form, or a side does not lie before the other.
+    """
+    if text is None:
+        return None
+    west, south, east, north = _numbers(name, text, "W,S,E,N", (4,), "in degrees or in `map_crs`")
+    if not (west < east and south < north):
+        raise OptionError(f"{name}: expected west before east and south before north, got {text!r}")
+    return west, south, east, north
+
+
+def is_in_degrees(bounds: tuple[float, float, float, float]) -> bool:
+    """Whether bounds may be degrees: no map lies so near the origin of a projection in metres."""
+    west, south, east, north = bounds
+    return west >= -180.0 and east <= 540.0 and south >= -90.0 and north <= 90.0
+
+
+def _numbers(
+    name: str, text: str, form: str, counts: Sequence[int], units: str = "in degrees and metres"
+) -> list[float]:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise OptionError(f"{name}: expected {form} in degrees and metres, got {text!r}")
+        raise OptionError(f"{name}: expected {form} {units}, got {text!r}")
     return numbers
 
 

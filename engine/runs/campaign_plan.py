@@ -39,7 +39,7 @@ class RecordedFlight:
         folder: that the others lie in, as seen from the campaign's file.
         map: the map.
         surface: its surface model; left out where it has the usual name and is not there, as the next three are.
-        camera: the calibration.
+        camera: the calibration; left out likewise, then ``hfov_deg`` or the photographs' EXIF.
         frames: a folder of pictures, a video or a bag.
         telemetry: telemetry.csv or a log.
         frame_stamps: with a log, a CSV with timestamp_ns and frame; without it the frames' own stamps.
@@ -47,6 +47,11 @@ class RecordedFlight:
         image_topic: of the pictures, where the frames are a bag with several.
         truth: truth.csv or a log.
         map_sigma_m: georeferencing accuracy of the map per axis; none is what the map states.
+        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
+        map_crs: of a map that names none.
+        hfov_deg: horizontal field of view, in place of a calibration.
+        mount: how the camera is mounted, by name.
+        camera_pitch_deg: of the camera, -90 looks straight down.
         group: flights of one group are pooled in the table; without it those of a published data set are, and any
             other flight is a group of its own.
     """
@@ -62,6 +67,11 @@ class RecordedFlight:
     image_topic: str | None = None
     truth: str | None = "truth.csv"
     map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    hfov_deg: float | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
     group: str | None = None
 
     def __post_init__(self) -> None:
@@ -93,7 +103,7 @@ class RecordedFlight:
             return FlightFiles(
                 map=needed("map"),
                 surface=optional("surface"),
-                camera=needed("camera"),
+                camera=optional("camera"),
                 frames=needed("frames"),
                 telemetry=optional("telemetry"),
                 truth=optional("truth"),
@@ -101,6 +111,11 @@ class RecordedFlight:
                 log_offset_s=self.log_offset_s,
                 image_topic=self.image_topic,
                 map_sigma_m=self.map_sigma_m,
+                map_bounds=self.map_bounds,
+                map_crs=self.map_crs,
+                hfov_deg=self.hfov_deg,
+                mount=self.mount,
+                camera_pitch_deg=self.camera_pitch_deg,
             )
         except OptionError as error:
             raise OptionError(f"flights.{name}: {error}") from None
@@ -266,12 +281,12 @@ def _input_hashes(files: FlightFiles) -> dict[str, str]:
     """A hash of the content of each input; no stamp of a file has to be trusted."""
     paths = {name: getattr(files, name) for name in (*FOLDER_LAYOUT, "frame_stamps")}
     hashes = {name: _content_hash(path) for name, path in paths.items() if path is not None}
-    values = {
-        "log_offset_s": files.log_offset_s or None,
-        "image_topic": files.image_topic,
-        "map_sigma_m": files.map_sigma_m,
-    }
+    values = {name: getattr(files, name) for name in _VALUES}
+    values["log_offset_s"] = files.log_offset_s or None
     return hashes | {name: repr(value) for name, value in values.items() if value is not None}
+
+
+_VALUES = ("image_topic", "map_sigma_m", "map_bounds", "map_crs", "hfov_deg", "mount", "camera_pitch_deg")
 
 
 @cache

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
-from engine.camera import Camera
+import numpy as np
+
+from engine.camera import Camera, mount_rotation
 from engine.errors import CalibrationError, OptionError, TelemetryError
 from engine.formats.flight import Flight
 from engine.formats.frames import PictureFolder
@@ -49,6 +51,19 @@ def _decoded_size(path: str) -> tuple[int, int]:
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = "it is no picture" if isinstance(error, UnidentifiedImageError) else str(error)
         raise TelemetryError(f"{path}: expected a readable picture: {' '.join(reason.split())}") from None
+
+
+def check_gimbal(flight: Flight, camera: Camera) -> None:
+    """Refuse a mount besides the angles of a gimbal, which say by themselves where the camera looks.
+
+    Raises:
+        CalibrationError: the camera would be turned twice.
+    """
+    if flight.has_gimbal and not np.allclose(camera.mount, mount_rotation(), atol=1e-3):
+        raise CalibrationError(
+            "mount: expected nadir, since the telemetry has the angles of a gimbal and they say where the camera "
+            "looks"
+        )
 
 
 def check_needs(flight: Flight, method: str, profile: str) -> None:

@@ -17,7 +17,7 @@ from engine.formats.flight import write_flight_folder
 from engine.formats.track import TrackRow, read_track, track_row, write_track
 from engine.formats.truth import read_truth
 from engine.matcher import SceneMatcher
-from engine.methods import METHODS
+from engine.methods import CLASSICAL
 from engine.orthomap import OrthoMap
 from engine.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
 from engine.report.figures import draw_figures
@@ -31,7 +31,7 @@ from engine.runs.results import SUMMARY, TRACK
 from engine.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
 from engine.sim import FlightStyle, Town, picture_at
 from engine.sim.faults import FAULT_KINDS, Fault
-from engine.sim.flight import grid_at
+from engine.sim.flight import NADIR_PITCH_DEG, grid_at
 from engine.sim.light import Image
 from engine.sim.loop import ClosedLoop
 from engine.sim.pilot import plan_rounds
@@ -70,7 +70,7 @@ class ClosedLoopSettings:
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
+        check_choice("method", self.method, CLASSICAL)
         check_choice("fault", self.fault, FAULT_KINDS)
         if not 0.1 <= self.minutes <= 120.0:
             raise OptionError(f"minutes: expected 0.1 to 120, got {self.minutes:g}")
@@ -105,10 +105,12 @@ def fly_closed_loop(
         The figures, as loop.json has them.
     """
     out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
+    if world.camera_pitch_deg != NADIR_PITCH_DEG:
+        raise OptionError(f"camera_pitch_deg: expected none in a closed loop, got {world.camera_pitch_deg:g}")
     check_folder(out, force)
     live_view.check(force=force)
     progress.message("drawing the world")
-    town, camera = world.build(), Camera.from_fov(300, 300, 60.0)
+    town, camera = world.build(), world.camera()
     site = town.site()
     matcher = SceneMatcher(site, camera, loop.method, loop.device)
     matcher.warmup()

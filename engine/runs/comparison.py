@@ -24,30 +24,37 @@ DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
 """What is compared unless named: the paper's Table I."""
 
 
-def parse_runs(texts: Sequence[str] = (), **overrides: Any) -> dict[str, TrackSettings]:
+def parse_runs(
+    texts: Sequence[str] = (), *, weights: Sequence[StrPath] = (), **overrides: Any
+) -> dict[str, TrackSettings]:
     """Settings by the name of their run, from METHOD, METHOD/PROFILE or a settings file each.
 
     Args:
         texts: one a run; none of them is :data:`DEFAULT_RUNS`.
+        weights: files of the runs by the learned method.
         overrides: settings that hold for all of them, where not None.
 
     Raises:
         OptionError: a text is none of these, or two runs have one name.
     """
+    texts = texts or DEFAULT_RUNS
     runs: dict[str, TrackSettings] = {}
-    for text in texts or DEFAULT_RUNS:
-        name, settings = _parse_run(text, overrides)
+    for text in texts:
+        name, settings = _parse_run(text, weights, overrides)
         if name in runs:
             raise OptionError(f"runs: expected runs of different names, got {name!r} twice")
         runs[name] = settings
+    if weights and not any(settings.method == "learned" for settings in runs.values()):
+        raise OptionError(f"weights: expected them with a run by learned, got {', '.join(runs)}")
     return runs
 
 
-def _parse_run(text: str, overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
+def _parse_run(text: str, weights: Sequence[StrPath], overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
     method, slash, profile = text.partition("/")
+    weights = weights if method == "learned" else ()
     if method in METHODS and not Path(text).is_file():
         chosen = {"method": method, "profile": profile} if slash else {"method": method}
-        return text.replace("/", "-"), load_settings(None, **overrides, **chosen)
+        return text.replace("/", "-"), load_settings(None, weights=weights, **overrides, **chosen)
     if not Path(text).is_file():
         raise OptionError(
             f"runs: expected {', '.join(METHODS)}, one of them with /paper, or a settings file, got {text!r}"

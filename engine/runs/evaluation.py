@@ -42,7 +42,10 @@ def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progres
     if path is None:
         raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
     truth_rows = open_truth(Path(path), rows[0].timestamp_ns if rows else None)
-    site = open_map(record.map, record.surface, record.map_sigma_m, progress=progress)
+    site = open_map(
+        record.map, record.surface, record.map_sigma_m, bounds=record.map_bounds, crs=record.map_crs,
+        progress=progress,
+    )  # fmt: skip
     ground = Ground(record.ground_m, record.ground_amsl_m)
     frames = _report_frames(record, rows, site)
     record = replace(record, truth=str(Path(path).resolve()))
@@ -60,7 +63,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
         if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
             return ReportFrames(why_missing="the frames or their telemetry are not those of the run any more.")
-        camera, options = files.load_camera(), settings.matcher_options()
+        camera, options = files.load_camera(flight), settings.matcher_options()
         return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, options))
     except (EngineError, OSError) as error:
         return ReportFrames(why_missing=f"{error}.")
@@ -70,11 +73,11 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
     """The files of a finished run.
 
     Raises:
-        TelemetryError: the record does not name them all.
+        TelemetryError: the record does not name the frames.
         OptionError: what it names does not go together.
     """
-    if record.camera is None or record.frames is None:
-        raise TelemetryError("the record of the run lacks its camera or its frames")
+    if record.frames is None:
+        raise TelemetryError("the record of the run lacks its frames")
     return FlightFiles(
         map=record.map,
         camera=record.camera,
@@ -83,4 +86,7 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         frame_stamps=record.frame_stamps,
         log_offset_s=record.log_offset_s or 0.0,
         image_topic=record.image_topic,
+        hfov_deg=record.hfov_deg,
+        mount=record.mount,
+        camera_pitch_deg=record.camera_pitch_deg,
     )

@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from engine.camera import Camera
-from engine.errors import OptionError, TelemetryError
-from engine.formats.flight import Flight, open_flight
+from engine.errors import MapError, OptionError, TelemetryError
+from engine.formats.flight import Flight, open_flight, subtitles_beside
+from engine.formats.frames import VIDEO_SUFFIXES
 from engine.formats.logs.readers import LogClock, is_log, open_truth
-from engine.formats.ros.bags import is_bag, read_bag_camera
+from engine.formats.ros.bags import is_bag
+from engine.learned import load_matcher
 from engine.orthomap import OrthoMap
-from engine.runs.arguments import parse_position, renamed_in_errors
-from engine.runs.checks import check_needs, check_pictures, check_position, check_start
+from engine.runs.arguments import is_in_degrees, parse_bounds, parse_position, renamed_in_errors
+from engine.runs.cameras import CameraFiles
+from engine.runs.checks import check_gimbal, check_needs, check_pictures, check_position, check_start
 from engine.runs.folders import StrPath
 from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import TrackSettings
@@ -29,7 +32,7 @@ FOLDER_LAYOUT = {
     "truth": "truth.csv",
 }
 """The files of a flight folder by what they are."""
-_OPTIONAL = ("surface", "telemetry", "truth")
+_OPTIONAL = ("surface", "camera", "telemetry", "truth")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, init=False)
@@ -39,14 +42,21 @@ class FlightFiles:
     Attributes:
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
         surface: surface model, a GeoTIFF of heights.
-        camera: calibration, or the bag that has it.
+        camera: calibration, or the bag that has it; None takes ``hfov_deg`` or the photographs' EXIF.
         frames: folder of pictures, video or bag.
-        telemetry: telemetry.csv or a log; None takes the bag's own or the pictures' EXIF.
+        telemetry: telemetry.csv or a log; None takes the bag's own, the subtitles beside a video, or the
+            pictures' EXIF.
         truth: truth.csv or a log; None takes the one beside the telemetry.
         frame_stamps: with a log, a CSV with timestamp_ns and frame.
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        map_bounds: "W,S,E,N" of the outer edges of a picture, in degrees or in ``map_crs``; None is the
+            file's own.
+        map_crs: coordinate reference system of a map that names none, such as "EPSG:32636".
+        hfov_deg: horizontal field of view, in place of a calibration.
+        mount: how the camera is mounted, a key of :data:`engine.camera.MOUNTS`; None is the calibration's.
+        camera_pitch_deg: of the camera against the vehicle's horizontal, -90 looks straight down.
 
     Raises:
         OptionError: a file does not go with another.
@@ -54,7 +64,7 @@ class FlightFiles:
 
     map: Path
     surface: Path | None
-    camera: Path
+    camera: Path | None
     frames: Path
     telemetry: Path | None
     truth: Path | None
@@ -62,6 +72,11 @@ class FlightFiles:
     log_offset_s: float
     image_topic: str | None
     map_sigma_m: float | None
+    map_bounds: str | None
+    map_crs: str | None
+    hfov_deg: float | None
+    mount: str | None
+    camera_pitch_deg: float | None
 
     def __init__(
         self,
@@ -76,30 +91,46 @@ class FlightFiles:
         log_offset_s: float = 0.0,
         image_topic: str | None = None,
         map_sigma_m: float | None = None,
+        map_bounds: str | None = None,
+        map_crs: str | None = None,
+        hfov_deg: float | None = None,
+        mount: str | None = None,
+        camera_pitch_deg: float | None = None,
     ) -> None:
         with renamed_in_errors(offset_s="log_offset_s"):
             LogClock(offset_s=log_offset_s)
-        if camera is None and not is_bag(frames):
-            raise OptionError("camera: expected a calibration, which only a bag may have within itself")
+        parse_bounds("map_bounds", map_bounds)
+        if telemetry is None:
+            telemetry = subtitles_beside(frames)
+        if camera is None and is_bag(frames):
+            camera = frames
+        if camera is None and hfov_deg is None and Path(frames).suffix.lower() in VIDEO_SUFFIXES:
+            raise OptionError("camera: expected a calibration, or `hfov_deg`: a video has neither within itself")
         if (frame_stamps is not None or log_offset_s) and (telemetry is None or not is_log(telemetry)):
             raise OptionError(f"frame_stamps, log_offset_s: expected a log as telemetry, got {telemetry}")
         if image_topic is not None and not is_bag(frames):
             raise OptionError(f"image_topic: expected a bag as frames, got {frames}")
         paths = {
-            "map": map, "frames": frames, "camera": frames if camera is None else camera, "surface": surface,
+            "map": map, "frames": frames, "camera": camera, "surface": surface,
             "telemetry": telemetry, "truth": truth, "frame_stamps": frame_stamps,
         }  # fmt: skip
         for name, path in paths.items():
             object.__setattr__(self, name, None if path is None else Path(path))
         object.__setattr__(self, "log_offset_s", log_offset_s)
         object.__setattr__(self, "image_topic", image_topic)
-        object.__setattr__(self, "map_sigma_m", map_sigma_m)
+        values = {
+            "map_sigma_m": map_sigma_m, "map_bounds": map_bounds, "map_crs": map_crs, "hfov_deg": hfov_deg,
+            "mount": mount, "camera_pitch_deg": camera_pitch_deg,
+        }  # fmt: skip
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        self.camera_files()
 
     @classmethod
     def in_folder(cls, folder: StrPath) -> FlightFiles:
         """The files of a flight folder by their usual names.
 
-        Surface, telemetry and truth are those that are there.
+        Surface, camera, telemetry and truth are those that are there.
         """
         paths: dict[str, Any] = {name: Path(folder) / file for name, file in FOLDER_LAYOUT.items()}
         return cls(**{name: path for name, path in paths.items() if name not in _OPTIONAL or path.exists()})
@@ -113,9 +144,27 @@ class FlightFiles:
         """When the frames were taken, where the telemetry is a log."""
         return LogClock(self.frame_stamps, self.log_offset_s)
 
-    def load_camera(self) -> Camera:
-        """The calibration, of a file or of a bag."""
-        return read_bag_camera(self.camera, self.image_topic) if is_bag(self.camera) else Camera.load(self.camera)
+    def camera_files(self) -> CameraFiles:
+        """What is said of the camera."""
+        return CameraFiles(
+            calibration=self.camera,
+            image_topic=self.image_topic,
+            hfov_deg=self.hfov_deg,
+            mount=self.mount,
+            camera_pitch_deg=self.camera_pitch_deg,
+        )
+
+    def load_camera(self, flight: Flight, progress: Progress = SILENT) -> Camera:
+        """The calibration, of a file, a bag or the photographs of the flight."""
+        camera = self.camera_files().load(flight.source, flight.names, progress=progress)
+        check_gimbal(flight, camera)
+        return camera
+
+    def open_map(self, progress: Progress = SILENT) -> OrthoMap:
+        """The map with its surface; see :func:`open_map`."""
+        return open_map(
+            self.map, self.surface, self.map_sigma_m, bounds=self.map_bounds, crs=self.map_crs, progress=progress
+        )
 
     def open_flight(self) -> Flight:
         """The frames with what is known of each."""
@@ -147,14 +196,16 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
         OptionError, TelemetryError, CalibrationError, MapError: something cannot be read, or does not belong
             together, or is of no use to one of the runs.
     """
-    site = open_map(files.map, files.surface, files.map_sigma_m, progress=progress)
-    camera = files.load_camera()
+    site = files.open_map(progress)
     flight = files.open_flight()
+    camera = files.load_camera(flight, progress)
     truth_path = files.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
     truth = open_truth(truth_path, stamp_ns) if truth_path is not None else None
     for settings in runs:
         check_needs(flight, settings.method, settings.profile)
+        if settings.method == "learned":
+            load_matcher(settings.learned.weights, device="cpu")
         start = parse_position("start", settings.start)
         check_position("start", start, site, OptionError)
         if start is None:
@@ -164,6 +215,8 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     check_pictures(flight, camera, progress)
     if flight.unused:
         progress.message(f"frames without a row in the telemetry, left out: {flight.unused}")
+    for remark in flight.remarks:
+        progress.message(remark)
     if flight.heights:
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
         progress.message(f"height above ground, by source, of {len(flight)} frames: {counts}")
@@ -171,7 +224,13 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
 
 
 def open_map(
-    path: StrPath, surface: StrPath | None = None, map_sigma_m: float | None = None, *, progress: Progress = SILENT
+    path: StrPath,
+    surface: StrPath | None = None,
+    map_sigma_m: float | None = None,
+    *,
+    bounds: str | None = None,
+    crs: str | None = None,
+    progress: Progress = SILENT,
 ) -> OrthoMap:
     """The map; where it is copied into the cache, that is a task of the progress.
 
@@ -179,14 +238,36 @@ def open_map(
         path: see :meth:`engine.OrthoMap.open`.
         surface: heights.
         map_sigma_m: georeferencing accuracy; None is what the map states.
+        bounds: "W,S,E,N" of the outer edges of a picture without georeference, in degrees or in the CRS; numbers
+            that may be degrees are degrees.
+        crs: of a file that names none.
         progress: is shown the copying.
 
     Raises:
-        OptionError: the accuracy is not above 0, or wider than any map.
+        OptionError: the accuracy is not above 0 or wider than any map, or bounds or CRS do not suit the file.
+        MapError: a file cannot be read, or is nowhere on the Earth.
     """
     if map_sigma_m is not None and not 0.0 < map_sigma_m <= MAX_SIGMA_M:
         raise OptionError(
             f"map_sigma_m: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {map_sigma_m:g}"
         )
-    with progress.task("copying the map into the cache") as update:
-        return OrthoMap.open(path, surface=surface, georeference_sigma_m=map_sigma_m, on_copy=update)
+    corners = parse_bounds("map_bounds", bounds)
+    in_degrees = crs is None or corners is None or is_in_degrees(corners)
+    try:
+        with (
+            progress.task("copying the map into the cache") as update,
+            renamed_in_errors(bounds_deg="map_bounds", bounds_crs="map_bounds", crs="map_crs"),
+        ):
+            return OrthoMap.open(
+                path,
+                surface,
+                bounds_deg=corners if in_degrees else None,
+                bounds_crs=None if in_degrees else corners,
+                crs=crs,
+                georeference_sigma_m=map_sigma_m,
+                on_copy=update,
+            )
+    except MapError as error:
+        if str(error).startswith(("map_bounds:", "map_crs:")):
+            raise OptionError(str(error)) from None
+        raise

@@ -42,6 +42,8 @@ class AuditFiles:
         height_agl_m: above the ground; None is the paper's height.
         around: only what lies within "LAT,LON,RADIUS_M".
         corridor_m: only what lies so near to the route.
+        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
+        map_crs: of a map that names none.
     """
 
     map: StrPath
@@ -52,6 +54,8 @@ class AuditFiles:
     height_agl_m: float | None = None
     around: str | None = None
     corridor_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +113,7 @@ def _plan(
     around = parse_circle("around", files.around)
     if files.corridor_m is not None and files.route is None:
         raise OptionError("corridor_m: expected a `route` with it, got none")
-    site = open_map(files.map, files.surface, progress=progress)
+    site = open_map(files.map, files.surface, bounds=files.map_bounds, crs=files.map_crs, progress=progress)
     other = None if files.other is None else _same_ground(open_map(files.other, progress=progress), site)
     camera = Camera.from_fov(*PAPER_CAMERA) if files.camera is None else Camera.load(files.camera)
     waypoints = None if files.route is None else read_route(files.route)

@@ -18,13 +18,16 @@ from engine.errors import BackendError, CalibrationError, OptionError, Telemetry
 from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
+from engine.methods.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
+from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath, check_file
 from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
+from engine.runs.settings import with_weights
 
 if TYPE_CHECKING:
     from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
@@ -50,6 +53,10 @@ class BridgeFiles:
         rate_hz: pace of pictures without stamps; None is 10.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
+        map_crs: of a map that names none.
+        mount: how the camera is mounted, by name; None is the calibration's.
+        camera_pitch_deg: of the camera, -90 looks straight down.
 
     Raises:
         OptionError: a number is out of its range, or an argument does not go with another.
@@ -64,8 +71,13 @@ class BridgeFiles:
     rate_hz: float | None = None
     exposure_to_grab_ms: float | None = None
     map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
 
     def __post_init__(self) -> None:
+        self.camera_files()
         if (self.frames is None) == (self.camera_source is None):
             raise OptionError("frames: expected either `frames` or `camera_source`")
         if self.frames is None:
@@ -78,6 +90,10 @@ class BridgeFiles:
             raise OptionError(
                 f"exposure_to_grab_ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
             )
+
+    def camera_files(self) -> CameraFiles:
+        """What is said of the camera."""
+        return CameraFiles(calibration=Path(self.camera), mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage]:
         """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
@@ -148,7 +164,8 @@ class BridgeSettings:
     """How a bridge matches frames.
 
     Attributes:
-        method: "auto", "ncc" or "sift".
+        method: "auto", "ncc", "sift" or "learned".
+        weights: files of the learned method.
         device: where tensors live.
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: age by which a frame is answered.
@@ -160,6 +177,7 @@ class BridgeSettings:
     """
 
     method: str = "auto"
+    weights: tuple[StrPath, ...] = ()
     device: str = "auto"
     start: str | None = None
     deadline_ms: float = 121.0
@@ -167,9 +185,14 @@ class BridgeSettings:
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
+        self.matcher_options()
         check_device(self.device)
         parse_position("start", self.start)
         self.live_options()
+
+    def matcher_options(self) -> MatcherOptions:
+        """What of it is the matcher's."""
+        return MatcherOptions(learned=with_weights(self.method, self.weights))
 
     def live_options(self) -> LiveOptions:
         """The deadlines of the frames."""
@@ -211,10 +234,12 @@ def run_mavlink_bridge(
     outgoing = link.outgoing()
     start = parse_position("start", settings.start)
     key = None if link.key is None else read_key(Path(link.key))
-    site = open_map(files.map, files.surface, files.map_sigma_m, progress=progress)
-    camera = Camera.load(files.camera)
+    site = open_map(
+        files.map, files.surface, files.map_sigma_m, bounds=files.map_bounds, crs=files.map_crs, progress=progress
+    )
+    camera = files.camera_files().load(None)
     check_position("start", start, site, OptionError)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):

@@ -14,8 +14,9 @@ from engine.errors import TelemetryError
 _TEXTS = ("map", "method", "profile")
 _TEXTS_OR_NONE = (
     "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "device", "start",
+    "map_bounds", "map_crs", "mount",
 )  # fmt: skip
-_NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "budget_ms", "ground_amsl_m")
+_NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,16 +26,21 @@ class RunRecord:
     Attributes:
         map: file or folder.
         surface: heights.
-        camera: calibration, or a bag that has it.
+        camera: calibration, or a bag that has it; None was the photographs' EXIF or ``hfov_deg``.
         frames: folder, video or bag.
         telemetry: telemetry.csv or a log.
         truth: truth.csv or a log.
         frame_stamps: when the frames were taken, where the telemetry is a log.
         log_offset_s: added to the frames' own stamps, in the same case.
         image_topic: of the pictures, where the frames are a bag.
-        map_sigma_m: georeferencing accuracy of the map, where it was given.
-        heights: frames by the source of their height, where the telemetry is a log.
-        method: "ncc", "sift" or "auto".
+        map_sigma_m: georeferencing accuracy of the map, where it was given, as are the next five.
+        map_bounds: of a picture, as typed.
+        map_crs: of a map that names none.
+        hfov_deg: horizontal field of view.
+        mount: of the camera, by name.
+        camera_pitch_deg: of the camera.
+        heights: frames by the source of their height, where the telemetry is a log or the photographs' own.
+        method: "ncc", "sift", "auto" or "learned".
         profile: "engine" or "paper".
         device: where tensors lived.
         start: where the flight began, as typed.
@@ -60,6 +66,11 @@ class RunRecord:
     log_offset_s: float | None = None
     image_topic: str | None = None
     map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    hfov_deg: float | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
     heights: Mapping[str, int] = field(default_factory=dict)
     method: str
     profile: str

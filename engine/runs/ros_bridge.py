@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from engine.adapters.ros import RosBridge, RosNode, RosStatus, RosTopics
 from engine.adapters.ros_out import RosOptions
@@ -12,6 +13,7 @@ from engine.errors import BackendError, OptionError
 from engine.formats.ros.messages import camera_from_message
 from engine.matcher import SceneMatcher
 from engine.runs.arguments import parse_position
+from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
@@ -33,6 +35,10 @@ class RosSettings:
         camera: calibration; None takes the topic's, of a nadir camera.
         topics: that are heard.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
+        map_crs: of a map that names none.
+        mount: how the camera is mounted, by name; None is the calibration's.
+        camera_pitch_deg: of the camera, -90 looks straight down.
         firmware: for whom the poses are, behind MAVROS: "none", "ardupilot" or "px4".
         origin: of the poses, "LAT,LON"; None is the map's.
 
@@ -45,6 +51,10 @@ class RosSettings:
     camera: StrPath | None = None
     topics: RosTopics = field(default_factory=RosTopics)
     map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
     version: int = 1
     firmware: str = "none"
     origin: str | None = None
@@ -52,6 +62,12 @@ class RosSettings:
     def __post_init__(self) -> None:
         if not self.topics.image:
             raise OptionError("image_topic: expected a name, got nothing")
+        self.camera_files()
+
+    def camera_files(self) -> CameraFiles:
+        """What is said of the camera."""
+        calibration = None if self.camera is None else Path(self.camera)
+        return CameraFiles(calibration=calibration, mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
 
     def options(self) -> RosOptions:
         """What is published.
@@ -89,12 +105,15 @@ def run_ros_bridge(
     live_view.check()
     settings = settings or BridgeSettings()
     start, options = parse_position("start", settings.start), ros.options()
-    site = open_map(ros.map, ros.surface, ros.map_sigma_m, progress=progress)
+    site = open_map(
+        ros.map, ros.surface, ros.map_sigma_m, bounds=ros.map_bounds, crs=ros.map_crs, progress=progress
+    )
     check_position("start", start, site, OptionError)
-    camera = None if ros.camera is None else Camera.load(ros.camera)
+    described = ros.camera_files()
+    camera = None if ros.camera is None else described.load(None)
     node = _node(ros.version)
-    camera = camera or _published_camera(node, ros.topics.camera_info, progress)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device)
+    camera = camera or described.mounted(_published_camera(node, ros.topics.camera_info, progress))
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):

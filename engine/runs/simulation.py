@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.flight import write_flight_folder
 from engine.runs.arguments import check_choice
@@ -15,7 +17,8 @@ from engine.runs.folders import StrPath, check_folder, prepare_folder
 from engine.runs.inputs import FlightFiles
 from engine.runs.progress import SILENT, Progress
 from engine.runs.results import OWNED
-from engine.sim import CONDITIONS, FlightPlan, Town, build_town, plan_flight, world_from_map
+from engine.sim import CONDITIONS, FlightPlan, FlightStyle, Town, build_town, plan_flight, world_from_map
+from engine.sim.flight import NADIR_PITCH_DEG, paper_camera, reach_m
 from engine.sim.town import EXACT, MAX_RELIEF_M
 from engine.values import Prior
 
@@ -24,6 +27,10 @@ FOLDER_OWNED = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml"
 LOOP_OWNED = ("loop.csv", "loop.json", "loop.png", "loop-path.png", *OWNED)
 """What a closed loop writes beside them."""
 START_SIGMA_M = 10.0
+MAX_PITCH_DEG = -30.0
+"""Pitch of the camera that looks furthest from the vertical: 60 degrees off it."""
+_HEIGHT_M = FlightStyle().height_agl_m
+_TOWN_PX, _GSD_M_PER_PX = (900, 1000), 0.53
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +43,11 @@ class WorldSettings:
         relief_m: height of a town's hills.
         map: the user's own map as the world, in place of a town.
         surface: heights of that map.
+        camera_pitch_deg: of the camera, -90 straight down, towards the nose: -45 looks 45 degrees ahead of that.
 
     Raises:
-        OptionError: the arguments do not go together, there is no such condition, or the hills are too high.
+        OptionError: the arguments do not go together, there is no such condition, the hills are too high, or the
+            camera looks too far from the vertical.
     """
 
     seed: int = 1
@@ -46,8 +55,14 @@ class WorldSettings:
     relief_m: float = 0.0
     map: StrPath | None = None
     surface: StrPath | None = None
+    camera_pitch_deg: float = NADIR_PITCH_DEG
 
     def __post_init__(self) -> None:
+        if not NADIR_PITCH_DEG <= self.camera_pitch_deg <= MAX_PITCH_DEG:
+            raise OptionError(
+                f"camera_pitch_deg: expected {NADIR_PITCH_DEG:g} (straight down) to {MAX_PITCH_DEG:g}, "
+                f"got {self.camera_pitch_deg:g}"
+            )
         if self.condition is not None:
             check_choice("condition", self.condition, tuple(CONDITIONS))
         if self.surface is not None and self.map is None:
@@ -63,7 +78,21 @@ class WorldSettings:
         """The world with its map: a town of the seed's, or the user's rasters."""
         if self.map is not None:
             return world_from_map(self.map, self.surface, condition=self.condition, seed=self.seed)
-        return build_town(self.seed, condition=self.condition or "noon", relief_m=self.relief_m)
+        # An oblique camera sees further, and the flight is as long over as much more of a town.
+        more_m = 2.0 * (reach_m(self.camera(), _HEIGHT_M) - reach_m(paper_camera(), _HEIGHT_M))
+        width_px, height_px = (n + math.ceil(more_m / _GSD_M_PER_PX) for n in _TOWN_PX)
+        return build_town(
+            self.seed,
+            width_px=width_px,
+            height_px=height_px,
+            gsd_m_per_px=_GSD_M_PER_PX,
+            condition=self.condition or "noon",
+            relief_m=self.relief_m,
+        )
+
+    def camera(self) -> Camera:
+        """The paper's camera, turned up by its pitch."""
+        return paper_camera(self.camera_pitch_deg)
 
     def facts(self) -> dict[str, Any]:
         """The same as JSON can hold it."""
@@ -93,7 +122,7 @@ def simulate(
     out, world = Path(out), world or WorldSettings()
     check_folder(out, force)
     progress.message("drawing the world and the flight over it")
-    plan = plan_flight(world.seed, frames=frames, town=world.build())
+    plan = plan_flight(world.seed, frames=frames, town=world.build(), camera=world.camera())
     prepare_folder(out, force, (*FOLDER_OWNED, *LOOP_OWNED))
     write_flight(out, plan, progress=progress)
     way_m = float(np.hypot(*np.diff(plan.truth.position_m[:, :2], axis=0).T).sum())

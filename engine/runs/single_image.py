@@ -3,51 +3,66 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from engine.camera import Camera
 from engine.errors import OptionError
-from engine.formats.frames import read_image
+from engine.formats.frames import open_frames, read_image
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
+from engine.methods.options import MatcherOptions
 from engine.runs.arguments import check_choice, check_device, parse_position
+from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
 from engine.runs.progress import SILENT, Progress
+from engine.runs.settings import with_weights
 from engine.values import Fix, Frame, NoFix
 
 
 def locate_image(
     image: StrPath,
     map: StrPath,  # noqa: A002 - what the file is, as everywhere
-    camera: StrPath,
+    camera: StrPath | None = None,
     *,
     surface: StrPath | None = None,
     map_sigma_m: float | None = None,
+    map_bounds: str | None = None,
+    map_crs: str | None = None,
+    hfov_deg: float | None = None,
+    mount: str | None = None,
+    camera_pitch_deg: float | None = None,
     height_agl_m: float | None = None,
     heading_deg: float | None = None,
     roll_deg: float | None = None,
     pitch_deg: float | None = None,
     near: str | None = None,
     method: str = "auto",
+    weights: Sequence[StrPath] = (),
     device: str = "auto",
     progress: Progress = SILENT,
 ) -> Fix | NoFix:
-    """Match one image.
+    """Match one image. Height, attitude and position are the arguments', not those of a photograph's EXIF.
 
     Args:
         image: the file.
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration, a ROS camera_info YAML file.
+        camera: calibration, a ROS camera_info YAML file; None takes ``hfov_deg`` or the photograph's EXIF.
         surface: surface model, a GeoTIFF of heights.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
+        map_crs: of a map that names none.
+        hfov_deg: horizontal field of view, in place of a calibration.
+        mount: how the camera is mounted, by name; None is the calibration's, else nadir.
+        camera_pitch_deg: of the camera, -90 looks straight down.
         height_agl_m: above the ground; None is unknown, as of the next three.
         heading_deg: clockwise from true north.
         roll_deg: right side down.
         pitch_deg: nose up.
         near: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
-        method: "ncc", "sift" or "auto".
+        method: "ncc", "sift", "auto" or "learned".
+        weights: files of the learned method.
         device: where tensors live.
         progress: is shown the copying of the map.
 
@@ -60,15 +75,22 @@ def locate_image(
     }  # fmt: skip
     _check_numbers(known)
     check_choice("method", method, METHODS)
+    options = MatcherOptions(learned=with_weights(method, weights))
     check_device(device)
     prior = parse_position("near", near)
-    site = open_map(map, surface, map_sigma_m, progress=progress)
-    calibration = Camera.load(camera)
+    described = CameraFiles(
+        calibration=None if camera is None else Path(camera),
+        hfov_deg=hfov_deg,
+        mount=mount,
+        camera_pitch_deg=camera_pitch_deg,
+    )
+    site = open_map(map, surface, map_sigma_m, bounds=map_bounds, crs=map_crs, progress=progress)
+    calibration = described.load(open_frames(image), progress=progress)
     check_position("near", prior, site, OptionError)
     pixels = read_image(image)
     calibration.check_size(pixels.shape)
     frame = Frame(pixels, None, **known)
-    return SceneMatcher(site, calibration, method, device).locate(frame, prior)
+    return SceneMatcher(site, calibration, method, device, options).locate(frame, prior)
 
 
 def _check_numbers(known: Mapping[str, float | None]) -> None:

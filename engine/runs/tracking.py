@@ -16,7 +16,8 @@ from engine.formats.settings import changed
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackWriter, read_track, track_row
 from engine.matcher import SceneMatcher
-from engine.navigator import ACCEPT_ALL, Navigator
+from engine.navigator import Navigator
+from engine.navigator_options import ACCEPT_ALL
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from engine.report.metrics import Ground
 from engine.runs.arguments import parse_budget, parse_position
@@ -110,6 +111,11 @@ def _record(
         log_offset_s=files.log_offset_s if files.has_clock else None,
         image_topic=files.image_topic,
         map_sigma_m=files.map_sigma_m,
+        map_bounds=files.map_bounds,
+        map_crs=files.map_crs,
+        hfov_deg=files.hfov_deg,
+        mount=files.mount,
+        camera_pitch_deg=files.camera_pitch_deg,
         heights=dict(inputs.flight.heights),
         method=settings.method,
         profile=settings.profile,
@@ -140,8 +146,7 @@ def _follow(
         navigator: fresh.
         out: the folder of track.csv and notes.csv.
         budget: of each frame.
-        use_priors: whether the flight may begin at the telemetry's position; once it has begun, the fixes
-            carry on.
+        use_priors: whether the telemetry's own positions count; a start that was given stands in their place.
         view: is shown each frame once it is answered.
 
     Returns:
@@ -155,7 +160,6 @@ def _follow(
             begin = time.perf_counter()
             result = _update(navigator, item, prior)
             latency_ms = (time.perf_counter() - begin) * 1e3
-            use_priors = use_priors and not navigator.tracking
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
             attitudes.append(attitude_row(item.frame, result))

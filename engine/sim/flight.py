@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -34,6 +34,8 @@ from engine.values import Attitude, Frame, Truth
 
 Array = NDArray[np.float64]
 
+NADIR_PITCH_DEG = -90.0
+"""Pitch of a camera that looks straight down."""
 EDGE_M = 20.0
 """Distance of footprints from the map's edge while the camera looks straight down."""
 DRONE_SENSOR = Sensor(
@@ -196,11 +198,38 @@ class SimulatedFlight:
     truth: list[Truth]
 
 
-def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Generator) -> Array:
-    """Corners (5, 2) of the largest rectangle whose level footprints lie on the map, jittered."""
-    half_w, half_h = (0.5 * n * town.gsd_m_per_px for n in (town.ortho.shape[1], town.ortho.shape[0]))
+def paper_camera(pitch_deg: float = NADIR_PITCH_DEG) -> Camera:
+    """The paper's camera, 300 x 300 px with 60 degrees.
+
+    Args:
+        pitch_deg: of its axis against the body's horizontal, as gimbals state it: -90 looks straight down, -45
+            half way up from there towards the nose.
+    """
+    camera = Camera.from_fov(300, 300, 60.0)
+    up = math.radians(pitch_deg - NADIR_PITCH_DEG)
+    turn = np.array([[math.cos(up), 0.0, math.sin(up)], [0.0, 1.0, 0.0], [-math.sin(up), 0.0, math.cos(up)]])
+    return camera if pitch_deg == NADIR_PITCH_DEG else replace(camera, mount=turn @ camera.mount)
+
+
+def reach_m(camera: Camera, height_m: float) -> float:
+    """How far a level camera sees: to the corners of a nadir picture, to the middle of an oblique one, in metres.
+
+    Args:
+        camera: intrinsics and mount.
+        height_m: above the ground.
+    """
     corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
-    reach = height_m * math.hypot(corner[0], corner[1]) + EDGE_M
+    axis = camera.mount[:, 2]
+    return height_m * max(math.hypot(corner[0], corner[1]), math.hypot(axis[0], axis[1]) / axis[2])
+
+
+def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Generator) -> Array:
+    """Corners (5, 2) of the largest rectangle whose level footprints lie on the map, jittered.
+
+    Of an oblique camera it is the middle of the footprint.
+    """
+    half_w, half_h = (0.5 * n * town.gsd_m_per_px for n in (town.ortho.shape[1], town.ortho.shape[0]))
+    reach = reach_m(camera, height_m) + EDGE_M
     if min(half_w, half_h) - reach < 20.0:
         raise OptionError(
             f"town: expected a map larger than {2 * reach + 40:.0f} m for footprints seen from {height_m:.0f} m, "
@@ -279,7 +308,7 @@ def plan_flight(
         OptionError: an argument is out of range, or the map is too small for the height.
     """
     _check_frames(frames, rate_hz)
-    style, camera = style or FlightStyle(), camera or Camera.from_fov(300, 300, 60.0)
+    style, camera = style or FlightStyle(), camera or paper_camera()
     town = town or build_town(seed, **town_options)
     motion, origin = _fly_over(town, camera, style, generator(seed, 0xF1))
     stamps_ns = _stamps_ns(motion, frames, rate_hz)

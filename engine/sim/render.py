@@ -3,7 +3,8 @@
 Convention:
     A world is a raster seen from straight above: colour and height of the highest surface at every pixel.
     Heights are metres above flat ground at 0. Positions are metres in the raster's projected CRS; attitude is
-    about true north, so grid convergence and point scale enter through the grid's local Jacobian.
+    about true north, so grid convergence and point scale enter through the grid's local Jacobian. Beyond its edge
+    a world continues mirrored.
 """
 
 from __future__ import annotations
@@ -19,14 +20,18 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError, ShapeError
-from engine.geo import LocalFrame, enu_from_body
+from engine.geo import LocalFrame
 from engine.sim.light import Array, Float32, Image, Light
+from engine.sim.rays import Rays, stretch
 from engine.values import Attitude
 
 LAYER_M = 1.0
 """Height step of the search for the first surface that a ray meets; thinner structures may be missed."""
 SLOPE_VARIANCE, GLINT = 0.02, 0.9
 """Variance of the slopes of ripples in a light breeze, and the sun's brightness where all facets mirror it."""
+SKY_RGB = (200.0, 208.0, 218.0)
+"""The sky where the air has no colour of its own."""
+_GRAZING = 1.2  # tangent of the angle off the vertical beyond which surfaces are found more finely
 FLOOR_M = 3.0
 """Height of one storey: the pitch of the rows of windows."""
 
@@ -100,7 +105,7 @@ class World:
         object.__setattr__(self, "gsd_m_per_px", math.sqrt(area))
 
     def ground_at(self, grid_m: tuple[float, float]) -> float:
-        """Height of the bare ground at (easting, northing), of the nearest pixel; beyond the edge, the edge's."""
+        """Height of the bare ground at (easting, northing), of the nearest pixel."""
         if self.ground_m is None:
             return 0.0
         xy = np.linalg.inv(self.pixel_to_crs[:, :2]) @ (np.asarray(grid_m) - self.pixel_to_crs[:, 2])
@@ -142,54 +147,7 @@ def grid_from_enu(crs_epsg: int, grid_m: tuple[float, float]) -> Array:
     return np.array([[x[0] - x[1], x[3] - x[2]], [y[0] - y[1], y[3] - y[2]]]) / 100.0
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Where the rays of a picture meet the plane at height z, in world pixels: nadir + (camera - z) * reach."""
-
-    reach: Array
-    ahead: Array
-    nadir_px: Array
-    camera_m: float
-    size: tuple[int, int]
-
-    @classmethod
-    def cast(
-        cls,
-        world: World,
-        camera: Camera,
-        grid_m: tuple[float, float],
-        camera_m: float,
-        attitude: Attitude,
-        fine: int,
-    ) -> _Rays:
-        """Rays through ``fine`` x ``fine`` points in every pixel of the camera."""
-        offset = 0.5 / fine - 0.5
-        sample = np.array([[1 / fine, 0, offset], [0, 1 / fine, offset], [0, 0, 1.0]])
-        enu_from_cam = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
-        rays = enu_from_cam @ np.linalg.inv(camera.matrix) @ sample
-        size = (camera.width_px * fine, camera.height_px * fine)
-        corners = np.array([[0, size[0], 0, size[0]], [0, 0, size[1], size[1]], [1, 1, 1, 1.0]])
-        if float((rays[2] @ corners).max()) > -0.1:
-            raise OptionError(f"attitude: expected a camera that looks at the ground, got {attitude}")
-        px_from_grid = np.linalg.inv(world.pixel_to_crs[:, :2])
-        nadir = px_from_grid @ (np.asarray(grid_m) - world.pixel_to_crs[:, 2])
-        reach = px_from_grid @ grid_from_enu(world.crs_epsg, grid_m) @ rays[:2]
-        return cls(reach, -rays[2], nadir, camera_m, size)
-
-    def homography(self, z_m: float) -> Array:
-        """(3, 3) from picture to world pixels for the plane at height z."""
-        flat = (self.camera_m - z_m) * self.reach + np.outer(self.nadir_px, self.ahead)
-        return np.vstack([flat, self.ahead])
-
-    def per_metre(self) -> tuple[Float32, Float32]:
-        """World pixels (x, y) that each ray travels per metre of height, on the picture's raster."""
-        x, y = np.arange(self.size[0]), np.arange(self.size[1])[:, None]
-        scale = 1.0 / (self.ahead[0] * x + self.ahead[1] * y + self.ahead[2])
-        right, down = ((row[0] * x + row[1] * y + row[2]) * scale for row in self.reach)
-        return right.astype(np.float32), down.astype(np.float32)
-
-
-def _first_layer(world: World, rays: _Rays) -> tuple[Image, Float32]:
+def _first_layer(world: World, rays: Rays) -> tuple[Image, Float32]:
     """For every ray the first layer from the top that lies inside something, and the layers' heights.
 
     Returns:
@@ -199,21 +157,32 @@ def _first_layer(world: World, rays: _Rays) -> tuple[Image, Float32]:
     top = float(world.height_m.max())
     count = int(np.clip(math.ceil(top / LAYER_M), 1, 254))
     heights = np.linspace(0.0, top, count + 1).astype(np.float32)
-    found = np.zeros(rays.size[::-1], np.uint8)
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    every = np.zeros(rays.size[::-1], np.uint8)
+    first = rays.rows_of_sky
+    found, below = every[first:], np.array([[1.0, 0, 0], [0, 1.0, first], [0, 0, 1.0]])
+    flags, mirrored = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP, cv2.BORDER_REFLECT
     for layer in range(1, count):
-        seen = cv2.warpPerspective(coarse, rays.homography(float(heights[layer])), rays.size, flags=flags)
+        homography = rays.homography(float(heights[layer])) @ below
+        seen = cv2.warpPerspective(coarse, homography, found.shape[::-1], flags=flags, borderMode=mirrored)
         _, inside = cv2.threshold(seen, math.floor(heights[layer] / unit), layer, cv2.THRESH_BINARY)
         cv2.max(found, inside, found)
-    return found, heights
+    return every, heights
 
 
 def _nearest(raster: NDArray[Any], x: Float32, y: Float32) -> NDArray[Any]:
-    rows = np.clip(np.rint(y).astype(np.int32), 0, raster.shape[0] - 1)
-    return raster[rows, np.clip(np.rint(x).astype(np.int32), 0, raster.shape[1] - 1)]
+    return raster[_mirrored(y, raster.shape[0]), _mirrored(x, raster.shape[1])]
 
 
-def _intersect(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
+def _mirrored(place: Float32, size: int) -> NDArray[np.int32]:
+    """Whole indices of places along an axis that goes to and fro."""
+    index = np.rint(place).astype(np.int32)
+    if index.size and (index.min() < 0 or index.max() >= size):
+        index = np.mod(index, 2 * size)
+        index = np.minimum(index, 2 * size - 1 - index)
+    return index
+
+
+def _intersect(world: World, rays: Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
     """Height at which rays meet the surface, and whether they meet it from the side.
 
     Bisects between the layer inside and the free layer above it; a surface that rises above the free end is a
@@ -223,7 +192,7 @@ def _intersect(world: World, rays: _Rays, x: Float32, y: Float32, low: Float32, 
     camera_m = np.float32(rays.camera_m)
     inside, free = low.copy(), low + np.float32(step)
     surface = _nearest(world.height_m, nadir_x + (camera_m - inside) * x, nadir_y + (camera_m - inside) * y)
-    for _ in range(3):
+    for _ in range(3 if rays.steepness < _GRAZING else 6):
         middle = np.float32(0.5) * (inside + free)
         at = _nearest(world.height_m, nadir_x + (camera_m - middle) * x, nadir_y + (camera_m - middle) * y)
         hit = at >= middle
@@ -310,7 +279,7 @@ def render_frame(
     """The picture that a pinhole camera takes of a world, without noise and exposure.
 
     Args:
-        world: what is seen; beyond its edge its outermost pixels continue on flat ground.
+        world: what is seen; mirrored beyond its edge, and sky from 84 degrees off the vertical.
         camera: intrinsics and mount, without distortion.
         grid_m: the camera's (easting, northing) in the world's CRS.
         height_agl_m: above the world's height 0 (the flat ground), and above its highest surface.
@@ -321,17 +290,22 @@ def render_frame(
         (H, W, 3) uint8 RGB.
 
     Raises:
-        OptionError: the camera distorts, looks above the horizon, or is not above the highest roof.
+        OptionError: the camera distorts, its axis is more than 75 degrees off the vertical, or it is not above the
+            highest roof.
     """
     _check_view(world, camera, height_agl_m)
+    px_from_grid = np.linalg.inv(world.pixel_to_crs[:, :2])
+    nadir_px = px_from_grid @ (np.asarray(grid_m) - world.pixel_to_crs[:, 2])
+    pose = px_from_grid @ grid_from_enu(world.crs_epsg, grid_m), nadir_px, height_agl_m
     if supersample is None:
-        supersample = int(np.clip(round(height_agl_m / camera.focal_px / world.gsd_m_per_px), 1, 4))
-    rays = _Rays.cast(world, camera, grid_m, height_agl_m, attitude, supersample)
+        pixel_m = height_agl_m / camera.focal_px * stretch(camera, attitude)
+        supersample = int(np.clip(round(pixel_m / world.gsd_m_per_px), 1, 4))
+    rays = Rays.cast(camera, attitude, *pose, supersample)
     size = (camera.width_px, camera.height_px)
     return np.asarray(cv2.resize(_trace(world, rays), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _trace(world: World, rays: _Rays) -> Image:
+def _trace(world: World, rays: Rays) -> Image:
     """Colours (H, W, 3) along all rays, supersampled."""
     found, heights = _first_layer(world, rays)
     per_metre = x, y = rays.per_metre()
@@ -342,7 +316,15 @@ def _trace(world: World, rays: _Rays) -> Image:
     drop = np.full(found.shape, rays.camera_m, np.float32)
     drop.reshape(-1)[where] -= z_m
     x, y = x * drop + np.float32(rays.nadir_px[0]), y * drop + np.float32(rays.nadir_px[1])
-    picture: Any = cv2.remap(world.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    picture: Any = cv2.remap(world.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     walls = where[wall]
     picture.reshape(-1, 3)[walls] = _wall_colours(world, x.ravel()[walls], y.ravel()[walls], z_m[wall])
-    return _after_light(world, picture, (x, y), per_metre, drop)
+    return _below_sky(world, rays, _after_light(world, picture, (x, y), per_metre, drop))
+
+
+def _below_sky(world: World, rays: Rays, picture: Image) -> Image:
+    """The picture (H, W, 3) with its far field faded into the sky."""
+    if not rays.sees_sky:
+        return picture
+    sky = np.array(SKY_RGB if world.air is None else world.air.rgb, np.float32)
+    return np.asarray(picture + (sky - picture) * rays.sky_share()[..., None]).astype(np.uint8)

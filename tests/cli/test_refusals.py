@@ -41,6 +41,7 @@ def said(capsys, arguments, code=2):
         *((TRACK, "--log-offset-s", value) for value in ("nan", "inf", "1e10")),
         (LOCATE, "--near", "48,16,1e200"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
+        *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         *((command, "--device", "gpu") for command in COMMANDS.values()),
         (PLAYED, "--firmware", "x"),
         (PLAYED, "--message", "x"),

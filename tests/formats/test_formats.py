@@ -22,7 +22,7 @@ from engine.errors import (
     TelemetryError,
 )
 from engine.formats.flight import open_flight, write_flight_folder
-from engine.formats.frames import exif_telemetry, open_frames, read_image
+from engine.formats.frames import open_frames, read_image
 from engine.formats.geotiff import write_geotiff
 from engine.formats.telemetry import (
     DEFAULT_PRIOR_SIGMA_M,
@@ -35,6 +35,7 @@ from engine.formats.track import COLUMNS, TrackRow, TrackWriter, read_track, tra
 from engine.formats.truth import interpolate_truth, read_truth, write_truth
 from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
 from tests.support.paths import SHARED
+from tests.support.photos import photograph
 
 FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
 
@@ -406,76 +407,6 @@ def test_a_video_that_does_not_say_how_long_it_is_is_counted(video, monkeypatch)
     assert len(open_frames(video).names) == 12
 
 
-# ----------------------------------------------------------------------------------------------------- EXIF
-
-
-def photograph(path, taken="2024:05:06 07:08:09", gps=(), subsec=None, offset=None, xmp=""):
-    exif = Image.Exif()
-    details = {0x9003: taken, 0x9291: subsec, 0x9011: offset}
-    exif.get_ifd(0x8769).update({key: value for key, value in details.items() if value is not None})
-    exif.get_ifd(0x8825).update(dict(gps))
-    Image.fromarray(picture(90, (32, 24))).save(path, exif=exif)
-    if xmp:
-        body = b"http://ns.adobe.com/xap/1.0/\0" + f"<x:xmpmeta><rdf:Description {xmp}/></x:xmpmeta>".encode()
-        content = path.read_bytes()
-        path.write_bytes(content[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + content[2:])
-
-
-PLACE = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0), 5: b"\0", 6: 512.5}
-
-
-def test_exif_gives_stamp_prior_and_altitude(tmp_path):
-    photograph(tmp_path / "a.jpg", gps=PLACE, subsec="045", offset="+02:00")
-    (row,) = exif_telemetry(tmp_path)
-    assert row.timestamp_ns == 1_714_972_089_045_000_000  # 2024-05-06 05:08:09.045 UTC
-    assert (row.lat_deg, row.lon_deg) == (pytest.approx(-33.51), pytest.approx(-70.25))
-    assert row.alt_amsl_m == 512.5
-    assert row.heading_deg is None
-    assert row.prior.sigma_m == DEFAULT_PRIOR_SIGMA_M
-
-
-def test_exif_heading_counts_only_from_true_north(tmp_path):
-    photograph(tmp_path / "a.jpg", gps=PLACE | {16: "T", 17: 123.5})
-    photograph(tmp_path / "b.jpg", gps=PLACE | {16: "M", 17: 123.5}, taken="2024:05:06 07:08:10")
-    assert [row.heading_deg for row in exif_telemetry(tmp_path)] == [123.5, None]
-
-
-def test_exif_without_a_fix_or_below_the_sea(tmp_path):
-    photograph(
-        tmp_path / "a.jpg", gps={1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0), 5: b"\1", 6: 3.0, 31: 2.5}
-    )
-    (row,) = exif_telemetry([tmp_path / "a.jpg"])
-    assert row.prior is None
-    assert row.alt_amsl_m == -3.0
-
-
-def test_xmp_gives_height_and_the_attitude_of_the_gimbal(tmp_path):
-    xmp = (
-        'drone-dji:RelativeAltitude="+36.10" drone-dji:FlightYawDegree="+10.0" drone-dji:GimbalRollDegree="{}" '
-        'drone-dji:GimbalPitchDegree="{}" drone-dji:GimbalYawDegree="{}"'
-    )
-    photograph(tmp_path / "a.jpg", xmp=xmp.format("+0.00", "-80.00", "-170.00"))
-    photograph(tmp_path / "b.jpg", xmp=xmp.format("+180.00", "-80.00", "+10.00"), taken="2024:05:06 07:08:10")
-    photograph(tmp_path / "c.jpg", xmp='drone-dji:FlightYawDegree="-20.5"', taken="2024:05:06 07:08:11")
-    level, flipped, body = exif_telemetry(tmp_path)
-    assert level.height_agl_m == 36.1
-    assert (level.heading_deg, level.pitch_deg) == (pytest.approx(190.0), pytest.approx(10.0))
-    assert level.roll_deg == pytest.approx(0.0, abs=1e-9)
-    # Turned over about its own axis, the same camera heads the other way and leans back instead of forward.
-    assert (flipped.heading_deg, flipped.pitch_deg) == (pytest.approx(190.0), pytest.approx(-10.0))
-    assert (body.heading_deg, body.pitch_deg, body.height_agl_m) == (339.5, None, None)
-
-
-def test_photographs_sort_by_time_share_a_second_and_need_a_time(tmp_path):
-    photograph(tmp_path / "b.jpg")
-    photograph(tmp_path / "c.jpg")
-    photograph(tmp_path / "a.jpg", taken="2024:05:06 07:08:10")
-    photograph(tmp_path / "d.jpg", taken="0000:00:00 00:00:00")
-    rows = exif_telemetry(tmp_path)
-    assert [row.frame for row in rows] == ["b.jpg", "c.jpg", "a.jpg"]
-    assert np.diff([row.timestamp_ns for row in rows]).tolist() == [500_000_000, 500_000_000]
-
-
 # --------------------------------------------------------------------------------------------------- flight
 
 
@@ -514,7 +445,7 @@ def test_without_telemetry_frames_come_bare(folder, video):
 
 
 def test_without_telemetry_photographs_bring_their_own(tmp_path):
-    photograph(tmp_path / "a.jpg", gps=PLACE)
+    photograph(tmp_path / "a.jpg", gps={1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0)})
     (item,) = open_flight(tmp_path)
     assert item.prior.lat_deg == pytest.approx(-33.51)
 

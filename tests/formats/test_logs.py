@@ -26,7 +26,7 @@ from engine.errors import OptionError, TelemetryError
 from engine.formats.flight import open_flight
 from engine.formats.logs.readers import LogClock, open_log, open_truth, stamp_frames
 from engine.formats.resampling import MAX_SAMPLE_GAP_NS, FlightLog, interpolate, make_series, telemetry_at
-from engine.formats.telemetry import read_telemetry
+from engine.formats.telemetry import read_telemetry, take_off_sigma_m
 from engine.formats.track import read_track
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.runs.simulation import write_flight
@@ -276,6 +276,98 @@ def test_a_video_has_its_own_times(tmp_path):
     assert [row.heading_deg for row in rows] == pytest.approx([5.0 * k for k in range(9)], abs=1e-9)
     (last,) = [item for item in open_flight(path, tmp_path / "v.SRT") if item.name == "8"]
     assert last.frame.image.mean() == pytest.approx(160, abs=3)
+
+
+FRAME = """{k}
+00:00:{s:02d},{ms:03d} --> 00:00:{s:02d},{ms:03d}
+<font size="28">{count}2023-11-14 22:13:20.123
+[latitude: 32.5000{k:02d}] [longitude: -35.250000] [rel_alt: 80.500 abs_alt: 712.300] {gimbal}</font>
+
+"""
+
+
+def subtitles(path, frames=60, count="FrameCnt: {n}, DiffTime: 33ms\n", gimbal="", step_ms=40):
+    """Subtitles of a video at 25 Hz, a cue a frame."""
+    path.write_text(
+        "".join(
+            FRAME.format(
+                k=k + 1, s=step_ms * k // 1000, ms=step_ms * k % 1000, count=count.format(n=k + 1), gimbal=gimbal
+            )
+            for k in range(frames)
+        )
+    )
+    return path
+
+
+def extracted(folder, names):
+    folder.mkdir()
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((4, 4, 3), np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("ending", ["SRT", "srt"])
+def test_subtitles_beside_a_video_are_taken(tmp_path, ending):
+    path = tmp_path / "DJI_0001.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (32, 32))
+    for k in range(5):
+        writer.write(np.full((32, 32, 3), 40 * k, np.uint8))
+    writer.release()
+    assert not open_flight(path).rows
+    subtitles(tmp_path / f"DJI_0001.{ending}", gimbal="[gb_yaw: 20.0 gb_pitch: -90.0 gb_roll: 0.0]")
+    flight = open_flight(path)
+    assert [row.timestamp_ns for row in flight.rows] == [k * S // 25 for k in range(5)]
+    assert [row.lat_deg for row in flight.rows] == pytest.approx([32.5 + 1e-6 * (k + 1) for k in range(5)])
+    assert [row.heading_deg for row in flight.rows] == pytest.approx([20.0] * 5)
+    assert flight.has_gimbal
+    assert {row.height_sigma_m for row in flight.rows} == {take_off_sigma_m(80.5)}
+    assert {row.prior.sigma_m for row in flight.rows} == {15.0}
+
+
+@pytest.mark.parametrize("count", ["FrameCnt: {n}, DiffTime: 33ms\n", "SrtCnt : {n}, DiffTime : 33ms\n"])
+@pytest.mark.parametrize(
+    ("names", "frames"),
+    [
+        (["f_0000.png", "f_0030.png", "f_0045.png"], [0, 30, 45]),  # from 0, as OpenCV counts
+        (["DJI_0001_frame0001.png", "DJI_0001_frame0026.png"], [0, 25]),  # from 1, as ffmpeg does
+        ([f"{k}.png" for k in range(1, 61)], list(range(60))),
+    ],
+)
+def test_extracted_frames_are_stamped_by_their_numbers(tmp_path, names, frames, count):
+    log = subtitles(tmp_path / "DJI_0001.SRT", count=count)
+    flight = open_flight(extracted(tmp_path / "frames", names), log)
+    assert [row.frame for row in flight.rows] == names
+    assert [row.timestamp_ns for row in flight.rows] == [k * S // 25 for k in frames]
+    assert [row.lat_deg for row in flight.rows] == pytest.approx([32.5 + 1e-6 * (k + 1) for k in frames])
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["a.png", "b.png"], "expected pictures with the numbers of the video's frames in their names, or"),
+        (["1_a.png", "01_b.png"], "expected pictures with the numbers"),
+        (["1.png", "90.png"], "got number 90 for a video of 60 frames"),
+        (["1.png", "2.png", "3.png"], "got 1 to 3 without a gap for a video of 60 frames"),
+    ],
+)
+def test_numbers_that_are_none_of_the_video_are_refused(tmp_path, names, said):
+    log, folder = subtitles(tmp_path / "v.SRT"), extracted(tmp_path / "frames", names)
+    assert said in refusal(open_flight, folder, log)
+
+
+def test_of_a_cue_a_second_each_is_of_one_picture(tmp_path):
+    log = subtitles(tmp_path / "v.SRT", frames=3, count="", step_ms=1000)
+    flight = open_flight(extracted(tmp_path / "frames", ["1.png", "2.png", "3.png"]), log)
+    assert [row.timestamp_ns for row in flight.rows] == [0, S, 2 * S]
+    other = extracted(tmp_path / "other", ["1.png", "31.png"])
+    assert "for each of 2 pictures, got 3; say when they were taken" in refusal(open_flight, other, log)
+
+
+def test_a_gimbal_of_zeros_in_subtitles_is_none(tmp_path):
+    log = subtitles(tmp_path / "v.SRT", gimbal="[gb_yaw: 0.0 gb_pitch: 0.0 gb_roll: 0.0]")
+    flight = open_flight(extracted(tmp_path / "frames", ["1.png", "50.png"]), log)
+    assert [(row.roll_deg, row.pitch_deg, row.heading_deg) for row in flight.rows] == [(None, None, None)] * 2
+    assert not flight.has_gimbal
 
 
 def test_where_nothing_stamps_the_frames_the_message_says_how(pictures, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from engine import OptionError
 from engine.formats.settings import changed, field_descriptions, options_from_mapping, read_settings, settings_text
 from engine.methods.options import SiftOptions
-from engine.navigator import NavigatorOptions
+from engine.navigator_options import NavigatorOptions
 from engine.runs.settings import TrackSettings, load_settings
 
 KEY = re.compile(r"^#(\w+ = )", re.MULTILINE)

@@ -152,6 +152,8 @@ def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, l
         (["--map", "map.tif", "--relief-m", "5"], "--relief-m"),
         (["--relief-m", "-5"], "--relief-m"),
         (["--frames", "0"], "--frames"),
+        (["--camera-pitch-deg", "-20"], "--camera-pitch-deg"),
+        (["--closed-loop", "--camera-pitch-deg", "-45"], "--camera-pitch-deg"),
         (["--closed-loop", "--condition", "eclipse"], "--condition"),
     ],
 )

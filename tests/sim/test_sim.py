@@ -135,7 +135,7 @@ def test_worlds_and_views_are_checked(town):
     with pytest.raises(OptionError, match="height_agl_m: expected above the highest"):
         render_frame(world, CAMERA, ORIGIN, 25.0, level)
     with pytest.raises(OptionError, match="attitude"):
-        render_frame(world, CAMERA, ORIGIN, 150.0, Attitude(0.0, 70.0, 0.0))
+        render_frame(world, CAMERA, ORIGIN, 150.0, Attitude(0.0, 76.0, 0.0))
     bent = Camera(300, 300, CAMERA.matrix, distortion=np.array([0.1, 0, 0, 0, 0]))
     with pytest.raises(OptionError, match="camera: expected a pinhole"):
         render_frame(world, bent, ORIGIN, 150.0, level)

@@ -11,21 +11,26 @@ import typer
 from engine.cli import console
 from engine.cli.options import (
     CameraOption,
+    CameraPitchOption,
     DeadlineOption,
     DeviceOption,
     FirmwareOption,
     JsonOption,
+    MapBoundsOption,
+    MapCrsOption,
     MapOption,
     MapSigmaOption,
     MaxSigmaOption,
     MessageOption,
     MethodOption,
+    MountOption,
     RerunConnectOption,
     RerunOption,
     SecondsOption,
     StartOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -41,8 +46,12 @@ def mavlink(
     ],
     map_path: MapOption,
     camera: CameraOption,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     frames: Annotated[
         Path | None,
         typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
@@ -85,6 +94,7 @@ def mavlink(
         bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is used.")
     ] = True,
     method: MethodOption = "auto",
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: DeviceOption = "auto",
     deadline_ms: DeadlineOption = 121.0,
@@ -106,14 +116,18 @@ def mavlink(
     files = BridgeFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
         camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
-        map_sigma_m=map_sigma_m,
+        map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
+        camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
         message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
         use_velocity=use_velocity,
     )  # fmt: skip
-    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    settings = BridgeSettings(
+        method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
+        seconds=seconds,
+    )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_mavlink_bridge(files, link, settings, live_view=live_view, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
@@ -144,10 +158,14 @@ def ros(
     version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     camera: Annotated[
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
     ] = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     image: Annotated[
         str, typer.Option("--image-topic", metavar="NAME", help="sensor_msgs/Image.")
     ] = "/camera/image_raw",
@@ -177,6 +195,7 @@ def ros(
         str | None, typer.Option("--origin", metavar="LAT,LON", help="Of the poses; without it the map's.")
     ] = None,
     method: MethodOption = "auto",
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: DeviceOption = "auto",
     deadline_ms: DeadlineOption = 121.0,
@@ -201,10 +220,14 @@ def ros(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
         velocity=velocity,
     )  # fmt: skip
-    settings = BridgeSettings(method=method, device=device, start=start, deadline_ms=deadline_ms, seconds=seconds)
+    settings = BridgeSettings(
+        method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
+        seconds=seconds,
+    )  # fmt: skip
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
-        firmware=firmware, origin=origin,
+        firmware=firmware, origin=origin, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
+        camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)

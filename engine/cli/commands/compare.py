@@ -10,30 +10,39 @@ import typer
 from engine.cli import console, tables
 from engine.cli.options import (
     BudgetOption,
-    CameraOption,
+    CameraPitchOption,
     ForceOption,
     FrameStampsOption,
+    HfovOption,
     ImageTopicOption,
     JsonOption,
     LogOffsetOption,
+    MapBoundsOption,
+    MapCrsOption,
     MapOption,
     MapSigmaOption,
+    MountOption,
+    OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
     StartOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
 
 def compare(
     map_path: MapOption,
-    camera: CameraOption,
     frames: Annotated[
         Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
     ],
     out: OutOption,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     telemetry: Annotated[
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
     ] = None,
@@ -42,6 +51,8 @@ def compare(
     log_offset_s: LogOffsetOption = 0.0,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     truth: Annotated[
         Path | None, typer.Option("--truth", metavar="FILE", help="truth.csv; else the one beside the telemetry.")
     ] = None,
@@ -49,6 +60,7 @@ def compare(
         list[str] | None,
         typer.Option("--run", metavar="METHOD[/PROFILE]|FILE", help="Once a run; without it the paper's Table I."),
     ] = None,
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: OptionalDeviceOption = None,
     budget_ms: BudgetOption = None,
@@ -66,10 +78,11 @@ def compare(
     from engine.runs.inputs import FlightFiles
 
     use_threads(threads)
-    settings = parse_runs(runs or [], start=start, device=device, budget_ms=budget_ms)
+    settings = parse_runs(runs or [], weights=weights or (), start=start, device=device, budget_ms=budget_ms)
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
+        map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     results = compare_runs(files, out, settings, force=force, progress=console.PROGRESS)
     if as_json:

@@ -10,14 +10,20 @@ import typer
 
 from engine.cli import console
 from engine.cli.options import (
-    CameraOption,
+    CameraPitchOption,
     DeviceOption,
+    HfovOption,
     JsonOption,
+    MapBoundsOption,
+    MapCrsOption,
     MapOption,
     MapSigmaOption,
     MethodOption,
+    MountOption,
+    OptionalCameraOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -28,9 +34,14 @@ if TYPE_CHECKING:
 def locate(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
     map_path: MapOption,
-    camera: CameraOption,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     height_agl_m: Annotated[
         float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground.")
     ] = None,
@@ -46,6 +57,7 @@ def locate(
         typer.Option("--near", metavar="LAT,LON[,SIGMA_M]", help="Search here; without it the whole map."),
     ] = None,
     method: MethodOption = "auto",
+    weights: WeightsOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
@@ -59,9 +71,10 @@ def locate(
 
     use_threads(threads)
     result = locate_image(
-        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, height_agl_m=height_agl_m,
-        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method, device=device,
-        progress=console.PROGRESS,
+        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
+        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg, height_agl_m=height_agl_m,
+        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
+        weights=weights or (), device=device, progress=console.PROGRESS,
     )  # fmt: skip
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms

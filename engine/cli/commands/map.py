@@ -11,6 +11,8 @@ from engine.cli import console, tables
 from engine.cli.options import (
     ForceOption,
     JsonOption,
+    MapBoundsOption,
+    MapCrsOption,
     OutOption,
     SurfaceOption,
     ThreadsOption,
@@ -21,12 +23,14 @@ from engine.cli.options import (
 def info(
     map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
     surface: SurfaceOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Size, ground sample distance, CRS, bounds."""
     from engine.runs.inputs import open_map
 
-    site = open_map(map_path, surface, progress=console.PROGRESS)
+    site = open_map(map_path, surface, bounds=map_bounds, crs=map_crs, progress=console.PROGRESS)
     console.facts(site.info(), as_json, title=str(map_path))
 
 
@@ -34,6 +38,8 @@ def audit(
     map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
     out: OutOption,
     surface: SurfaceOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     camera: Annotated[
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it 300 x 300 px with 60 degrees."),
@@ -75,7 +81,7 @@ def audit(
     use_threads(threads)
     files = AuditFiles(
         map=map_path, surface=surface, camera=camera, route=route, other=other, height_agl_m=height_agl_m,
-        around=around, corridor_m=corridor_m,
+        around=around, corridor_m=corridor_m, map_bounds=map_bounds, map_crs=map_crs,
     )  # fmt: skip
     result = audit_map(files, out, prior_sigma_m=prior_sigma_m, force=force, progress=console.PROGRESS)
     if as_json:

@@ -44,6 +44,12 @@ def simulate(
         Path | None, typer.Option("--map", metavar="FILE", help="Your own map as the world, in place of a town.")
     ] = None,
     surface: SurfaceOption = None,
+    camera_pitch_deg: Annotated[
+        float,
+        typer.Option(
+            "--camera-pitch-deg", metavar="P", help="Of the camera, as a gimbal's: -90 straight down, -45 oblique."
+        ),
+    ] = -90.0,
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="Fly by the engine's fixes, with GPS off.")
     ] = False,
@@ -79,7 +85,14 @@ def simulate(
     from engine.runs.simulation import simulate as simulate_flight
 
     use_threads(threads)
-    world = WorldSettings(seed=seed, condition=condition, relief_m=relief_m, map=map_path, surface=surface)
+    world = WorldSettings(
+        seed=seed,
+        condition=condition,
+        relief_m=relief_m,
+        map=map_path,
+        surface=surface,
+        camera_pitch_deg=camera_pitch_deg,
+    )
     loop = {"minutes": minutes, "method": method, "fault": fault, "device": device}
     if not closed_loop:
         check_unused(loop | {"recording": recording, "viewer": viewer}, "closed_loop")

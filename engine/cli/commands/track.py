@@ -10,13 +10,19 @@ import typer
 from engine.cli import console, tables
 from engine.cli.options import (
     BudgetOption,
+    CameraPitchOption,
     ForceOption,
     FrameStampsOption,
+    HfovOption,
     ImageTopicOption,
     JsonOption,
     LogOffsetOption,
+    MapBoundsOption,
+    MapCrsOption,
     MapOption,
     MapSigmaOption,
+    MountOption,
+    OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
     RerunConnectOption,
@@ -25,6 +31,7 @@ from engine.cli.options import (
     StartOption,
     SurfaceOption,
     ThreadsOption,
+    WeightsOption,
     use_threads,
 )
 
@@ -35,16 +42,16 @@ def track(
         Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
     ],
     out: OutOption,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            "--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file; a bag may have its own."
-        ),
-    ] = None,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
     telemetry: Annotated[
         Path | None,
         typer.Option(
-            "--telemetry", metavar="FILE", help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; without it EXIF."
+            "--telemetry",
+            metavar="FILE",
+            help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; else a video's .SRT, or EXIF.",
         ),
     ] = None,
     image_topic: ImageTopicOption = None,
@@ -52,6 +59,8 @@ def track(
     log_offset_s: LogOffsetOption = 0.0,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
     truth: Annotated[
         Path | None,
         typer.Option(
@@ -61,8 +70,9 @@ def track(
     settings_path: SettingsOption = None,
     method: Annotated[
         str | None,
-        typer.Option("--method", metavar="ncc|sift|auto", help="ncc, unless the settings say otherwise."),
+        typer.Option("--method", metavar="ncc|sift|auto|learned", help="ncc, unless the settings say otherwise."),
     ] = None,
+    weights: WeightsOption = None,
     start: StartOption = None,
     device: OptionalDeviceOption = None,
     budget_ms: BudgetOption = None,
@@ -92,10 +102,12 @@ def track(
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
+        map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
     )  # fmt: skip
     settings = load_settings(
-        settings_path, method=method, profile=profile, device=device, start=start, budget_ms=budget_ms
-    )
+        settings_path, weights=weights or (), method=method, profile=profile, device=device, start=start,
+        budget_ms=budget_ms,
+    )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     summary = track_flight(files, out, settings, force=force, live_view=live_view, progress=console.PROGRESS)
     title = f"{settings.method} ({settings.profile} profile) on {frames}"

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from engine.errors import OptionError, TelemetryError
-from engine.formats.frames import FrameSource, VideoFile, exif_telemetry
+from engine.formats.frames import FrameSource, VideoFile
 from engine.formats.logs.dataflash import read_dataflash
 from engine.formats.logs.dji_srt import read_srt
 from engine.formats.logs.ulog import read_ulog
-from engine.formats.resampling import UTC_FROM_NS, FlightLog, truth_from_log
+from engine.formats.photos import exif_telemetry
+from engine.formats.resampling import UTC_FROM_NS, FlightLog, TimeSeries, truth_from_log
 from engine.formats.ros.bags import BagFrames, is_bag, read_bag
 from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
@@ -27,8 +32,8 @@ class LogClock:
     """Source of the capture times of a flight whose telemetry is a log.
 
     Attributes:
-        stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the log's
-            camera messages, or the photographs' EXIF.
+        stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the numbers
+            of a video's frames in the pictures' names, the log's camera messages, or the photographs' EXIF.
         offset_s: added to every frame's stamp.
 
     Raises:
@@ -43,6 +48,7 @@ class LogClock:
             raise OptionError(f"offset_s: expected finite seconds, got {self.offset_s}")
 
 
+_SHARE_OF_ALL = 0.9  # of a video's frames: fewer without a gap were extracted at another rate
 AS_LOGGED = LogClock()
 """The frames' own stamps, without offset."""
 
@@ -99,6 +105,8 @@ def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> t
     if isinstance(source, (VideoFile, BagFrames)):
         stamps_ns = source.stamps_ns()
         return stamps_ns, source.names[: len(stamps_ns)]
+    if log.frame_numbers is not None:
+        return _stamps_by_number(source, log, log.frame_numbers)
     if log.captures_ns.size:
         if log.captures_ns.size != len(source.names):
             raise TelemetryError(
@@ -113,6 +121,32 @@ def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> t
             "EXIF times, and no `frame_stamps` was given"
         )
     return [row.timestamp_ns for row in rows], [row.frame for row in rows]
+
+
+def _stamps_by_number(source: FrameSource, log: FlightLog, numbers: TimeSeries) -> tuple[list[int], list[str]]:
+    """Times of pictures that were extracted from a video, by the number of the frame in their names.
+
+    A picture 0 makes the first frame 0, as OpenCV counts; else it is 1, as ffmpeg counts.
+    """
+    found = [re.findall(r"[0-9]+", Path(name).stem) for name in source.names]
+    numbered = sorted((int(digits[-1]), name) for digits, name in zip(found, source.names, strict=True) if digits)
+    asked = "expected pictures with the numbers of the video's frames in their names, or `frame_stamps`"
+    if len(numbered) < len(found) or any(a[0] == b[0] for a, b in itertools.pairwise(numbered)):
+        raise TelemetryError(f"{log.path}: {asked}, got {source.names[0]} to {source.names[-1]}")
+    first, last = numbered[0][0], numbered[-1][0]
+    from_1 = 1 if first == 0 else 0
+    count = int(numbers.values[-1])
+    if last + from_1 > count + 1:
+        raise TelemetryError(f"{log.path}: {asked}, got number {last} for a video of {count} frames")
+    if last - first + 1 == len(numbered) < _SHARE_OF_ALL * count and len(numbered) > 1:
+        raise TelemetryError(
+            f"{log.path}: {asked}, got {first} to {last} without a gap for a video of {count} frames: pictures "
+            "that were taken of it at another rate are not numbered as its frames are"
+        )
+    at = np.array([number + from_1 for number, _ in numbered], np.float64)
+    begin_ns = int(numbers.stamps_ns[0])
+    offsets_ns = np.interp(at, numbers.values, (numbers.stamps_ns - begin_ns).astype(np.float64))
+    return [begin_ns + round(float(offset_ns)) for offset_ns in offsets_ns], [name for _, name in numbered]
 
 
 def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:

@@ -1,0 +1,175 @@
+"""Matchers from weights files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from engine import device as devices
+from engine.errors import OptionError
+from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
+from engine.learned.matchers import KeypointMatcher, Loftr
+from engine.learned.superpoint import SuperPoint
+from engine.learned.weights import KINDS, Weights, fill, read_weights
+
+_EXTRACTORS = ("DISK", "ALIKED", "SuperPoint")
+_EXPECTED = "LoFTR, or LightGlue with DISK, ALIKED or SuperPoint"
+
+
+def load_matcher(
+    paths: Sequence[str | Path],
+    *,
+    device: str | torch.device = "auto",
+    max_keypoints: int = 2048,
+    min_confidence: float = 0.5,
+) -> KeypointMatcher | Loftr:
+    """Build the matcher that some files hold, in any order.
+
+    Args:
+        paths: LoFTR alone, or LightGlue with DISK, ALIKED or SuperPoint; state dicts or checkpoints, under the
+            published names of their layers or kornia's.
+        device: "cpu", "cuda" or "auto".
+        max_keypoints: taken from each picture; LoFTR has none.
+        min_confidence: of a match by LoFTR, in [0, 1]; LightGlue has a threshold of its own.
+
+    Raises:
+        OptionError: a file is missing, is not one of tensors, holds no known network or does not fit it, or the
+            files do not make a matcher.
+        DeviceError: the device is not there.
+    """
+    if max_keypoints < 2:
+        raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
+    if not 0.0 <= min_confidence <= 1.0:
+        raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
+    if not paths:
+        raise OptionError(f"weights: expected the files of {_EXPECTED}, got none")
+    target, files = devices.resolve(device), [read_weights(path) for path in paths]
+    for weights in files:
+        if weights.kind is None:
+            some = ", ".join(sorted(weights.tensors)[:2])
+            raise OptionError(f"weights: {weights.path}: expected {', '.join(KINDS)}, got tensors named {some}")
+    kinds = sorted(str(weights.kind) for weights in files)
+    if kinds == ["LoFTR"]:
+        return Loftr(_loftr(files[0], target), min_confidence)
+    extractors = [weights for weights in files if weights.kind in _EXTRACTORS]
+    matchers = [weights for weights in files if weights.kind == "LightGlue"]
+    if len(extractors) != 1 or len(matchers) != 1 or len(files) != 2:
+        raise OptionError(f"weights: expected the files of {_EXPECTED}, got {' and '.join(kinds)}")
+    return _keypoint_matcher(extractors[0], matchers[0], target, max_keypoints)
+
+
+def load_loftr(path: str | Path, *, device: str | torch.device = "auto", min_confidence: float = 0.5) -> Loftr:
+    """Build LoFTR with the weights of a local file.
+
+    Args:
+        path: a state dict, or a checkpoint that holds one.
+        device: "cpu", "cuda" or "auto".
+        min_confidence: in [0, 1]; matches below it are left out.
+
+    Raises:
+        OptionError: the file is missing, is not one of tensors, or does not fit the network.
+        DeviceError: the device is not there.
+    """
+    if not 0.0 <= min_confidence <= 1.0:
+        raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
+    return Loftr(_loftr(read_weights(path), devices.resolve(device)), min_confidence)
+
+
+def load_disk_lightglue(
+    disk: str | Path, lightglue: str | Path, *, device: str | torch.device = "auto", max_keypoints: int = 2048
+) -> KeypointMatcher:
+    """Build DISK and LightGlue with the weights of two local files.
+
+    Args:
+        disk: a state dict, or a checkpoint that holds one, of DISK.
+        lightglue: the same of LightGlue for DISK's descriptors.
+        device: "cpu", "cuda" or "auto".
+        max_keypoints: taken from each picture.
+
+    Raises:
+        OptionError: a file is missing, is not one of tensors, or does not fit its network.
+        DeviceError: the device is not there.
+    """
+    if max_keypoints < 2:
+        raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
+    target = devices.resolve(device)
+    detector = Disk(_disk(read_weights(disk), target))
+    return KeypointMatcher(detector, _lightglue(read_weights(lightglue), 128, target), max_keypoints)
+
+
+def _keypoint_matcher(
+    extractor: Weights, lightglue: Weights, device: torch.device, max_keypoints: int
+) -> KeypointMatcher:
+    build: dict[str, tuple[Callable[[nn.Module], Extractor], Callable[[Weights, torch.device], nn.Module]]] = {
+        "DISK": (Disk, _disk),
+        "ALIKED": (Aliked, _aliked),
+        "SuperPoint": (SuperPointKeypoints, _superpoint),
+    }
+    assert extractor.kind is not None  # checked by the caller
+    wrap, load = build[extractor.kind]
+    network = load(extractor, device)
+    numbers = {"DISK": 128, "SuperPoint": 256}.get(extractor.kind) or len(
+        extractor.tensors["desc_head.sf_conv.weight"]
+    )
+    return KeypointMatcher(wrap(network), _lightglue(lightglue, numbers, device), max_keypoints)
+
+
+def _loftr(weights: Weights, device: torch.device) -> nn.Module:
+    from kornia.feature import LoFTR
+
+    return fill(LoFTR(pretrained=None), weights, device)
+
+
+def _disk(weights: Weights, device: torch.device) -> nn.Module:
+    from kornia.feature import DISK
+
+    return fill(DISK(), weights, device)
+
+
+def _aliked(weights: Weights, device: torch.device) -> nn.Module:
+    """ALIKED of the size that its tensors have."""
+    try:
+        from kornia.feature import ALIKED
+    except ImportError:
+        raise OptionError("weights: ALIKED takes kornia 0.9 or later, got an older one") from None
+
+    if len(weights.tensors["block1.conv1.weight"]) == 8:
+        name = "aliked-t16"
+    else:
+        offsets = weights.tensors.get("desc_head.agg_weights")
+        name = "aliked-n32" if offsets is not None and len(offsets) == 32 else "aliked-n16"
+    # Without a threshold every local maximum is a keypoint; how many are taken is said picture by picture.
+    return fill(ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
+
+
+def _superpoint(weights: Weights, device: torch.device) -> nn.Module:
+    return fill(SuperPoint(), weights, device)
+
+
+def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Module:
+    """LightGlue for descriptors of so many numbers, as deep as its file.
+
+    Raises:
+        OptionError: it is for descriptors of another length, or for keypoints with a scale and an angle.
+    """
+    from kornia.feature import LightGlue
+
+    tensors, unnamed = weights.tensors, None  # named features would make kornia fetch their weights
+    projection, positions = tensors.get("input_proj.weight"), tensors.get("posenc.Wr.weight")
+    taken = 256 if projection is None else int(projection.shape[-1])
+    if weights.kind == "LightGlue":
+        if positions is not None and positions.shape[-1] != 2:
+            what = (
+                "expected LightGlue for DISK, ALIKED or SuperPoint, got one whose keypoints have scales or shapes"
+            )
+            raise OptionError(f"weights: {weights.path}: {what}")
+        if taken != numbers:
+            what = f"expected LightGlue for descriptors of {numbers} numbers, got one for {taken}"
+            raise OptionError(f"weights: {weights.path}: {what}")
+    layers = 1 + max((int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment.")), default=8)
+    settings: dict[str, Any] = {"features": unnamed, "input_dim": numbers, "n_layers": layers}
+    return fill(LightGlue(**settings), weights, device)

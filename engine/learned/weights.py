@@ -1,0 +1,119 @@
+"""Weights files: read as tensors only, recognised by the names of their tensors, and checked against a network."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from engine.errors import OptionError
+
+KINDS = {
+    "DISK": ("unet.path_down.0.1.3.weight",),
+    "ALIKED": ("block1.conv1.weight", "score_head.0.weight", "desc_head.sf_conv.weight"),
+    "SuperPoint": ("conv1a.weight", "convPa.weight", "convDa.weight"),
+    "LightGlue": ("posenc.Wr.weight", "log_assignment.0.final_proj.weight"),
+    "LoFTR": ("backbone.conv1.weight", "loftr_coarse.layers.0.q_proj.weight"),
+}
+"""Tensors by which each network's file is recognised."""
+_WRAPPERS = ("state_dict", "extractor", "model")  # under which checkpoints keep their tensors
+# Computed anew where a file lacks them.
+_DERIVED = ("num_batches_tracked", "confidence_thresholds", "dkd.hw_grid")
+# What training left in published files, and inference does not read.
+_UNUSED = re.compile(r"log_assignment\.\d+\.r|.*num_batches_tracked|confidence_thresholds")
+_LISTED = 3  # names in a message
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """The tensors of one file.
+
+    Attributes:
+        path: of the file.
+        kind: of :data:`KINDS`, or None where the names are of no known network.
+        tensors: by the names that the networks have now.
+    """
+
+    path: Path
+    kind: str | None
+    tensors: Mapping[str, Tensor]
+
+
+def read_weights(path: str | Path) -> Weights:
+    """Read a file of tensors.
+
+    Args:
+        path: a state dict, or a checkpoint that holds one.
+
+    Raises:
+        OptionError: the file is missing or not one of tensors alone.
+    """
+    tensors = {_present_name(name): value for name, value in _read(path).items()}
+    kind = next((kind for kind, names in KINDS.items() if all(name in tensors for name in names)), None)
+    return Weights(Path(path), kind, tensors)
+
+
+def fill(network: nn.Module, weights: Weights, device: torch.device) -> nn.Module:
+    """The network with these weights, ready for inference; every name and shape must fit.
+
+    Raises:
+        OptionError: they do not fit.
+    """
+    wanted, tensors = network.state_dict(), weights.tensors
+    lacking = [n for n in wanted if n not in tensors and not n.endswith(_DERIVED)]
+    unknown = [n for n in tensors if n not in wanted and not _UNUSED.fullmatch(n)]
+    misshapen = [n for n in wanted if n in tensors and tensors[n].shape != wanted[n].shape]
+    faults = [
+        f"{what} {_listed(names)}"
+        for what, names in (("lacks", lacking), ("has unknown", unknown), ("has other shapes of", misshapen))
+        if names
+    ]
+    if faults:
+        name = type(network).__name__
+        raise OptionError(f"weights: {weights.path} does not fit {name}: {'; '.join(faults)}")
+    network.load_state_dict(dict(tensors), strict=False)
+    return network.to(device).eval().requires_grad_(False)
+
+
+def _present_name(name: str) -> str:
+    """LightGlue's layers were once self_attn.3 and cross_attn.3, and are transformers.3.self_attn now."""
+    name = name.removeprefix("matcher.")
+    part, _, rest = name.partition(".")
+    if part not in ("self_attn", "cross_attn"):
+        return name
+    layer, _, rest = rest.partition(".")
+    return f"transformers.{layer}.{part}.{rest}"
+
+
+def _read(path: str | Path) -> Mapping[str, Tensor]:
+    """The tensors of a file by the names that it has for them."""
+    if not Path(path).is_file():
+        raise OptionError(f"weights: no such file: {path}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:
+        raise OptionError(
+            f"weights: {path}: expected tensors alone, got a file that needs code to be run, or is damaged"
+        ) from None
+    except (OSError, EOFError, RuntimeError, ValueError, LookupError, zipfile.BadZipFile) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise OptionError(f"weights: {path} is not a readable torch file: {reason}") from None
+    for wrapper in _WRAPPERS:
+        if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
+            content = content[wrapper]
+    if not isinstance(content, dict) or not content or not all(isinstance(v, Tensor) for v in content.values()):
+        raise OptionError(
+            f"weights: {path}: expected a state dict, names to tensors, got {type(content).__name__}"
+        )
+    return content
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,314 @@
+"""Points of the frame found again on the map: by features of the orthophoto, or of the reduced frame.
+
+Where height and heading are known the whole frame is drawn in the map's pixels by them
+(:func:`engine.align.orthorectify`): its features are upright and of the map's scale, and what they match votes for
+one translation. Where they are not, the features of the frame itself are matched at any angle or scale, and RANSAC
+finds what agrees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from engine.align import Orthophoto, Relief, orthorectify
+from engine.features import match, sift
+from engine.geo import enu_from_body, wrap_heading_deg
+from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
+from engine.methods.options import SiftOptions
+from engine.methods.point_finding import PointFinder
+from engine.methods.query import Query
+from engine.methods.views import MapView, TelemetryHypothesis, slant_factor
+from engine.methods.votes import Vote, similarity, vote
+from engine.orthomap import OrthoMap
+from engine.pose import PoseStart
+from engine.values import Attitude
+
+Array = NDArray[np.float64]
+
+NOMINAL_SCALE = 0.5
+"""To which the pose's tolerance refers; features of a coarser picture are less accurate."""
+_ROUGHNESS_REACH_PX = 1.5  # pixels of the map about a landmark within which its surface's roughness counts
+_BLUNT_PX = 1.6  # scale at which a keypoint's position has twice the variance of a small one's
+MAX_KEYPOINTS = 1000
+"""Of the largest orthophoto."""
+_MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
+_UPSAMPLED_PX = 100_000  # an orthophoto that shows more has keypoints enough without its smallest ones
+_BUILDING_M = 30.0  # side of what stands on the ground, which the relief leaves out
+
+
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """Points of the frame found again in a view.
+
+    Attributes:
+        view: where.
+        points_px: (M, 2) pixels of the frame.
+        points_m: (M, 3) metres on the ground.
+        weights: (M,) relative inverse variances of the pixels.
+        tolerance_px: reprojection distance in the frame up to which a match agrees with a pose.
+        start: the pose that most voted for; None where there was no vote.
+        vote: what was voted for; None where there was no vote.
+    """
+
+    view: MapView
+    points_px: Array
+    points_m: Array
+    weights: Array
+    tolerance_px: float
+    start: PoseStart | None = None
+    vote: Vote | None = None
+
+
+def match_views(
+    query: Query,
+    landmarks: LandmarkMap | None,
+    options: SiftOptions,
+    views: list[MapView],
+    hypothesis: TelemetryHypothesis,
+    finder: PointFinder | None = None,
+) -> list[Matched]:
+    """What of the frame is found again in each view.
+
+    Args:
+        query: the frame.
+        landmarks: of the map; None where a finder takes their place.
+        options: settings.
+        views: where to look.
+        hypothesis: what is assumed of the telemetry.
+        finder: finds the points in place of features; None takes ``options.matcher`` where there is one.
+    """
+    if finder is None and options.matcher is not None:
+        finder = PointFinder(options.matcher)
+    source = finder or landmarks
+    assert source is not None  # only a finder does without landmarks
+    height_m, attitude = hypothesis.height_m, query.telemetry.grid_attitude
+    if height_m is not None and hypothesis.x_axis_deg is not None and attitude is not None and options.upright:
+        found = [_by_orthophoto(query, source, options, view, attitude, height_m) for view in views]
+        if None not in found:
+            return [matched for matched in found if matched is not None]
+    if isinstance(source, PointFinder):
+        return _by_reduced(query, source, options, views)
+    return _by_frame(query, source, options, views, hypothesis)
+
+
+# ----------------------------------------------------------------------------------- by the orthophoto
+
+
+def _by_orthophoto(
+    query: Query,
+    source: LandmarkMap | PointFinder,
+    options: SiftOptions,
+    view: MapView,
+    attitude: Attitude,
+    height_m: float,
+) -> Matched | None:
+    """The whole frame drawn on a view's level, its features matched, and what they vote for."""
+    with query.scheduler.stage("rectify"):
+        jacobian = query.jacobian * 2.0**view.level
+        relief = _relief(query, view.level)
+        photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
+    if photo is None:
+        return None
+    if isinstance(source, PointFinder):
+        photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
+        scale_px = np.zeros(len(photo_px))
+    else:
+        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
+    ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
+    weights = roughness_weights(query.site, ground_m) / (1.0 + (scale_px / _BLUNT_PX) ** 2)
+    # Pixels of the frame that are one of the level, in the middle of the frame.
+    slant_m = height_m * slant_factor(query.camera, attitude)
+    per_px = query.site.gsd_m_per_px * 2.0**view.level * query.camera.focal_px / slant_m
+    matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
+    with query.scheduler.stage("vote"):
+        return _voted(query, options, matched, photo, photo_px, map_px, attitude, height_m)
+
+
+def _feature_pairs(
+    query: Query, landmarks: LandmarkMap, photo: Orthophoto, view: MapView, options: SiftOptions
+) -> tuple[Array, Array, Array]:
+    """Matched features: (M, 2) pixels of the orthophoto, (M, 2) of the level, and (M,) their scales."""
+    with query.scheduler.stage("frame features"):
+        shown_px = int(np.count_nonzero(photo.valid))
+        keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
+        features = sift(
+            as_picture(photo.gray, query.device),
+            max_keypoints=keypoints,
+            upright=True,
+            mask=torch.from_numpy(photo.valid).to(query.device)[None, None],
+            upsample=2 if shown_px <= _UPSAMPLED_PX else 1,
+            contrast_threshold=options.contrast_threshold,
+        )
+    with query.scheduler.stage("map features"):
+        per_px = _MAP_DENSITY * keypoints / max(shown_px, 1)
+        known = landmarks.find(view.crop, view.level, upright=True, per_px=per_px)
+    with query.scheduler.stage("match"):
+        found = match(
+            features, known.features, ratio=options.vote_ratio, max_scale_factor=options.max_scale_factor
+        )
+        pairs = found.pairs().cpu().numpy()
+        photo_px = features.xy_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
+        scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
+        return photo_px, known.features.xy_px[0].cpu().numpy()[pairs[:, 1]].astype(np.float64), scale_px
+
+
+def _voted(
+    query: Query,
+    options: SiftOptions,
+    matched: Matched,
+    photo: Orthophoto,
+    photo_px: Array,
+    map_px: Array,
+    attitude: Attitude,
+    height_m: float,
+) -> Matched:
+    """The matches with the pose that most of them vote for."""
+    site, level = query.site, matched.view.level
+    slant_m = height_m * slant_factor(query.camera, attitude)
+    radius_px = max(options.vote_share * slant_m / (site.gsd_m_per_px * 2.0**level), 2.0 * options.tolerance_px)
+    middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
+    found = vote(photo_px - middle, map_px, radius_px)
+    if found is None:
+        return matched
+    nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px
+    nadir_px = site.full_from_level(nadir, level)
+    heading_deg = wrap_heading_deg(attitude.heading_deg + found.turn_deg)
+    enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, heading_deg) @ query.camera.mount
+    up_m = site.ground_at(nadir_px) + height_m * found.scale
+    start = PoseStart(
+        enu_from_camera.T,
+        np.array([*site.enu_from_pixel(nadir_px), up_m]),
+        radius_px / options.tolerance_px * matched.tolerance_px,
+    )
+    return replace(matched, start=start, vote=found)
+
+
+def _relief(query: Query, level: int) -> Relief | None:
+    """The bare ground about the prior's place, without what stands on it; None where it is not known."""
+    site, nadir = query.site, query.prior_px
+    if nadir is None or not site.has_surface:
+        return None
+    nadir_level, ground_m = site.level_from_full(nadir, level), site.ground_at(nadir)
+
+    def heights_m(offsets_px: Array) -> Array:
+        surface_m = site.surface_at(site.full_from_level(nadir_level + offsets_px, level))
+        spacing_m = np.ptp(offsets_px, axis=(0, 1)) / (np.array(offsets_px.shape[1::-1]) - 1.0)
+        spacing_m = np.maximum(spacing_m * site.gsd_m_per_px * 2.0**level, 1e-6)
+        reach = [int(n) for n in np.clip(np.ceil(_BUILDING_M / spacing_m / 2.0), 1, 8)]
+        size = (2 * reach[0] + 1, 2 * reach[1] + 1)
+        lower = cv2.erode(surface_m.astype(np.float32), np.ones(size[::-1], np.uint8))
+        return np.asarray(cv2.blur(cv2.dilate(lower, np.ones(size[::-1], np.uint8)), size) - ground_m, np.float64)
+
+    return heights_m
+
+
+# ------------------------------------------------------------------------------------- by the frame itself
+
+
+@dataclass(frozen=True, slots=True)
+class _Reduced:
+    """The frame reduced as the paper does, (1, 1, H, W) in [0, 1], and the scale (x, y) that reduced it."""
+
+    picture: torch.Tensor
+    scale: Array
+
+    def full(self, xy_px: Array) -> Array:
+        """Places in the frame: edges lie on edges, centres on centres."""
+        return np.asarray((xy_px + 0.5) / self.scale - 0.5, dtype=np.float64)
+
+
+def _by_frame(
+    query: Query,
+    landmarks: LandmarkMap,
+    options: SiftOptions,
+    views: list[MapView],
+    hypothesis: TelemetryHypothesis,
+) -> list[Matched]:
+    """Features of the reduced frame among those of the map, view by view."""
+    turn = hypothesis.x_axis_deg
+    upright = options.upright and turn is not None
+    with query.scheduler.stage("frame features"):
+        reduced = _reduce(query, options.scale)
+        features = sift(reduced.picture, max_keypoints=options.max_keypoints, upright=upright, up_deg=turn or 0.0)
+    matched = []
+    for view in views:
+        with query.scheduler.stage("map features"):
+            known = _map_features(query, landmarks, options, view, upright)
+        with query.scheduler.stage("match"):
+            found = match(
+                features,
+                known.features,
+                ratio=options.ratio,
+                rotation_deg=-(turn or 0.0),
+                max_angle_diff_deg=None if upright or turn is None else options.max_turn_deg,
+                scale=1.0 / view.pixel_ratio,
+                max_scale_factor=None if hypothesis.height_m is None else options.max_scale_factor,
+            )
+            pairs = found.pairs().cpu().numpy()
+            points_px = reduced.full(features.xy_px[0].cpu().numpy()[pairs[:, 0]])
+            scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
+            weights = 1.0 / (1.0 + (scale_px / _BLUNT_PX) ** 2)
+            points_m = known.points_m[pairs[:, 1]]
+            weights = weights * roughness_weights(query.site, points_m)
+            matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
+    return matched
+
+
+def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: list[MapView]) -> list[Matched]:
+    """What a matcher of pictures finds with the reduced frame, view by view."""
+    reduced, matched = _reduce(query, options.scale), []
+    valid = np.ones(reduced.picture.shape[2:], np.bool_)
+    for view in views:
+        points_px, map_px = finder.find(query, reduced.picture, valid, view)
+        ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
+        weights = roughness_weights(query.site, ground_m)
+        matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
+    return matched
+
+
+def _frame_tolerance_px(options: SiftOptions) -> float:
+    return options.pose.reprojection_px * max(1.0, NOMINAL_SCALE / options.scale)
+
+
+def _reduce(query: Query, scale: float) -> _Reduced:
+    height, width = query.gray.shape
+    size = (max(16, round(width * scale)), max(16, round(height * scale)))
+    picture = cv2.resize(query.gray, size, interpolation=cv2.INTER_AREA)
+    tensor = as_picture(np.asarray(picture, np.uint8), query.device)
+    return _Reduced(tensor, np.array(size) / [width, height])
+
+
+def _map_features(
+    query: Query, landmarks: LandmarkMap, options: SiftOptions, view: MapView, upright: bool
+) -> Landmarks:
+    """Landmarks of a view, as dense as the features of the reduced frame; denser where pixels are coarser."""
+    site, crop = query.site, view.crop
+    reduced_px = query.gray.size * options.scale**2
+    if options.map_features == "prepared":
+        per_px = options.max_keypoints / reduced_px * max(1.0, view.pixel_ratio) ** 2
+        return landmarks.find(crop, view.level, upright=upright, per_px=per_px)
+    count = np.clip(
+        options.max_keypoints * crop.area_px / reduced_px, options.max_keypoints, options.max_map_keypoints
+    )
+    mask = None
+    if not site.fully_valid:
+        mask = torch.from_numpy(site.valid(crop, view.level)).to(query.device)[None, None]
+    picture = as_picture(site.gray(crop, view.level), query.device)
+    features = sift(picture, max_keypoints=int(count), upright=upright, mask=mask)
+    map_px = site.full_from_level(features.xy_px[0].cpu().numpy() + view.corner_px, view.level)
+    return Landmarks(features, lifted(site, map_px))
+
+
+def lifted(site: OrthoMap, map_px: Array) -> Array:
+    """(N, 3) east, north and the height of the surface at pixels (N, 2) of the map."""
+    return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
+
+
+def roughness_weights(site: OrthoMap, points_m: Array) -> Array:
+    """Weights (N,) of landmarks: where the surface is rough, what they show may stand higher or lower."""
+    return site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGHNESS_REACH_PX)

@@ -1,0 +1,191 @@
+"""Inputs of a run that no file was written for: pictures with corners, lenses by their field of view, mounts."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from engine.camera import Camera, mount_rotation
+from engine.cli.app import run
+from engine.errors import CalibrationError, MapError, OptionError
+from engine.formats.flight import camera_info
+from engine.formats.geotiff import write_geotiff
+from engine.runs import BridgeFiles, FlightFiles
+from engine.runs.evaluation import _recorded_files
+from engine.runs.inputs import open_map
+from engine.runs.record import RunRecord
+from tests.support.photos import gimbal, photograph
+
+UTM, WEST, NORTH = "EPSG:32633", 598_000.0, 5_342_000.0
+FOCAL_35MM = 0xA405
+
+
+def noise(rows=60, columns=80):
+    return np.random.default_rng(3).integers(0, 256, (rows, columns), dtype=np.uint8)
+
+
+@pytest.fixture
+def shot(tmp_path):
+    Image.fromarray(noise()).save(tmp_path / "shot.png")
+    return tmp_path / "shot.png"
+
+
+# ---------------------------------------------------------------------------------------------------- maps
+
+
+def test_a_picture_is_placed_by_edges_in_the_units_of_its_crs(shot):
+    site = open_map(shot, bounds=f"{WEST},{NORTH - 30},{WEST + 40},{NORTH}", crs=UTM)
+    assert (site.width_px, site.height_px) == (80, 60)
+    assert site.gsd_m_per_px == pytest.approx(0.5, rel=1e-3)
+    west, south, east, north = site.bounds_deg
+    again = open_map(shot, bounds=f"{west},{south},{east},{north}")  # degrees, which need no CRS
+    middles = [(each.frame.lat_deg, each.frame.lon_deg) for each in (site, again)]
+    assert middles[0] == pytest.approx(middles[1], abs=5e-6)  # a copy on a metric grid is up to a pixel wider
+
+
+def test_edges_in_degrees_stay_degrees_with_a_projected_crs(shot):
+    site = open_map(shot, bounds="16.0,48.0,16.001,48.0005018", crs="EPSG:3857")
+    assert site.bounds_deg == pytest.approx((16.0, 48.0, 16.001, 48.0005018), abs=1e-7)
+
+
+def test_a_geotiff_that_names_no_crs_is_given_one(tmp_path):
+    path = tmp_path / "map.tif"
+    write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
+    named = open_map(path)
+    from rasterio import open as open_raster
+    from rasterio.crs import CRS
+
+    with open_raster(path, "r+") as dataset:
+        dataset.crs = CRS()
+    with pytest.raises(MapError, match=r"names no CRS; give `map_crs`, such as EPSG:32636"):
+        open_map(path)
+    assert open_map(path, crs=UTM).bounds_deg == pytest.approx(named.bounds_deg, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"bounds": "16,48,17"}, "map_bounds: expected W,S,E,N in degrees or in `map_crs`, got '16,48,17'"),
+        ({"bounds": "17,48,16,49"}, "map_bounds: expected west before east and south before north"),
+        ({"bounds": "16,48,17,49", "crs": UTM}, "map_bounds: the corners are no rectangle in crs"),
+        ({"bounds": "16,48,17,49", "crs": "EPSG:5"}, "map_crs: expected"),
+        (
+            {"bounds": "598000,5341970,598040,5342000"},
+            "map_bounds: expected west < east and south < north in degrees",
+        ),
+    ],
+)
+def test_edges_that_place_no_picture_are_wrong_usage(shot, options, words):
+    with pytest.raises(OptionError) as caught:
+        open_map(shot, **options)
+    assert str(caught.value).startswith(words)
+
+
+def test_a_map_with_a_place_of_its_own_refuses_another(tmp_path):
+    path = tmp_path / "map.tif"
+    write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
+    with pytest.raises(OptionError, match="map_bounds: expected none for a file with a georeference of its own"):
+        open_map(path, bounds="16,48,17,49")
+    with pytest.raises(OptionError, match="map_crs: expected none, since"):
+        open_map(path, crs="EPSG:32634")
+
+
+def test_the_command_line_names_its_options(shot, capsys):
+    assert run(["map", "info", str(shot)]) == 1
+    assert "give --map-bounds (west, south, east, north)" in capsys.readouterr().err
+    assert run(["map", "info", str(shot), "--map-bounds", "1,2,3"]) == 2
+    assert "--map-bounds: expected W,S,E,N in degrees or in --map-crs, got '1,2,3'" in capsys.readouterr().err
+    bounds = ["--map-bounds", "16.0,48.0,16.001,48.0005018", "--map-crs", "EPSG:3857"]
+    assert run(["map", "info", str(shot), *bounds]) == 0
+
+
+# -------------------------------------------------------------------------------------------------- cameras
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k in range(3):
+        photograph(folder / f"{k}.jpg", f"2024:05:06 07:08:0{k}", tags={FOCAL_35MM: 24}, size_px=(320, 240))
+    return folder
+
+
+def load(files):
+    flight = files.open_flight()
+    return files.load_camera(flight)
+
+
+def test_the_camera_is_that_of_the_photographs_or_of_a_field_of_view(photos):
+    own = load(FlightFiles(map="m.tif", frames=photos))
+    assert own.focal_px == pytest.approx(400.0 * 24.0 / np.hypot(36.0, 24.0))
+    assert np.allclose(own.mount, mount_rotation())
+    given = load(
+        FlightFiles(map="m.tif", frames=photos, hfov_deg=90.0, mount="nadir-tail", camera_pitch_deg=-70.0)
+    )
+    assert given.focal_px == pytest.approx(160.0)
+    assert np.allclose(given.mount, mount_rotation("nadir-tail", -70.0))
+
+
+def test_a_mount_counts_more_than_the_calibrations(photos, tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text(camera_info(Camera.from_fov(320, 240, 60.0)))
+    camera = load(FlightFiles(map="m.tif", frames=photos, camera=path, mount="forward-45"))
+    assert camera.focal_px == pytest.approx(160.0 / np.tan(np.radians(30.0)))
+    assert np.allclose(camera.mount, mount_rotation("forward-45"))
+
+
+def test_where_a_gimbal_says_where_the_camera_looks_a_mount_is_refused(tmp_path):
+    photograph(tmp_path / "a.jpg", xmp=gimbal(), tags={FOCAL_35MM: 24})
+    load(FlightFiles(map="m.tif", frames=tmp_path))
+    with pytest.raises(CalibrationError, match="mount: expected nadir, since the telemetry has the angles"):
+        load(FlightFiles(map="m.tif", frames=tmp_path, mount="nadir-tail"))
+    photograph(tmp_path / "a.jpg", xmp=gimbal("+0.0", "+0.0", "+0.0"), tags={FOCAL_35MM: 24})
+    load(FlightFiles(map="m.tif", frames=tmp_path, mount="nadir-tail"))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"hfov_deg": 60.0, "camera": "c.yaml"}, "hfov_deg: expected without `camera`"),
+        ({"hfov_deg": 180.0}, "hfov_deg: expected above 0 and below 180, got 180"),
+        ({"mount": "side"}, "mount: expected one of nadir, .*forward-45, got 'side'"),
+        ({"camera_pitch_deg": 45.0}, "camera_pitch_deg: expected -90"),
+        ({"frames": "f.MP4"}, "camera: expected a calibration, or `hfov_deg`: a video has neither"),
+    ],
+)
+def test_what_says_nothing_of_a_camera_is_wrong_usage(options, words):
+    with pytest.raises(OptionError, match=words):
+        FlightFiles(**{"map": "m.tif", "frames": "f"} | options)
+
+
+def test_pictures_without_exif_need_a_camera(tmp_path):
+    Image.fromarray(noise()).save(tmp_path / "1.png")
+    with pytest.raises(CalibrationError, match=r"1\.png: expected a focal length .* give `hfov_deg` or `camera`"):
+        load(FlightFiles(map="m.tif", frames=tmp_path))
+    with pytest.raises(OptionError, match="mount: expected one of"):
+        BridgeFiles(map="m.tif", camera="c.yaml", camera_source="0", mount="side")
+
+
+def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
+    path = tmp_path / "DJI_0001.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (64, 48))
+    for k in range(3):
+        writer.write(np.full((48, 64, 3), 40 * k, np.uint8))
+    writer.release()
+    cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: 80.0]\n\n"
+    (tmp_path / "DJI_0001.SRT").write_text("".join(cue.format(n=k + 1, ms=40 * k) for k in range(3)))
+    files = FlightFiles(map="m.tif", frames=path, hfov_deg=70.0)
+    assert files.telemetry == tmp_path / "DJI_0001.SRT"
+    assert [row.height_agl_m for row in files.open_flight().rows] == [80.0] * 3
+    assert load(files).width_px == 64
+
+
+def test_a_record_gives_the_same_files(photos):
+    files = FlightFiles(map="/m.tif", frames=photos, hfov_deg=70.0, mount="nadir-left", camera_pitch_deg=-80.0)
+    record = RunRecord(
+        map="/m.tif", surface=None, frames=str(photos), truth=None, hfov_deg=70.0, mount="nadir-left",
+        camera_pitch_deg=-80.0, method="ncc", profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0},
+        ground_m=0.0, ground_amsl_m=None,
+    )  # fmt: skip
+    assert _recorded_files(record) == files
