@@ -91,6 +91,18 @@ class Correlator:
         template = torch.from_numpy(enhanced).to(query.device)
         return Aligned(pose, level, jacobian, view, patch, template)
 
+    def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
+        """The patches of the null hypothesis, as large as the frame's: upside down, and mirrored.
+
+        They show no place on Earth. Where the compass is wrong by half a turn, or the camera's picture comes
+        mirrored, one of them shows the true one.
+        """
+        query = self.query
+        mirrored = np.ascontiguousarray(query.gray[:, ::-1])
+        patch = rectify(mirrored, query.camera, aligned.view, fraction=self.options.fraction)
+        out = [np.ascontiguousarray(aligned.patch.gray[::-1, ::-1])]
+        return out if patch is None else [*out, patch.gray]
+
     def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
         """Rise (2,) of the ground per pixel of the level, about a wider area the vaguer the prior is."""
         query = self.query
