@@ -143,10 +143,10 @@ def prior_agreement(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> P
         sigma_m: standard deviation of the prior, per axis.
 
     Returns:
-        PriorAgreement: by the covariances of both.
+        PriorAgreement: by the covariances of both. An error of the map is the prior's, which is a place on it.
     """
     apart = np.array([fix.east_m, fix.north_m]) - prior_m
-    allowed = fix.covariance_m2[:2, :2] + sigma_m**2 * np.eye(2)
+    allowed = fix.relative_covariance_m2 + sigma_m**2 * np.eye(2)
     return PriorAgreement(chi_square(apart, allowed), float(np.linalg.det(allowed)) ** 0.25)
 
 

@@ -27,7 +27,8 @@ class AssumedErrors:
         heading_deg: of the heading.
         tilt_deg: of roll and of pitch, where the frame came with them.
         unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
-        map_m: georeferencing accuracy per axis, where the map does not state it (:func:`with_map_accuracy`).
+        map_m: georeferencing accuracy per axis, where the map does not state it (:func:`with_map_accuracy`): that
+            of web maps and of public orthophotos.
         surface_slope_deg: slope accuracy of the surface model under one frame, where it does not state it.
         unknown_slope_deg: the same where flat ground is assumed.
     """
@@ -37,7 +38,7 @@ class AssumedErrors:
     heading_deg: float = 1.0
     tilt_deg: float = 0.37
     unknown_tilt_deg: float = 4.0
-    map_m: float = 0.3
+    map_m: float = 3.0
     surface_slope_deg: float = 0.1
     unknown_slope_deg: float = 2.0
 
@@ -64,6 +65,11 @@ def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
         map_m=errors.map_m if site.georeference_sigma_m is None else site.georeference_sigma_m,
         surface_slope_deg=errors.surface_slope_deg if site.slope_sigma_deg is None else site.slope_sigma_deg,
     )
+
+
+def map_sigma_of(site: OrthoMap) -> float:
+    """Georeferencing accuracy of a map per axis: its own, or that of any map."""
+    return AssumedErrors().map_m if site.georeference_sigma_m is None else site.georeference_sigma_m
 
 
 def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:

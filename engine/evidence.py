@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from engine.motion import PositionEstimate
+from engine.orthomap import OrthoMap
 from engine.values import Fix, Prior
 
 MAX_PROBABILITY = 0.9999
@@ -30,9 +31,29 @@ def log_odds(probability: float) -> float:
     return math.log(p / (1.0 - p))
 
 
+def probability(odds: float) -> float:
+    """The probability of log-odds."""
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
 def match_log_odds(fix: Fix) -> float:
     """Of a match by itself, where every second frame shows a place in its window."""
     return log_odds(UNSTATED_PROBABILITY if fix.confidence is None else fix.confidence)
+
+
+def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
+    """The position of another source, as far as it can be relied on.
+
+    Args:
+        prior: by the other source.
+        site: the map, whose axes count.
+    """
+    if prior.east_m is not None and prior.north_m is not None:
+        return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m, log_odds(RELIABILITY))
+    assert prior.lat_deg is not None  # a Prior has one of the two
+    assert prior.lon_deg is not None
+    place_m = site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
+    return PositionEstimate(np.asarray(place_m[:2], np.float64), prior.sigma_m, log_odds(RELIABILITY))
 
 
 def new_ground_share(moved_m: float, height_m: float | None) -> float:
@@ -71,10 +92,10 @@ def agreement_log_odds(estimate: PositionEstimate, fix: Fix, area_m2: float) -> 
         fix: the match.
         area_m2: that was searched.
     """
-    covariance = fix.covariance_m2[:2, :2] + estimate.sigma_m**2 * np.eye(2)
-    log_density = -0.5 * (estimate.chi_square(fix) + math.log(float(np.linalg.det(2.0 * math.pi * covariance))))
+    covariance = 2.0 * math.pi * estimate.difference_covariance_m2(fix)
+    log_density = -0.5 * (estimate.chi_square(fix) + math.log(float(np.linalg.det(covariance))))
     log_area = math.log(area_m2 + 2.0 * math.pi * estimate.sigma_m**2)  # an estimate that is vaguer adds nothing
-    wrong = 1.0 / (1.0 + math.exp(estimate.log_odds))
+    wrong = probability(-estimate.log_odds)
     log_right = math.log1p(-wrong) + log_area + log_density
     return min(float(np.logaddexp(log_right, math.log(wrong))), log_odds(MAX_PROBABILITY))
 

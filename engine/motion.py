@@ -179,29 +179,37 @@ class PositionEstimate:
         en_m: (2,) east and north.
         sigma_m: one standard deviation of each.
         log_odds: log(p / (1 - p)) of the probability that it holds within its standard deviation.
+        on_map: it came from the same map, and shares the error of its georeference.
     """
 
     en_m: Array
     sigma_m: float
     log_odds: float = 0.0
+    on_map: bool = False
+
+    def difference_covariance_m2(self, fix: Fix) -> Array:
+        """(2, 2) covariance of the difference to a fix; an error of the map cancels between two fixes on it."""
+        covariance = fix.relative_covariance_m2 if self.on_map else fix.covariance_m2[:2, :2]
+        return np.asarray(covariance + self.sigma_m**2 * np.eye(2))
 
     def chi_square(self, fix: Fix) -> float:
         """Squared distance of a fix in units of both covariances: two degrees of freedom."""
-        return chi_square(en_m(fix) - self.en_m, fix.covariance_m2[:2, :2] + self.sigma_m**2 * np.eye(2))
+        return chi_square(en_m(fix) - self.en_m, self.difference_covariance_m2(fix))
 
-    def prior(self, widened: float = 1.0, moved_m: Array | None = None) -> Prior:
+    def prior(self, widened: float = 1.0, moved_m: Array | None = None, map_sigma_m: float = 0.0) -> Prior:
         """The same as a prior.
 
         Args:
             widened: factor on the standard deviation, which is bounded by :data:`engine.values.MAX_SIGMA_M`.
             moved_m: (2,) movement east and north since the last frame; None is 0.
+            map_sigma_m: error of the map between this position and a place on it.
 
         Returns:
             Prior: in metres east and north of the map's origin.
         """
         east, north = (float(v) for v in self.en_m)
         moved_east, moved_north = (0.0, 0.0) if moved_m is None else (float(v) for v in moved_m)
-        sigma_m = min(self.sigma_m * widened, MAX_SIGMA_M)
+        sigma_m = min(math.hypot(self.sigma_m * widened, map_sigma_m), MAX_SIGMA_M)
         return Prior(
             east_m=east, north_m=north, sigma_m=sigma_m, moved_east_m=moved_east, moved_north_m=moved_north
         )
@@ -222,7 +230,9 @@ def en_m(fix: Fix) -> Array:
 def is_valid(fix: Fix) -> bool:
     """Whether the position is finite and the covariance positive definite."""
     finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
-    return finite and bool(np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0)
+    if not finite or not np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0:
+        return False
+    return bool(np.linalg.eigvalsh(fix.relative_covariance_m2)[0] > 0.0)
 
 
 def _velocity_of(frame: Frame) -> Array | None:

@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.budget import Budget
+from engine.covariance import map_sigma_of
 from engine.evidence import (
     MAX_PROBABILITY,
     RELIABILITY,
     Sources,
-    agreement_log_odds,
     log_odds,
     match_log_odds,
-    new_ground_share,
-    repeated_log_odds,
+    position_of,
+    probability,
 )
+from engine.hypotheses import Hypotheses, Hypothesis, Match
+from engine.map_offset import MapOffset, MapOffsetEstimator
 from engine.motion import (
     DeadReckoning,
     DriftModel,
@@ -82,16 +84,6 @@ class _Anchor:
     disputed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _PendingFix:
-    """The last of some fixes that agree and are not accepted yet, with the log-odds of them all."""
-
-    fix: Fix
-    sample: OdometrySample
-    count: int
-    log_odds: float
-
-
 class Navigator:
     """Follows a flight: each frame is matched in the window that dead reckoning from the last fix gives.
 
@@ -119,8 +111,9 @@ class Navigator:
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._velocity: VelocityEstimate | None = None  # by the last fixes
         self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
-        self._anchor = None if start is None else _Anchor(self._position(start), None)
-        self._pending: _PendingFix | None = None
+        self._anchor = None if start is None else _Anchor(position_of(start, matcher.site), None)
+        self._map_offset = MapOffsetEstimator()
+        self._hypotheses = Hypotheses(self._drift, o.gate)
         self._refusals = 0  # in a row
         self._frames_lost = 0
         self._fixed = self._lost = False  # whether the newest frame was; whether the flight is
@@ -164,7 +157,14 @@ class Navigator:
         """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
         now = self._odometry.last
         estimate = None if now is None else self._reckoned(now)
-        return None if estimate is None else estimate.prior()
+        if estimate is None:
+            return None
+        return estimate.prior(map_sigma_m=map_sigma_of(self._matcher.site) if estimate.on_map else 0.0)
+
+    @property
+    def map_offset(self) -> MapOffset | None:
+        """How far the map is off by the priors of :meth:`update`; no fix is moved by it. None without priors."""
+        return self._map_offset.offset
 
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
@@ -172,8 +172,8 @@ class Navigator:
         Args:
             frame: the newest, or one that comes late by at most ``late_s``. A late one is matched where the
                 vehicle was then, and moves nothing back.
-            prior: of this frame's position by another source; searched about where it is tighter than dead
-                reckoning, and evidence for or against a match in any case.
+            prior: of this frame's position by another source, not by the map; searched about where it is tighter
+                than dead reckoning, and evidence for or against a match in any case.
             budget: of this frame, in place of the navigator's.
 
         Raises:
@@ -189,8 +189,10 @@ class Navigator:
         self._odometry.append(frame, now)
         if isinstance(result, Fix):
             result = self._judge(result, now, sources, frame.height_agl_m, late=late)
+            if isinstance(result, Fix) and sources.given is not None:
+                self._map_offset.add(result, sources.given, now.time_s)
         elif not late and result.reason is not Reason.LATE:
-            self._pending = None  # no fix confirmed it
+            result = self._add_doubted(result, now, sources, frame.height_agl_m)
         if not late:
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
@@ -210,16 +212,20 @@ class Navigator:
         odds = 0.0 if self._refusals >= self._options.lost_after else anchor.position.log_odds
         if now.blind_s != anchor.sample.blind_s:
             odds = min(odds, log_odds(RELIABILITY))
-        return PositionEstimate(anchor.position.en_m + now.moved_m - anchor.sample.moved_m, sigma_m, odds)
+        place_m = anchor.position.en_m + now.moved_m - anchor.sample.moved_m
+        return PositionEstimate(place_m, sigma_m, odds, anchor.position.on_map)
 
     def _sources(self, now: OdometrySample, prior: Prior | None, *, late: bool) -> Sources:
         """What is known of the position, and where the matcher looks for it."""
-        given = None if prior is None else self._position(prior)
+        given = None if prior is None else position_of(prior, self._matcher.site)
         sources = Sources(self._reckoned(now), given, self._pending_position(now))
         chosen, chosen_prior = self._searched(sources, now, late=late)
         misled = self._refusals >= self._options.lost_after and self._is_turn(self._refusals)
         if prior is not None and not misled and (chosen_prior is None or prior.sigma_m < chosen_prior.sigma_m):
-            chosen, chosen_prior = given, prior
+            chosen, chosen_prior = (
+                given,
+                replace(prior, sigma_m=math.hypot(prior.sigma_m, map_sigma_of(self._matcher.site))),
+            )
         return replace(sources, searched=chosen, prior=chosen_prior)
 
     def _searched(
@@ -236,28 +242,19 @@ class Navigator:
                 return None, None
         growth = options.growth ** min(self._refusals, options.lost_after)
         last = self._odometry.last
-        return estimate, estimate.prior(growth, None if late or last is None else now.moved_m - last.moved_m)
+        moved_m = None if late or last is None else now.moved_m - last.moved_m
+        return estimate, estimate.prior(
+            growth, moved_m, 0.0 if estimate.on_map else map_sigma_of(self._matcher.site)
+        )
 
     def _is_turn(self, count: int) -> bool:
         """Whether this one of the frames that know no better searches the whole map."""
         return self._matcher.site.is_searchable and count % self._options.search_every == 0
 
     def _pending_position(self, now: OdometrySample) -> PositionEstimate | None:
-        """Dead reckoning from the pending fix."""
-        pending = self._pending
-        if pending is None:
-            return None
-        sigma_m = min(math.hypot(pending.fix.sigma_m, self._drift.sigma_m(pending.sample, now)), MAX_SIGMA_M)
-        moved_m = now.moved_m - pending.sample.moved_m
-        return PositionEstimate(en_m(pending.fix) + moved_m, sigma_m, log_odds(RELIABILITY))
-
-    def _position(self, prior: Prior) -> PositionEstimate:
-        if prior.east_m is not None and prior.north_m is not None:
-            return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m, log_odds(RELIABILITY))
-        assert prior.lat_deg is not None  # a Prior has one of the two
-        assert prior.lon_deg is not None
-        estimate = self._matcher.site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
-        return PositionEstimate(np.asarray(estimate[:2], np.float64), prior.sigma_m, log_odds(RELIABILITY))
+        """Dead reckoning from the strongest match that waits for others."""
+        pending = self._hypotheses.pending
+        return None if pending is None else self._hypotheses.position(pending, now)
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
@@ -279,44 +276,49 @@ class Navigator:
         required, against = self._options.min_log_odds, self._against(fix, now)
         own, given = (self._vouching(source, fix, sources) for source in (sources.own, sources.given))
         disputed = given < 0.0
-        if disputed and self._anchor is not None and self._anchor.disputed:
-            given = 0.0  # an error of the other source lasts
+        if self._anchor is not None and self._anchor.disputed:
+            given = 0.0  # an error of the other source lasts: until it agrees again it counts neither way
         others = match_log_odds(fix) + given
         if against is None and own + others >= required:
             self._accept(fix, now, 1, own + others, jump=False, disputed=disputed)
             return fix
         if late:
             return self._refuse_match(fix, against, own + others)
-        pending = self._chained(fix, now, sources, height_m, others if against is not None else own + others)
-        outweighed = against is not None and self._dead_reckoning_outweighs(now, pending.count)
-        if pending.count > 1 and pending.log_odds >= required and not outweighed:
-            self._accept(fix, now, pending.count, pending.log_odds, jump=against is not None, disputed=disputed)
+        match = Match(fix, others if against is not None else own + others)
+        found = self._hypotheses.add([match], now, sources, self._map_m2(fix), height_m)
+        return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(
+            fix, against, match.log_odds if found is None else found.log_odds
+        )
+
+    def _add_doubted(
+        self, refusal: NoFix, now: OdometrySample, sources: Sources, height_m: float | None
+    ) -> Fix | NoFix:
+        """The refusal, whose candidates speak for hypotheses; or the fix that these then make."""
+        candidates = [fix for fix in refusal.candidates if is_valid(fix)]
+        matches = [Match(fix, match_log_odds(fix), doubted=True) for fix in candidates]
+        map_m2 = self._map_m2(candidates[0]) if candidates else 0.0
+        found = self._hypotheses.add(matches, now, sources, map_m2, height_m)
+        return (None if found is None else self._decide(found, now, found.fix, disputed=False)) or refusal
+
+    def _decide(self, found: Hypothesis | None, now: OdometrySample, fix: Fix, *, disputed: bool) -> Fix | None:
+        """The fix of a hypothesis that enough matches speak for."""
+        if found is None or found.count < 2 or self._hypotheses.lead(found) < self._options.min_log_odds:
+            return None
+        against = self._against(fix, now)
+        if against is not None and (found.doubted or self._dead_reckoning_outweighs(now, found.count)):
+            return None
+        self._accept(fix, now, found.count, found.log_odds, jump=against is not None, disputed=disputed)
+        if not found.doubted:
             return fix
-        self._pending = pending
-        return self._refuse_match(fix, against, pending.log_odds)
+        return replace(fix, confidence=probability(min(found.log_odds, log_odds(MAX_PROBABILITY))))
 
     def _vouching(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
         """What an estimate adds to the log-odds of a match."""
         options = self._options
         return sources.vouching(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
 
-    def _map_m2(self, fix: Fix) -> float:
-        """Area of the window."""
+    def _map_m2(self, fix: Fix) -> float:  # area of the window
         return float(fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
-
-    def _chained(
-        self, fix: Fix, now: OdometrySample, sources: Sources, height_m: float | None, alone: float
-    ) -> _PendingFix:
-        """The match with the pending ones that it agrees with; where there is none, with its log-odds alone."""
-        pending, before = self._pending, sources.pending
-        if pending is None or before is None or before.chi_square(fix) > self._options.gate:
-            return _PendingFix(fix, now, 1, alone)
-        agreement = 0.0
-        if before is not sources.searched:
-            agreement = agreement_log_odds(before, fix, sources.searched_m2(self._map_m2(fix)))
-        share = new_ground_share(float(np.hypot(*(en_m(fix) - en_m(pending.fix)))), height_m)
-        odds = pending.log_odds + repeated_log_odds(fix, agreement, share)
-        return _PendingFix(fix, now, pending.count + 1, odds)
 
     def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
         """A trusted prediction that a fix contradicts: from the last fix, or from one some seconds ago.
@@ -351,9 +353,11 @@ class Navigator:
         self._resets += known and jump
         support = count if last is None or jump else last.support + count
         odds = min(odds, log_odds(MAX_PROBABILITY))
-        self._anchor = _Anchor(PositionEstimate(en_m(fix), fix.sigma_m, odds), now, fix, support, disputed)
+        position = PositionEstimate(en_m(fix), fix.relative_sigma_m, odds, on_map=True)
+        self._anchor = _Anchor(position, now, fix, support, disputed)
         self._note_velocity(self._anchor, jump=jump)
-        self._refusals, self._frames_lost, self._pending, self._lost = 0, 0, None, False
+        self._refusals, self._frames_lost, self._lost = 0, 0, False
+        self._hypotheses.clear()
 
     def _note_velocity(self, anchor: _Anchor, *, jump: bool) -> None:
         """The velocity by the fixes of about the last second."""
@@ -375,12 +379,11 @@ class Navigator:
         """The refusal of a match that is not accepted."""
         if against is not None:
             apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
-            sigma_m = math.hypot(against.sigma_m, fix.sigma_m)
+            sigma_m = math.hypot(against.sigma_m, fix.relative_sigma_m if against.on_map else fix.sigma_m)
             detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
             return fix.refused(Reason.INCONSISTENT, detail)
-        probability = 1.0 / (1.0 + math.exp(-odds))
-        detail = f"right with a probability of {probability:.4f}, {self._options.min_confidence:g} is asked for"
-        return fix.refused(Reason.UNCONFIRMED, detail)
+        asked = f"{self._options.min_confidence:g} is asked for"
+        return fix.refused(Reason.UNCONFIRMED, f"right with a probability of {probability(odds):.4f}, {asked}")
 
     def _note_loss(self, now: OdometrySample) -> None:
         """Declare the flight lost, or drop its start, after too many refusals or too much uncertainty."""

@@ -41,7 +41,8 @@ _POSES_PER_SAMPLE = 4
 _MIRRORED_STEPS = 4  # of the other pose of a plane: enough to estimate its cost
 _PAIRED = 300  # projections that are compared with all image points for the probability of a chance inlier
 _SAME_POSE_DEG = 1.5
-_CLOSE_SHARE = 0.4  # of the inliers within a wider tolerance
+_CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn
+_CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # least inliers, as a share of those within the widest tolerance
 _START_SLACK = 2.0  # factor on the tolerance in the first step from a pose that fits within a wider one
 _IDENTITY = np.eye(3)
 
@@ -201,11 +202,17 @@ def solve_pose(
     origin = points_m[known].mean(0)
     problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
     fit = _fit(problem, options) if start is None else _fit_from(problem, start, origin)
-    if fit is None or not _supported(problem, fit, options) or _ambiguous(problem, fit, options):
+    if fit is None or not _supported(problem, fit, options):
+        return None
+    other = _other_pose(problem, fit, options)
+    if other is not None and start is None:
         return None
     log10_nfa, covariance = _log10_nfa(problem, fit, options), match_covariance(problem, fit)
     if log10_nfa > options.max_log10_nfa or covariance is None:
         return None
+    if other is not None:  # the place is known, the tilt is not: either pose may be right
+        apart = np.append(other.center - fit.center, np.zeros(3))
+        covariance = covariance + 0.5 * apart[:, None] * apart
     return _stats(fit, origin, covariance, known, len(points_m), log10_nfa)
 
 
@@ -285,9 +292,13 @@ def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
     near = gauss_newton(wide, start.rotation, start.center_m - origin)
     if near is None:
         return None
-    close = gauss_newton(problem, near.rotation, near.center, slack=_START_SLACK)
-    enough = _CLOSE_SHARE * np.count_nonzero(near.inliers)
-    return near if close is None or np.count_nonzero(close.inliers) < enough else close
+    enough = max(_CLOSE_SHARE * np.count_nonzero(near.inliers), _CLOSE_INLIERS)
+    for factor in _CLOSER:
+        closer = replace(problem, tolerance_px=min(factor * problem.tolerance_px, wide.tolerance_px))
+        close = gauss_newton(closer, near.rotation, near.center, slack=_START_SLACK)
+        if close is not None and np.count_nonzero(close.inliers) >= enough:
+            return close
+    return near
 
 
 def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
@@ -334,18 +345,19 @@ def _log10_choose(n: int, k: int) -> float:
     return (math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)) / math.log(10)
 
 
-def _ambiguous(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
-    """Whether the other of the two poses of a plane explains the matches nearly as well."""
+def _other_pose(problem: Problem, fit: Fit, options: PoseOptions) -> Fit | None:
+    """The other of the two poses of a plane where it explains the matches nearly as well."""
     R, center = _mirrored(problem.points[:, fit.inliers], fit)
     if _same(R, fit.rotation):
-        return False
+        return None
     cost = _cost(problem, fit.rotation, fit.view, fit.variance_px2, options)
     if _cost(problem, R, reproject(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
-        return False  # too far off for a refinement to compensate
+        return None  # too far off for a refinement to compensate
     other = gauss_newton(problem, R, center, steps=_MIRRORED_STEPS)
     if other is None or _same(other.rotation, fit.rotation):
-        return False
-    return _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + options.min_cost_gap
+        return None
+    close = _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + options.min_cost_gap
+    return other if close else None
 
 
 def _mirrored(points: Array, fit: Fit) -> tuple[Array, Array]:

@@ -267,6 +267,8 @@ class Fix:
             the pose, "verified" by both methods.
         confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None where NCC
             searched the map, the heading or the height, for which no model was fitted.
+        map_sigma_m: the part of ``covariance_m2`` that is the map's georeference, one standard deviation per axis:
+            one error, which all fixes on a map share.
     """
 
     timestamp_ns: int | None
@@ -284,6 +286,17 @@ class Fix:
     map_xy_px: tuple[float, float]
     stage: str = "fine"
     confidence: float | None = None
+    map_sigma_m: float = 0.0
+
+    @property
+    def relative_covariance_m2(self) -> NDArray[np.float64]:
+        """(2, 2) east and north against the map, and against other fixes on it: without the map's own error."""
+        return self.covariance_m2[:2, :2] - self.map_sigma_m**2 * np.eye(2)
+
+    @property
+    def relative_sigma_m(self) -> float:
+        """As :attr:`sigma_m`, without the map's own error."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.relative_covariance_m2)[-1]))
 
     @property
     def sigma_m(self) -> float:
@@ -315,6 +328,7 @@ class NoFix:
         score: of the best match, or None where there was none.
         window: the crop that was searched, or None.
         timings: milliseconds per stage that ran.
+        candidates: a few matches that are not probable enough alone, with what they state of themselves.
     """
 
     reason: Reason
@@ -324,6 +338,7 @@ class NoFix:
     score: float | None = None
     window: Window | None = None
     timings: Timings = field(default_factory=Timings)
+    candidates: tuple[Fix, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

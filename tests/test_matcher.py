@@ -551,7 +551,7 @@ def test_a_device_that_is_missing_is_an_error_and_only_auto_falls_back(ground, c
 
 
 def test_options_are_refused_by_name(ground, camera):
-    with pytest.raises(OptionError, match=r"^method: expected one of ncc, sift, auto, got 'orb'"):
+    with pytest.raises(OptionError, match=r"^method: expected one of ncc, sift, auto, learned, got 'orb'"):
         SceneMatcher(ground.site, camera, "orb")
     with pytest.raises(OptionError, match=r"^profile: expected one of engine, paper, got 'fast'"):
         MatcherOptions(profile="fast")

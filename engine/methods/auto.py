@@ -65,11 +65,14 @@ class Auto(Method):
         first = self.ncc.correlate(query)
         second = self.sift.locate(query, is_second=isinstance(first, Fix))
         if isinstance(first, NoFix):
-            return first if isinstance(second, NoFix) and second.reason is Reason.LATE else second
+            if isinstance(second, Fix):
+                return second
+            both = first.candidates + second.candidates
+            return replace(first if second.reason is Reason.LATE else second, candidates=both)
         if isinstance(second, NoFix):
             return self.ncc.refine(query, first)
         apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
-        if not are_consistent(apart_m, (first.covariance_m2 + second.covariance_m2)[:2, :2]):
+        if not are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2):
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
         refined = self.ncc.refine(query, first)

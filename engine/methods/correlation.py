@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from engine.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
 from engine.indexes.prepared import PreparedMap, Region
+from engine.methods.oblique import is_oblique, oblique_patch
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
 from engine.ncc_fft import match_template, ncc
@@ -73,6 +74,8 @@ class Correlator:
         assert attitude is not None  # a hypothesis has both
         assert height is not None
         jacobian = query.jacobian * 2.0**level
+        if is_oblique(query, attitude):
+            return self._align_oblique(pose, level, nadir_px)
         view = view_of(query.camera, attitude, height, jacobian)
         if view is not None:
             slope = self._slope(view, height, level, nadir_px)
@@ -97,11 +100,29 @@ class Correlator:
         They show no place on Earth. Where the compass is wrong by half a turn, or the camera's picture comes
         mirrored, one of them shows the true one.
         """
-        query = self.query
-        mirrored = np.ascontiguousarray(query.gray[:, ::-1])
-        patch = rectify(mirrored, query.camera, aligned.view, fraction=self.options.fraction)
-        out = [np.ascontiguousarray(aligned.patch.gray[::-1, ::-1])]
-        return out if patch is None else [*out, patch.gray]
+        query, own, attitude = self.query, aligned.patch.gray, aligned.pose.grid_attitude
+        turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
+        if attitude is not None and not is_oblique(query, attitude):
+            mirrored = np.ascontiguousarray(query.gray[:, ::-1])
+            patch = rectify(mirrored, query.camera, aligned.view, fraction=self.options.fraction)
+        return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
+
+    def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
+        """An oblique frame drawn over the ground's relief; its view is that of the part which is correlated."""
+        query, options = self.query, self.options
+        attitude, height = pose.grid_attitude, pose.height_agl_m
+        assert attitude is not None
+        assert height is not None
+        place = query.prior_px if nadir_px is None else nadir_px
+        patch = oblique_patch(query, attitude, height, level, place)
+        if patch is None:
+            return query.refuse_tilted(attitude, METHOD)
+        size = np.array(patch.gray.shape[::-1], np.float64)
+        extent = (float(size[0]), float(size[1]))
+        view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
+        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        template = torch.from_numpy(enhanced).to(query.device)
+        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, template)
 
     def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
         """Rise (2,) of the ground per pixel of the level, about a wider area the vaguer the prior is."""

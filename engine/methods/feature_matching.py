@@ -15,13 +15,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from engine.align import Orthophoto, Relief, orthorectify
+from engine.align import Orthophoto, orthorectify
 from engine.features import match, sift
 from engine.geo import enu_from_body, wrap_heading_deg
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.methods.options import SiftOptions
 from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
+from engine.methods.relief import ground_relief
 from engine.methods.views import MapView, TelemetryHypothesis, slant_factor
 from engine.methods.votes import Vote, similarity, vote
 from engine.orthomap import OrthoMap
@@ -38,7 +39,6 @@ MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
 _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
 _UPSAMPLED_PX = 100_000  # an orthophoto that shows more has keypoints enough without its smallest ones
-_BUILDING_M = 30.0  # side of what stands on the ground, which the relief leaves out
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def _by_orthophoto(
     """The whole frame drawn on a view's level, its features matched, and what they vote for."""
     with query.scheduler.stage("rectify"):
         jacobian = query.jacobian * 2.0**view.level
-        relief = _relief(query, view.level)
+        relief = ground_relief(query.site, query.prior_px, view.level)
         photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
     if photo is None:
         return None
@@ -186,25 +186,6 @@ def _voted(
         radius_px / options.tolerance_px * matched.tolerance_px,
     )
     return replace(matched, start=start, vote=found)
-
-
-def _relief(query: Query, level: int) -> Relief | None:
-    """The bare ground about the prior's place, without what stands on it; None where it is not known."""
-    site, nadir = query.site, query.prior_px
-    if nadir is None or not site.has_surface:
-        return None
-    nadir_level, ground_m = site.level_from_full(nadir, level), site.ground_at(nadir)
-
-    def heights_m(offsets_px: Array) -> Array:
-        surface_m = site.surface_at(site.full_from_level(nadir_level + offsets_px, level))
-        spacing_m = np.ptp(offsets_px, axis=(0, 1)) / (np.array(offsets_px.shape[1::-1]) - 1.0)
-        spacing_m = np.maximum(spacing_m * site.gsd_m_per_px * 2.0**level, 1e-6)
-        reach = [int(n) for n in np.clip(np.ceil(_BUILDING_M / spacing_m / 2.0), 1, 8)]
-        size = (2 * reach[0] + 1, 2 * reach[1] + 1)
-        lower = cv2.erode(surface_m.astype(np.float32), np.ones(size[::-1], np.uint8))
-        return np.asarray(cv2.blur(cv2.dilate(lower, np.ones(size[::-1], np.uint8)), size) - ground_m, np.float64)
-
-    return heights_m
 
 
 # ------------------------------------------------------------------------------------- by the frame itself

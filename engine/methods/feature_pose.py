@@ -200,6 +200,7 @@ class FeatureMatcher:
             east_north_m=stats.center_m[:2],
             up_m=up,
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
+            map_sigma_m=options.errors.map_m,
         )
 
     def _with_confidence(
@@ -211,7 +212,8 @@ class FeatureMatcher:
         height_chi_square = None
         if height_m is not None and hypothesis.height_m == height_m:
             assert fix.up_m is not None
-            variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2])
+            # Above ground both count: an error of the map moves the ground with the camera.
+            variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2]) - errors.map_m**2
             ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
             height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
         prior_chi_square = None

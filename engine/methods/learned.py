@@ -44,7 +44,7 @@ class Learned(Method):
             matcher, self.keypoints, own.max_keypoints, own.max_map_keypoints, own.max_window_px
         )
         # The frame is turned upright for the network; without the heading a second look would see less.
-        self.options = replace(options.sift, second_look=False)
+        self.options = replace(options.sift, second_look=False, tolerance_px=own.tolerance_px)
         self.max_picture_px = own.max_picture_px
 
     warmup_rounds = 1  # of seconds each where there is no GPU

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from engine.acceptance import judge_peak, judge_second_look
@@ -15,11 +16,13 @@ from engine.methods import hypothesis_search
 from engine.methods.correlation import METHOD, Aligned, Correlator
 from engine.methods.explanation import Explanation, explain_correlation
 from engine.methods.method import Method
+from engine.methods.oblique import is_oblique
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
+from engine.peaks import best_positions
 from engine.scores import enhance
 from engine.values import Fix, NoFix, Peak, Reason, Result, Window
 from engine.window import SPREAD_SIGMAS
@@ -28,6 +31,7 @@ MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
 _MIN_SIDE_PX = 24  # of what is correlated there
+_MAX_CANDIDATES = 4  # of a refused frame
 _SECOND_LOOK = "ncc second look"
 
 
@@ -111,14 +115,16 @@ class Ncc(Method):
             result = found if isinstance(found, NoFix) else self.judge(query, found)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix) and found.features is not None:
             result = self._look_again(query, found, result)
+        if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
+            result = replace(result, candidates=self._candidates(query, found))
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def refine(self, query: Query, result: Result) -> Result:
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
         if not isinstance(result, Fix) or result.stage != "fine" or not self.options.refine:
             return result
-        # A height that was searched for is not the frame's, and an unknown slope would be taken for a tilt.
-        if not self._trusts(query) or not query.site.has_surface:
+        # A height that was searched for is not the frame's; an unknown slope would pass for a wrong tilt.
+        if not self._trusts(query) or (query.telemetry.has_tilt and not query.site.has_surface):
             return result
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
@@ -153,6 +159,7 @@ class Ncc(Method):
             peak, aligned = hypothesis_search.search(correlator, aligned, window)
         else:
             peak = correlator.search(aligned, window)
+            peak, aligned = self._over_its_ground(correlator, aligned, window, peak)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
             return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
@@ -164,6 +171,17 @@ class Ncc(Method):
         no_features = searched or wide or query.prior is None
         return found if no_features else self._with_confidence(correlator, found)
 
+    def _over_its_ground(
+        self, correlator: Correlator, aligned: Aligned, window: Window, peak: Peak | None
+    ) -> tuple[Peak | None, Aligned]:
+        """The peak of an oblique frame that is drawn once more, over the ground where it was found."""
+        attitude = aligned.pose.grid_attitude
+        if peak is None or attitude is None or not is_oblique(correlator.query, attitude):
+            return peak, aligned
+        again = correlator.align(aligned.pose, aligned.level, correlator.nadir_px(peak, aligned))
+        second = None if isinstance(again, NoFix) else correlator.search(again, window)
+        return (peak, aligned) if second is None or isinstance(again, NoFix) else (second, again)
+
     def judge(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where its peak is accepted, else a refusal."""
         pixels, fix = found.aligned.template.numel(), found.fix
@@ -172,6 +190,28 @@ class Ncc(Method):
         if refusal is not None:
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
         return fix
+
+    def _candidates(self, query: Query, found: PeakCandidate) -> tuple[Fix, ...]:
+        """The peaks of a refused frame, each with its probability beside the others; none where no model holds.
+
+        Rivals belong to it: over repeated structure they follow the vehicle as faithfully as the right place does.
+        """
+        if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
+            return ()
+        correlator, aligned = Correlator(query, self.prepared, self.options), found.aligned
+        with query.scheduler.stage("candidates"):
+            surface = correlator.surface(aligned, found.fix.window)
+        if surface is None:
+            return (found.fix,)
+        scores, corner_px = surface
+        exclusion_px = self.options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+        fixes = [found.fix]
+        for x, y, score in best_positions(scores, max(2, round(exclusion_px)), _MAX_CANDIDATES)[1:]:
+            place = corner_px + np.array([x, y])
+            peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
+            fix = self._fix(correlator, aligned, peak, found.fix.window, searched=False)
+            fixes.append(replace(fix, confidence=probability(self._features(query, aligned, peak, fix))))
+        return tuple(fixes)
 
     def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
         """The fix of the second look at the same window, where that is wanted and affordable, else the refusal."""
@@ -238,19 +278,22 @@ class Ncc(Method):
 
     def _with_confidence(self, correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
         """The candidate with its probability; one that is not high must also beat the null hypothesis."""
-        query, peak = correlator.query, found.peak
-        assert query.prior is not None
-        assert query.prior_px is not None
-        sigma = score_sigma(found.aligned.template.numel())
-        agreement = prior_agreement(found.fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
-        features = peak_features(peak, sigma, agreement)
+        query, peak, aligned = correlator.query, found.peak, found.aligned
+        features = self._features(query, aligned, peak, found.fix)
         confidence = probability(features)
         if confidence < self.options.rule.null_test_below:
-            null_score = self._null_score(correlator, found.aligned, found.fix.window)
+            null_score = self._null_score(correlator, aligned, found.fix.window)
             peak = replace(peak, second_score=max(peak.second_score, null_score))
-            features = peak_features(peak, sigma, agreement)
+            features = self._features(query, aligned, peak, found.fix)
             confidence = probability(features)
         return replace(found, peak=peak, features=features, fix=replace(found.fix, confidence=confidence))
+
+    def _features(self, query: Query, aligned: Aligned, peak: Peak, fix: Fix) -> PeakFeatures:
+        """What the confidence model is told of a peak."""
+        assert query.prior is not None
+        assert query.prior_px is not None
+        agreement = prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+        return peak_features(peak, score_sigma(aligned.template.numel()), agreement)
 
     def _null_score(self, correlator: Correlator, aligned: Aligned, window: Window) -> float:
         """The best score of the null-hypothesis templates: what this window gives to chance."""
@@ -279,6 +322,7 @@ class Ncc(Method):
             score=peak.score,
             window=window,
             grid_attitude=pose.grid_attitude if searched else None,
+            map_sigma_m=errors.map_m,
         )
 
     def _expected_window_px(self, query: Query) -> dict[int, float]:

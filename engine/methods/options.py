@@ -173,6 +173,7 @@ class LearnedOptions:
         max_keypoints: of a frame; LoFTR has none.
         max_map_keypoints: of a window.
         max_window_px: a window with more pixels of its level is not searched.
+        tolerance_px: in place of SIFT's; networks place points less exactly.
         min_match_confidence: of a match by LoFTR.
     """
 
@@ -181,6 +182,7 @@ class LearnedOptions:
     max_keypoints: int = 512
     max_map_keypoints: int = 2048
     max_window_px: int = 1 << 21
+    tolerance_px: float = 2.0
     min_match_confidence: float = 0.5
 
     def __post_init__(self) -> None:
@@ -188,6 +190,8 @@ class LearnedOptions:
         for name, minimum in limits.items():
             if not getattr(self, name) >= minimum:
                 raise OptionError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
+        if not 0.0 < self.tolerance_px < math.inf:
+            raise OptionError(f"tolerance_px: expected a positive number, got {self.tolerance_px}")
         if not 0.0 <= self.min_match_confidence <= 1.0:
             raise OptionError(f"min_match_confidence: expected 0 to 1, got {self.min_match_confidence}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from engine.methods.query import Query
 from engine.methods.views import MapView
 
 Array = NDArray[np.float64]
+
+
+_RIM_PX = 5  # what is valid ends so far within the frame's edge
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +57,7 @@ class PointFinder:
         Returns:
             (M, 2) pixels of the picture and (M, 2) pixels of the view's level.
         """
+        picture = _plain_outside(picture, valid)
         if self.keypoints is not None and isinstance(self.matcher, KeypointMatcher):
             points, places = self._by_keypoints(query, view, picture, self.matcher, self.keypoints, valid)
         else:
@@ -84,6 +89,16 @@ class PointFinder:
             pairs = matcher.match(mine, size, theirs, crop_size)
             points, places = _points(mine.xy_px[pairs[:, 0]]), _points(theirs.xy_px[pairs[:, 1]])
         return points, places
+
+
+def _plain_outside(picture: torch.Tensor, valid: NDArray[np.bool_]) -> torch.Tensor:
+    """The picture with its mean where it shows nothing: a repeated edge is full of lines, which networks see."""
+    side = 2 * _RIM_PX + 1
+    shown = cv2.dilate(valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    if shown.all() or not shown.any():
+        return picture
+    mask = torch.from_numpy(shown).to(picture.device)[None, None]
+    return torch.where(mask, picture, picture[mask].mean())
 
 
 def _points(xy_px: torch.Tensor) -> Array:

@@ -138,6 +138,7 @@ class Query:
         east_north_m: Array | None = None,
         up_m: float | None = None,
         grid_attitude: Attitude | None = None,
+        map_sigma_m: float = 0.0,
     ) -> Fix:
         """A fix of this frame; its heading counts from true north there.
 
@@ -150,6 +151,7 @@ class Query:
             east_north_m: (2,) of the nadir where it is known in metres; None computes it.
             up_m: height of the camera, or None where it is not measured.
             grid_attitude: the heading from grid north; None where it is not measured.
+            map_sigma_m: the part of the covariance that is the map's georeference.
         """
         east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
         lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
@@ -167,6 +169,7 @@ class Query:
             window=window,
             timings=self.scheduler.timings,
             map_xy_px=(float(nadir_px[0]), float(nadir_px[1])),
+            map_sigma_m=map_sigma_m,
         )
 
     def _true_attitude(self, grid_attitude: Attitude | None, lat_deg: float, lon_deg: float) -> Attitude | None:

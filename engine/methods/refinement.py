@@ -51,8 +51,8 @@ class Refinement:
     def refine(self, fix: Fix) -> Fix | NoFix:
         """The fix with all of its pose refined, or the fix itself where refinement does not confirm it.
 
-        Without a known roll and pitch the picture must determine them, or the fix is refused: its error is
-        unknown then.
+        Without a known roll and pitch the picture must determine them over a surface model, or the fix is refused:
+        its error is unknown then. Over ground that is taken for flat the fix stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         errors = query.errors(self.options.errors)
@@ -62,12 +62,15 @@ class Refinement:
             fit = fit or self._through_levels(prior, _MUCH_COARSER)
             pose_covariance = None if fit is None else covariance_of(fit, prior)
         if fit is not None and pose_covariance is not None:
-            covariance = pose_covariance[:3, :3] + errors.map_m**2 * np.eye(3)
-            covariance[2, 2] += (_HEIGHT_SHARE * (fit.pose.center_m[2] - query.site.ground_m)) ** 2
+            covariance = pose_covariance[:3, :3].copy()
+            height_m = fit.pose.center_m[2] - query.site.ground_m
+            covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
+            if not query.site.has_surface:  # a slope of the ground was taken for a tilt
+                covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
             moved = (fit.pose.center_m - prior.pose.center_m)[:2]
-            if are_consistent(moved, fix.covariance_m2[:2, :2] + covariance[:2, :2]):
-                return self._refined_fix(fix, fit, covariance)
-        if has_tilt:
+            if are_consistent(moved, fix.relative_covariance_m2 + covariance[:2, :2]):
+                return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3))
+        if has_tilt or not query.site.has_surface:
             return fix
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
@@ -144,6 +147,7 @@ class Refinement:
             east_north_m=center_m[:2],
             up_m=float(center_m[2]),
             grid_attitude=Attitude(*attitude_from_rotation(fit.pose.rotation.T @ query.camera.mount.T)),
+            map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
 

@@ -89,7 +89,8 @@ class Sift(Method):
         refusal = judge_pose(found.features, found.confidence, self.options.min_confidence)
         if refusal is None:
             return found.fix
-        return query.refuse(*refusal, METHOD, score=found.fix.score, window=found.fix.window)
+        refused = query.refuse(*refusal, METHOD, score=found.fix.score, window=found.fix.window)
+        return replace(refused, candidates=(found.fix,))
 
     def _work_px(self, query: Query) -> dict[float, float]:
         """Pixels of the reduced frame, to which the cost is proportional, by the share of the usual scale."""

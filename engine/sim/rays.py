@@ -59,6 +59,9 @@ class Rays:
             camera_m: its height.
             fine: points in a pixel along each axis.
 
+        Returns:
+            Rays: of width and height times ``fine``.
+
         Raises:
             OptionError: the optical axis is more than 75 degrees off the vertical.
         """
@@ -71,7 +74,14 @@ class Rays:
         return cls(px_from_enu @ rays[:2], -rays[2], rays[:2], nadir_px, camera_m, size)
 
     def homography(self, z_m: float) -> Array:
-        """(3, 3) from picture to world pixels for the plane at height z."""
+        """The homography of the plane at a height.
+
+        Args:
+            z_m: height of the plane.
+
+        Returns:
+            (3, 3) from picture to world pixels.
+        """
         flat = (self.camera_m - z_m) * self.reach + np.outer(self.nadir_px, self.ahead)
         return np.vstack([flat, self.ahead])
 
@@ -79,13 +89,20 @@ class Rays:
         """World pixels (x, y) that each ray travels per metre of height, on the picture's raster.
 
         A ray into the sky travels as one at the angle where the sky begins.
+
+        Returns:
+            Right and down, (H, W) each.
         """
         scale = 1.0 / (np.maximum(self._at(self.ahead), self._sky_drop) if self.sees_sky else self._at(self.ahead))
         right, down = (self._at(row) * scale for row in self.reach)
         return right.astype(np.float32), down.astype(np.float32)
 
     def sky_share(self) -> Float32:
-        """(H, W) share of the sky in what each ray sees."""
+        """Share of the sky in what each ray sees.
+
+        Returns:
+            (H, W) in [0, 1].
+        """
         angle_deg = np.degrees(np.arctan2(self._away, self._at(self.ahead)))
         return np.asarray(np.clip((angle_deg - FADE_DEG) / (FAR_DEG - FADE_DEG), 0.0, 1.0), np.float32)
 

@@ -285,7 +285,7 @@ def test_an_input_that_changed_on_disk_changes_its_print(place, tmp_path):
         ("runs = ['ncc']", "expected flights, as [flights.NAME] or as seeds in [simulated], got none"),
         (
             "runs = ['orb']\n[simulated]\nseeds = [1]",
-            "runs: expected ncc, sift, auto, one of them with /paper, or",
+            "runs: expected ncc, sift, auto, learned, one of them with /paper, or",
         ),
         ("runs = ['ncc']\n[flights.a]", "flights.a.map: expected a file that is there, got"),
         (

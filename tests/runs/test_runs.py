@@ -111,7 +111,7 @@ def test_errors_name_arguments(flight, tmp_path):
     files = FlightFiles.in_folder(flight)
     assert refused(TrackSettings, start="here").startswith("start: expected LAT,LON[,SIGMA_M]")
     assert refused(TrackSettings, budget_ms=-1.0) == "budget_ms: expected milliseconds above 0, got -1"
-    assert refused(TrackSettings, method="orb") == "method: expected one of ncc, sift, auto, got 'orb'"
+    assert refused(TrackSettings, method="orb") == "method: expected one of ncc, sift, auto, learned, got 'orb'"
     assert refused(FlightFiles, map="m.tif", frames="f.mp4").startswith("camera: expected a calibration")
     clock = refused(FlightFiles, map="m.tif", frames="f", camera="c.yaml", log_offset_s=1.0)
     assert clock.startswith("frame_stamps, log_offset_s: expected a log as telemetry")

@@ -1,0 +1,106 @@
+"""What correlation takes of an oblique frame: an upright part, drawn over the relief without the far field."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.align import Patch, orthorectify
+from engine.geo import enu_from_body
+from engine.methods.query import Query
+from engine.methods.relief import ground_relief
+from engine.orthomap import OrthoMap
+from engine.values import Attitude, Window
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+OBLIQUE_DEG = 25.0
+"""Angle of the optical axis off the vertical beyond which the ground is no plane to a frame."""
+FIELD_DEG = 60.0
+"""Ground farther off the vertical is left out: walls hide it, and an error of height or tilt moves it most."""
+_MIN_SIDE_PX = 8
+_CELLS = 96  # along the longer side, by which the rectangle is found
+
+
+def is_oblique(query: Query, attitude: Attitude) -> bool:
+    """Whether a frame looks far from the vertical."""
+    axis = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ query.camera.mount[:, 2]
+    return -float(axis[2]) < math.cos(math.radians(OBLIQUE_DEG))
+
+
+def oblique_patch(
+    query: Query, attitude: Attitude, height_m: float, level: int, nadir_px: Array | None
+) -> Patch | None:
+    """The largest upright part of an oblique frame that shows ground of the map, in pixels of a level.
+
+    Args:
+        query: the frame.
+        attitude: about grid north.
+        height_m: above the ground below the camera.
+        level: of the pyramid.
+        nadir_px: (2,) full-resolution pixel about which the ground is looked up; None takes it for level.
+
+    Returns:
+        Patch | None: None where no 8 x 8 pixels are seen.
+    """
+    site, jacobian = query.site, query.jacobian * 2.0**level
+    relief = ground_relief(site, nadir_px, level)
+    photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
+    if photo is None:
+        return None
+    valid = photo.valid & _near(photo.valid.shape, photo.offset_px, jacobian, height_m)
+    if nadir_px is not None:
+        valid &= _on_map(site, valid.shape, photo.offset_px + site.level_from_full(nadir_px, level), level)
+    box = largest_rectangle(valid)
+    if min(box.width_px, box.height_px) < _MIN_SIDE_PX:
+        return None
+    part = photo.gray[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px]
+    return Patch(np.ascontiguousarray(part), photo.offset_px + np.array([box.x0, box.y0]))
+
+
+def _near(shape: tuple[int, ...], offset_px: Array, jacobian: Array, height_m: float) -> Mask:
+    """(H, W) where the ground is no farther off the vertical than :data:`FIELD_DEG`."""
+    x, y = np.arange(shape[1]) + offset_px[0], (np.arange(shape[0]) + offset_px[1])[:, None]
+    east, north = (row[0] * x + row[1] * y for row in jacobian)
+    return np.asarray(east**2 + north**2 <= (height_m * math.tan(math.radians(FIELD_DEG))) ** 2)
+
+
+def _on_map(site: OrthoMap, shape: tuple[int, ...], corner_px: Array, level: int) -> Mask:
+    """(H, W) which pixels of an orthophoto lie on valid map, its corner at a pixel of the level."""
+    valid, corner = np.zeros(shape, np.bool_), np.rint(corner_px).astype(int)
+    rows, columns = site.level_shape(level)
+    low = np.maximum(corner, 0)
+    size = np.minimum(corner + np.array(shape[::-1]), [columns, rows]) - low
+    if (size > 0).all():
+        (x, y), (width, height) = low - corner, size
+        crop = Window(int(low[0]), int(low[1]), int(width), int(height))
+        valid[y : y + height, x : x + width] = site.valid(crop, level)
+    return valid
+
+
+def largest_rectangle(valid: Mask) -> Window:
+    """The largest upright rectangle of valid pixels, found on a grid of cells.
+
+    Args:
+        valid: (H, W).
+
+    Returns:
+        Window: empty where there is none.
+    """
+    step = max(1, max(valid.shape) // _CELLS)
+    rows, columns = (n // step for n in valid.shape)
+    cells = valid[: rows * step, : columns * step].reshape(rows, step, columns, step).all(axis=(1, 3))
+    run, best = np.zeros(columns, np.int64), (0, 0, 0, 0, 0)
+    for row in range(rows):
+        run = np.where(cells[row], run + 1, 0)
+        stack: list[tuple[int, int]] = []  # where a height began, and the height; rising
+        for column, tall in enumerate([*run.tolist(), 0]):
+            start = column
+            while stack and stack[-1][1] >= tall:
+                start, high = stack.pop()
+                best = max(best, (high * (column - start), start, row - high + 1, column - start, high))
+            stack.append((start, tall))
+    return Window(*(n * step for n in best[1:]))
