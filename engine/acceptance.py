@@ -43,7 +43,7 @@ class PeakRule:
         min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
         min_confidence: probability of :func:`engine.confidence.probability` below which a peak is not accepted.
         null_test_below: confidence below which the peak must also beat the null hypothesis, its own template
-            upside down in the same window; 1 always asks for it.
+            upside down and mirrored in the same window; 1 always asks for it.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         exclusion_m: rivals nearer than this are the peak itself.
     """
@@ -54,8 +54,8 @@ class PeakRule:
     max_prior_chi_square: float = 18.4
     min_sigmas_searched: float = 13.0
     min_margin_sigmas_searched: float = 8.0
-    min_confidence: float = 0.98
-    null_test_below: float = 0.995
+    min_confidence: float = 0.99
+    null_test_below: float = 0.9999
     min_deviation: float = 3.0
     exclusion_m: float = 6.0
 

@@ -297,7 +297,9 @@ def orthorectify(
     if np.prod(bounds[1] - bounds[0]) > MAX_PICTURE_PX:
         return None
     width, height = (int(n) + 1 for n in bounds[1] - bounds[0])
-    nodes = np.stack(np.meshgrid(*(np.linspace(*ends, _NODES) for ends in bounds.T)), axis=-1)
+    (left, top), (right, bottom) = bounds
+    columns, rows = np.linspace(left, right, _NODES), np.linspace(top, bottom, _NODES)
+    nodes = np.stack(np.meshgrid(columns, rows), axis=-1)
     up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
     seen = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1) @ _enu_from_camera(camera, attitude)
     ahead = seen[..., 2] > 0.0

@@ -70,7 +70,7 @@ class MapOffsetEstimator:
         """The estimate; None before a first difference, or where the map has no error."""
         if self._time_s is None:
             return None
-        return MapOffset(self._mean.copy(), np.linalg.inv(self._precision))
+        return MapOffset(self._mean.copy(), np.asarray(np.linalg.inv(self._precision), np.float64))
 
     def add(self, fix: Fix, given: PositionEstimate, time_s: float) -> None:
         """Add a fix and the other source's position at the same time.
@@ -91,5 +91,6 @@ class MapOffsetEstimator:
         gained = share * np.linalg.inv(fix.relative_covariance_m2 + given.sigma_m**2 * np.eye(2))
         precision = self._precision + gained
         difference = given.en_m - en_m(fix)
-        self._mean = np.linalg.solve(precision, self._precision @ self._mean + gained @ difference)
+        weighted = self._precision @ self._mean + gained @ difference
+        self._mean = np.asarray(np.linalg.solve(precision, weighted), np.float64)
         self._precision = precision

@@ -104,9 +104,9 @@ def test_a_refusal_tells_its_figures():
     verdict = judge_peak(clear, 2500, replace(MIDDLING, ratio=0.9), 0.979, rule)
     assert verdict is not None
     assert verdict[0] is Reason.AMBIGUOUS
-    for figure in ("0.979", "0.98", "10.0 sigmas", "90%", "4.0"):
+    for figure in ("0.979", "0.99", "10.0 sigmas", "90%", "4.0"):
         assert figure in verdict[1]
-    assert judge_peak(clear, 2500, MIDDLING, 0.98, rule) is None
+    assert judge_peak(clear, 2500, MIDDLING, 0.99, rule) is None
 
 
 def test_a_refusal_of_a_pose_tells_its_figures():

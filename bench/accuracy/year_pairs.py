@@ -27,7 +27,7 @@ from engine import NoFix
 from engine.device import set_threads
 from engine.window import level_crop
 
-WITHIN_M = 5.0
+WITHIN_M = 6.0  # nearer than this a rival is the peak itself; a year's measured shift is good to a metre or two
 PLAIN = "plain matchTemplate"
 Timed = tuple[Row, float]
 

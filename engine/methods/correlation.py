@@ -94,6 +94,19 @@ class Correlator:
         template = torch.from_numpy(enhanced).to(query.device)
         return Aligned(pose, level, jacobian, view, patch, template)
 
+    def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
+        """The patches of the null hypothesis, as large as the frame's: upside down, and mirrored.
+
+        They show no place on Earth. Where the compass is wrong by half a turn, or the camera's picture comes
+        mirrored, one of them shows the true one.
+        """
+        query, own, attitude = self.query, aligned.patch.gray, aligned.pose.grid_attitude
+        turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
+        if attitude is not None and not is_oblique(query, attitude):
+            mirrored = np.ascontiguousarray(query.gray[:, ::-1])
+            patch = rectify(mirrored, query.camera, aligned.view, fraction=self.options.fraction)
+        return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
+
     def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
         """An oblique frame drawn over the ground's relief; its view is that of the part which is correlated."""
         query, options = self.query, self.options

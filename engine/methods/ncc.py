@@ -23,6 +23,7 @@ from engine.methods.refinement import Refinement
 from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
+from engine.scores import enhance
 from engine.values import Fix, NoFix, Peak, Reason, Result, Window
 from engine.window import SPREAD_SIGMAS
 
@@ -295,14 +296,14 @@ class Ncc(Method):
         return peak_features(peak, score_sigma(aligned.template.numel()), agreement)
 
     def _null_score(self, correlator: Correlator, aligned: Aligned, window: Window) -> float:
-        """The best score of the null-hypothesis template: the frame's own, upside down.
-
-        It shows no place on Earth, so its best score is what this window gives to chance. Where the compass is
-        wrong by half a turn, it is the true place.
-        """
-        upside_down = replace(aligned, template=torch.flip(aligned.template, (0, 1)))
-        rival = correlator.search(upside_down, window)
-        return -1.0 if rival is None else rival.score
+        """The best score of the null-hypothesis templates: what this window gives to chance."""
+        options, best = self.options, -1.0
+        for patch in correlator.nowhere(aligned):
+            enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
+            template = torch.from_numpy(enhanced).to(correlator.query.device)
+            rival = correlator.search(replace(aligned, template=template), window)
+            best = best if rival is None else max(best, rival.score)
+        return best
 
     def _fix(self, correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
         """The camera's nadir and its covariance; the heading too where it was searched for."""

@@ -92,7 +92,8 @@ def largest_rectangle(valid: Mask) -> Window:
     """
     step = max(1, max(valid.shape) // _CELLS)
     rows, columns = (n // step for n in valid.shape)
-    cells = valid[: rows * step, : columns * step].reshape(rows, step, columns, step).all(axis=(1, 3))
+    blocks = valid[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    cells: Mask = np.asarray(blocks.all(axis=(1, 3)))
     run, best = np.zeros(columns, np.int64), (0, 0, 0, 0, 0)
     for row in range(rows):
         run = np.where(cells[row], run + 1, 0)

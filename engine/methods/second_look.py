@@ -2,8 +2,8 @@
 
 Another season, year or sun changes grey levels, and which side of an edge is the brighter one; where edges lie and
 which way they run stays. The surface is the mean of that of the grey levels and of both orientation channels
-(:func:`engine.scores.orientation`). What chance reaches is measured in the same window by the null-hypothesis
-template, the frame's own upside down.
+(:func:`engine.scores.orientation`). What chance reaches is measured in the same window by null-hypothesis
+templates, the frame's own upside down and mirrored.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class SecondLook:
 
     Attributes:
         peak: in pixels of the aligned level; its rival is the better one of the surface's and of chance's best.
-        chance_sigma: one standard deviation of the scores of the null-hypothesis template in the window.
+        chance_sigma: one standard deviation of the scores of the null-hypothesis templates in the window.
     """
 
     peak: Peak
@@ -59,18 +59,18 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
         valid = query.site.valid(crop, aligned.level)
         valid = None if valid.all() else valid
     search = _channels(gray, options.enhance_radius_px, valid)
-    template = _channels(aligned.patch.gray, options.enhance_radius_px, None)
-    templates = torch.from_numpy(np.stack([template, template[:, ::-1, ::-1]], axis=1)).to(query.device)
+    patches = [aligned.patch.gray, *correlator.nowhere(aligned)]
+    stacked = np.stack([_channels(patch, options.enhance_radius_px, None) for patch in patches], axis=1)
+    templates = torch.from_numpy(stacked).to(query.device)
     with torch.inference_mode():
         scores = ncc(torch.from_numpy(search).to(query.device), templates).mean(dim=0)
     if valid is not None:
         # Nodata is 0 in all channels, about their mean, and costs places that are mostly on the map little.
         share = torch.from_numpy(_share_on_map(valid, height, width)).to(query.device)
         scores = torch.where(share >= options.min_valid_share, scores, -1.0)
-    there = scores[1] > -1.0
-    if not bool(there.any()):
+    chance = scores[1:][scores[1:] > -1.0]
+    if not chance.numel():
         return None
-    chance = scores[1][there]
     peak = find_peak(
         scores[0], exclusion_px=options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
     )

@@ -220,7 +220,7 @@ def reach_m(camera: Camera, height_m: float) -> float:
     """
     corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
     axis = camera.mount[:, 2]
-    return height_m * max(math.hypot(corner[0], corner[1]), math.hypot(axis[0], axis[1]) / axis[2])
+    return height_m * max(math.hypot(corner[0], corner[1]), math.hypot(axis[0], axis[1]) / float(axis[2]))
 
 
 def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Generator) -> Array:
