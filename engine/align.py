@@ -333,7 +333,8 @@ def _border_rays(camera: Camera) -> Array:
     sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
     xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
     pixels = xy * [camera.width_px - 1, camera.height_px - 1]
-    return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(camera.matrix).T
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(camera.matrix).T
+    return np.asarray(rays, np.float64)
 
 
 def _between_nodes(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:

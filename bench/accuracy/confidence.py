@@ -2,8 +2,8 @@
 
     python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT|...]
 
-On towns that no other benchmark reports on, and for NCC as many matches of one year on the map of another over the
-cities' half for fitting. Half of the matches have an answer; what is left out of the telemetry and how coarsely
+On towns that no other benchmark reports on, and as many matches of one year on the map of another: over the cities'
+half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of the telemetry and how coarsely
 SIFT looks changes from match to match.
 """
 
@@ -59,9 +59,14 @@ def matched(job: tuple[int, int, int, str]) -> list[Row]:
 
 
 def matched_years(count: int, method: str) -> list[Row]:
-    """Matches of one year on the map of another; right within the benchmark's own 5 m."""
+    """Matches of one year on the map of another; right by the benchmark's own distance."""
     set_threads(1)
-    return [row for row, _ in year_matched("naip-cities", "fit", [method], count)]
+    sources = {"naip-cities": 0.7, "naip": 0.3} if method == "SIFT" else {"naip-cities": 1.0}
+    return [
+        row
+        for source, share in sources.items()
+        for row, _ in year_matched(source, "fit", [method], round(share * count))
+    ]
 
 
 def _by_sift(bench: Bench, made: Trial, rng: np.random.Generator) -> Row:
@@ -84,8 +89,8 @@ def main() -> None:
             continue
         jobs = [(a, b, each, method) for a, b in zip(FIT_SEEDS, FIT_SEEDS[1:] + FIT_SEEDS[:1], strict=True)]
         with ProcessPoolExecutor(2) as pool:
-            years = None if method == "SIFT" else pool.submit(matched_years, options.matches, method)
-            parts = [*pool.map(matched, jobs), *([] if years is None else [years.result()])]
+            years = pool.submit(matched_years, options.matches, method)
+            parts = [*pool.map(matched, jobs), years.result()]
         found = [row for part in parts for row in part if row.regressors]
         right = np.array([row.right for row in found])
         weights = model(*fitted(np.array([row.regressors for row in found]), right))
