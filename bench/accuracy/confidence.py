@@ -3,8 +3,8 @@
     python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT|...]
 
 On towns that no other benchmark reports on, and as many matches of one year on the map of another: over the
-cities' half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of the
-telemetry and how coarsely SIFT looks changes from match to match.
+cities' half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of
+the telemetry and how coarsely SIFT looks changes from match to match.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import torch
 from engine.acceptance import judge_peak, judge_second_look
 from engine.confidence import SECOND_LOOK_MODEL, PeakFeatures, peak_features, prior_agreement, probability
 from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
+from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
 from engine.methods import hypothesis_search
@@ -24,7 +25,7 @@ from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
 from engine.scores import enhance
-from engine.values import Fix, NoFix, Peak, Reason, Result, Window
+from engine.values import Attitude, Fix, NoFix, Peak, Reason, Result, Window
 from engine.window import SPREAD_SIGMAS
 
 MAX_WINDOW_PX = 8 << 20
@@ -33,6 +34,9 @@ _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where t
 _MIN_SIDE_PX = 24  # of what is correlated there
 _MAX_CANDIDATES = 4  # of a refused frame
 _SECOND_LOOK = "ncc second look"
+_TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
+_TURNED_SIGMA_DEG = 2.0  # of the heading then
+_MIN_CONFIDENCE_TURNED = 0.9995
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +119,8 @@ class Ncc(Method):
             result = found if isinstance(found, NoFix) else self.judge(query, found)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix) and found.features is not None:
             result = self._look_again(query, found, result)
+            if isinstance(result, NoFix):
+                result = self._look_turned(query, coarser, works[coarser], result)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             result = replace(result, candidates=self._candidates(query, found))
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
@@ -126,6 +132,10 @@ class Ncc(Method):
         # A height that was searched for is not the frame's; an unknown slope would pass for a wrong tilt.
         if not self._trusts(query) or (query.telemetry.has_tilt and not query.site.has_surface):
             return result
+        if result.attitude is not None:  # found by another heading than the frame's own
+            heading_deg = result.attitude.heading_deg
+            frame = replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
+            query = replace(query, frame=frame)
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
             query.scheduler.note_refusal("refinement", decay_cost=False)
@@ -212,6 +222,33 @@ class Ncc(Method):
             fix = self._fix(correlator, aligned, peak, found.fix.window, searched=False)
             fixes.append(replace(fix, confidence=probability(self._features(query, aligned, peak, fix))))
         return tuple(fixes)
+
+    def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
+        """The fix by a heading that is a few degrees off, where one is much more probable, else the refusal.
+
+        A compass beside motors is often off by more than is assumed of it, and a patch that is turned by 4 degrees
+        hardly correlates. Several headings were tried, so that more is asked for than of the frame's own.
+        """
+        rule = replace(self.options.rule, min_confidence=_MIN_CONFIDENCE_TURNED)
+        best: Fix | None = None
+        for turn_deg in _TURNS_DEG:
+            if not query.scheduler.can_afford("ncc", work):
+                break
+            assert query.frame.heading_deg is not None  # the first look had one
+            heading_deg = wrap_heading_deg(query.frame.heading_deg + turn_deg)
+            turned = replace(
+                query, frame=replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
+            )
+            with query.scheduler.costed("ncc", work):
+                found = self.find(turned, coarser=coarser)
+            if isinstance(found, NoFix) or judge_peak(
+                found.peak, found.aligned.template.numel(), found.features, found.fix.confidence, rule
+            ):
+                continue
+            if best is None or (found.fix.confidence or 0.0) > (best.confidence or 0.0):
+                attitude = Attitude(query.frame.roll_deg or 0.0, query.frame.pitch_deg or 0.0, heading_deg)
+                best = replace(found.fix, attitude=attitude)
+        return refusal if best is None else best
 
     def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
         """The fix of the second look at the same window, where that is wanted and affordable, else the refusal."""
