@@ -202,7 +202,9 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...], fraction: float) -
 MAX_FIELD_DEG = 70.0
 """Of an oblique frame the ground is used up to this angle off the vertical; beyond it is far and foreshortened."""
 MIN_PICTURE_PX = 32
-"""Least side of an orthorectified frame."""
+"""Least extent of an orthorectified frame."""
+SIDE_STEP_PX = 32
+"""One is square, its side a multiple of this, so that a flight meets few sizes and plans none in the air."""
 MAX_PICTURE_PX = 8 << 20
 """Most pixels of one: where it would cover more, its height is out of proportion to the map."""
 _NODES = 17  # along each side of the lattice on which the projection is computed; bilinear between
@@ -294,10 +296,11 @@ def orthorectify(
     bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)
     if bounds is None or (bounds[1] - bounds[0]).min() < MIN_PICTURE_PX:
         return None
-    if np.prod(bounds[1] - bounds[0]) > MAX_PICTURE_PX:
+    side = math.ceil(((bounds[1] - bounds[0]).max() + 1.0) / SIDE_STEP_PX) * SIDE_STEP_PX
+    if side * side > MAX_PICTURE_PX:
         return None
-    width, height = (int(n) + 1 for n in bounds[1] - bounds[0])
-    (left, top), (right, bottom) = bounds
+    corner = np.floor(bounds.mean(axis=0) - (side - 1) / 2.0)
+    (left, top), (right, bottom) = corner, corner + side - 1.0
     columns, rows = np.linspace(left, right, _NODES), np.linspace(top, bottom, _NODES)
     nodes = np.stack(np.meshgrid(columns, rows), axis=-1)
     up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
@@ -306,7 +309,7 @@ def orthorectify(
     steep = -up_m >= np.linalg.norm(seen, axis=-1) * math.cos(math.radians(MAX_FIELD_DEG + 1.0))
     projected = seen @ camera.matrix.T / np.where(ahead, seen[..., 2], 1.0)[..., None]
     projected[..., 2] = ahead & steep
-    between = _between_nodes(projected.astype(np.float32), (width, height))
+    between = _between_nodes(projected.astype(np.float32), (side, side))
     frame_px = np.ascontiguousarray(between[..., :2])
     slant_m = height_m / max(-_enu_from_camera(camera, attitude)[2, 2], 1e-3)
     scale = slant_m / camera.focal_px / math.sqrt(abs(float(np.linalg.det(enu_jacobian))))
@@ -318,7 +321,7 @@ def orthorectify(
     inside = (((frame_px >= 0) & (frame_px <= limit)).all(axis=-1) & (between[..., 2] > 0.999)).astype(np.uint8)
     rim = np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)
     valid = cv2.erode(inside, rim, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return Orthophoto(np.asarray(drawn, np.uint8), valid, bounds[0], frame_px)
+    return Orthophoto(np.asarray(drawn, np.uint8), valid, corner, frame_px)
 
 
 def _enu_from_camera(camera: Camera, attitude: Attitude) -> Array:

@@ -19,7 +19,9 @@ References:
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -149,6 +151,17 @@ def _sift(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Feature
             angle = torch.full_like(points.x, options.up_rad)
         descriptors = describe(gaussians, points, angle, plan, root=options.root)
         return _to_slots(points, angle, descriptors, len(images), options.max_keypoints)
+
+
+def prepare_plans(sides_px: Iterable[int], device: torch.device) -> None:
+    """Lay out the scale spaces of square pictures, so that none is planned in flight.
+
+    Args:
+        sides_px: of the pictures.
+        device: where they will be.
+    """
+    for side_px, upsample in itertools.product(sides_px, (1, 2)):
+        make_plan(side_px, side_px, 1, upsample, device)
 
 
 def plans_created() -> int:

@@ -129,7 +129,7 @@ class SiftOptions:
     min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
     use_attitude: bool = True
-    min_confidence: float = 0.97
+    min_confidence: float = 0.995
     pose: PoseOptions = field(default_factory=PoseOptions)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 

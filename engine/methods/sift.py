@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 
 from engine.acceptance import judge_pose
+from engine.align import MAX_PICTURE_PX, SIDE_STEP_PX
+from engine.features import prepare_plans
 from engine.indexes.landmarks import LandmarkMap
 from engine.methods.explanation import Explanation, explain_features
 from engine.methods.feature_pose import METHOD, FeatureMatcher, PoseCandidate
@@ -50,6 +53,9 @@ class Sift(Method):
         if query.prior is None:
             self.locate(query)
             return
+        # At most twice the frame's pixels lie along a side of an orthophoto; turned by 45 degrees half as many more.
+        longest_px = min(3 * max(query.gray.shape), math.isqrt(MAX_PICTURE_PX))
+        prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), query.device)
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed("sift", work_px):
                 self._at_scale(query, share)

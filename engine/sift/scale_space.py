@@ -105,7 +105,7 @@ class ScaleSpacePlan:
         return FIRST_SIGMA_PX * self.upsample
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> ScaleSpacePlan:
     """Lay out the octaves; cached for the most recent shapes, as frames come in one size."""
     growth = [2.0 ** (level / SCALES) for level in range(_LEVELS)]
