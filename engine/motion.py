@@ -188,7 +188,14 @@ class PositionEstimate:
     on_map: bool = False
 
     def difference_covariance_m2(self, fix: Fix) -> Array:
-        """(2, 2) covariance of the difference to a fix; an error of the map cancels between two fixes on it."""
+        """Covariance of the difference to a fix; an error of the map cancels between two fixes on it.
+
+        Args:
+            fix: on the map.
+
+        Returns:
+            (2, 2) square metres, east and north.
+        """
         covariance = fix.relative_covariance_m2 if self.on_map else fix.covariance_m2[:2, :2]
         return np.asarray(covariance + self.sigma_m**2 * np.eye(2))
 

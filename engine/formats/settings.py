@@ -187,6 +187,8 @@ def _table(options: Any, path: tuple[str, ...]) -> list[str]:
 def _literal(value: Any) -> str:
     if value is None:
         return f'"{NONE}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_literal, value))}]"
     # JSON's strings and booleans are valid TOML; so are Python's numbers, infinity included.
     return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
 

@@ -53,7 +53,7 @@ class Sift(Method):
         if query.prior is None:
             self.locate(query)
             return
-        # At most twice the frame's pixels lie along a side of an orthophoto; turned by 45 degrees half as many more.
+        # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
         longest_px = min(3 * max(query.gray.shape), math.isqrt(MAX_PICTURE_PX))
         prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), query.device)
         for share, work_px in self._work_px(query).items():
