@@ -13,7 +13,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from engine.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from engine.runs import FlightFiles, TrackSettings, track
 from engine.runs.arguments import parse_position
 from engine.runs.inputs import FlightInputs, open_inputs
+from engine.runs.settings import with_weights
 from engine.values import Window
 
 Array = NDArray[np.float64]
@@ -111,16 +112,18 @@ def _with_video(folder: Path) -> FlightFiles:
     return FlightFiles(**{what: folder / name for what, name in names.items()})
 
 
-def fly(name: str, method: str, step: int, weights: Path | None) -> Figures:
+def fly(name: str, method: str, step: int, weights: Sequence[Path]) -> Figures:
     """Track a flight as a user would; one without positions in its telemetry starts at its true place."""
     files, inputs = inputs_of(name, step)
     paper = method.startswith("paper-")
     profile = "paper" if paper else "engine"
     settings = TrackSettings(
-        start=_start(inputs), device="cpu", method=method.removeprefix("paper-"), profile=profile
+        start=_start(inputs),
+        device="cpu",
+        method=method.removeprefix("paper-"),
+        profile=profile,
+        learned=with_weights(method, weights if method == "learned" else ()),
     )
-    if method == "learned":
-        settings = replace(settings, sift=replace(settings.sift, weights=str(weights)))
     rows = _middles(inputs, settings) if name in MIDDLE else _tracked(files, inputs, settings)
     errors = errors_en_m(rows, inputs.truth, inputs.site.frame)
     spent = [row.latency_ms for row in rows if row.latency_ms is not None]
@@ -267,7 +270,7 @@ def measure(options: argparse.Namespace) -> Iterator[Figures | Votes]:
         if not (SHARED / name).is_dir():
             continue
         for method in options.methods:
-            if method == "learned" and options.weights is None:
+            if method == "learned" and not options.weights:
                 continue
             step = options.step or DRAWN.get(name, 1)
             if method == "classical":
@@ -282,7 +285,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--sets", nargs="+", choices=[*REAL, *DRAWN], default=[*REAL, *DRAWN])
     parser.add_argument("--step", type=int, help="every how many frames one is taken, of every set")
-    parser.add_argument("--weights", type=Path, help="of the learned matcher, which is left out without")
+    parser.add_argument("--weights", type=Path, nargs="+", default=(), help="of the learned method, else left out")
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
     parser.add_argument("--save-before", action="store_true", help="keep the figures as those before")
     options = parser.parse_args()
