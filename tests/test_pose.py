@@ -14,7 +14,7 @@ from bench.accuracy.pose_scenes import GROUNDS, WRONG
 from bench.accuracy.poses import CHI2_3_SIGMA, accepted, coverage
 from engine import pnp
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.pose import AttitudePrior, PoseOptions, PoseStats, solve_pose
+from engine.pose import AttitudePrior, PoseOptions, PoseStart, PoseStats, solve_pose
 
 K = np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]])
 SIZE = 300
@@ -460,3 +460,35 @@ def test_wrong_arrays_are_named():
         AttitudePrior(rotation=np.eye(3), sigma_deg=1, axes=np.zeros(3))
     with pytest.raises(OptionError, match="sigma_deg"):
         AttitudePrior(rotation=np.eye(3), sigma_deg=0)
+
+
+# From a start
+
+
+def test_from_a_near_start_one_match_in_six_is_enough_and_from_a_far_one_nothing_is_found():
+    s = scene(np.random.default_rng(41), 180, noise_px=0.5, wrong=5 / 6, relief_m=5.0)
+    turned = cv2.Rodrigues(np.deg2rad([1.0, -2.0, 1.5]))[0] @ s.rotation
+    prior = AttitudePrior(turned, 4.0)
+    near = PoseStart(turned, s.center_m + np.array([4.0, -3.0, 2.0]), 20.0)
+    found = solve_pose(s.points_m, s.points_px, K, start=near, prior=prior)
+    assert np.linalg.norm(found.center_m - s.center_m) < 2.0
+    assert np.count_nonzero(found.inliers & s.wrong) <= 3
+    far = PoseStart(turned, s.center_m + np.array([90.0, 90.0, 0.0]), 20.0)
+    assert solve_pose(s.points_m, s.points_px, K, start=far, prior=prior) is None
+
+
+def test_where_both_poses_of_a_plane_fit_the_covariance_covers_both_from_a_start():
+    """Where the place is known by a vote an unknown tilt makes it vague; it is no reason to refuse."""
+    rng = np.random.default_rng(20)
+    narrow = np.array([[9000.0, 0, 149.5], [0, 9000.0, 149.5], [0, 0, 1]])
+    rotation = cv2.Rodrigues(np.deg2rad([8.0, 0, 0]))[0] @ np.diag([1.0, -1, -1])
+    points = np.c_[rng.uniform(-2, 2, (60, 2)), np.zeros(60)]
+    center = -rotation[2] * 150
+    x = (points - center) @ rotation.T
+    pixels = (x @ narrow.T)[:, :2] / x[:, 2:] + rng.normal(0, 0.7, (60, 2))
+    mirrored = cv2.Rodrigues(np.deg2rad([-8.0, 0, 0]))[0] @ np.diag([1.0, -1, -1])
+    for wrong_or_right in (rotation, mirrored):
+        start = PoseStart(wrong_or_right, -wrong_or_right[2] * 150, 20.0)
+        found = solve_pose(points, pixels, narrow, start=start)
+        error = found.center_m - center
+        assert error @ np.linalg.solve(found.covariance_center_m2, error) < chi2.ppf(0.999, 3)

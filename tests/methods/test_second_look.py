@@ -88,3 +88,27 @@ def test_what_is_at_the_edge_contradicts_the_prior_or_has_a_rival_is_refused(pea
 def test_a_clear_peak_is_accepted():
     peak = Peak(1.0, 1.0, 0.6, 0.1, -np.eye(2))
     assert judge_second_look(peak, CLEAR, probability(CLEAR, SECOND_LOOK_MODEL), PeakRule()) is None
+
+
+# Another heading
+
+
+@pytest.mark.parametrize("turn_deg", [-4.0, 4.5])
+def test_a_compass_that_is_a_few_degrees_off_is_found_out(ground, camera, turn_deg):
+    frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
+    rng = np.random.default_rng(3)  # dim and noisy, so that the turned patch does not do by itself
+    image = np.clip(0.25 * frame.image + 90 + rng.normal(0, 14, frame.image.shape), 0, 255).astype(np.uint8)
+    told = replace(frame, image=image, heading_deg=40.0 + turn_deg)
+    result = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR))
+    assert isinstance(result, Fix)
+    assert np.hypot(*(np.array(result.map_xy_px) - NADIR)) < 3.0
+    assert result.attitude is not None
+    assert abs(result.attitude.heading_deg - 40.0) < 1.5
+
+
+def test_no_heading_makes_another_place_look_right(ground, camera):
+    frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
+    mirrored = replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]))
+    for heading_deg in (36.0, 40.0, 44.0):
+        told = replace(mirrored, heading_deg=heading_deg)
+        assert isinstance(SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR)), NoFix)
