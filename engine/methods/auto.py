@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from engine.acceptance import are_consistent
 from engine.methods.explanation import Explanation
@@ -62,7 +63,7 @@ class Auto(Method):
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        first = self.ncc.correlate(query)
+        first = self.ncc.correlate(query, try_turns=False)  # SIFT finds the heading by itself
         second = self.sift.locate(query, is_second=isinstance(first, Fix))
         if isinstance(first, NoFix):
             if isinstance(second, Fix):
@@ -73,6 +74,8 @@ class Auto(Method):
             return self.ncc.refine(query, first)
         apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
         if not are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2):
+            if float(np.hypot(*apart_m)) < self.ncc.options.rule.exclusion_m:
+                return _vaguer(second, apart_m)
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
         refined = self.ncc.refine(query, first)
@@ -85,3 +88,14 @@ class Auto(Method):
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
+
+
+def _vaguer(second: Fix, apart_m: NDArray[np.float64]) -> Fix:
+    """The fix of SIFT where NCC found the same place, but not as nearly as both state.
+
+    No other place lies so near. Telemetry in error moves the patch that NCC looks for; the pose rests less on it.
+    Which one is off is unknown: the covariance covers both.
+    """
+    covariance_m2 = second.covariance_m2.copy()
+    covariance_m2[:2, :2] += apart_m[:, None] * apart_m
+    return replace(second, covariance_m2=covariance_m2)

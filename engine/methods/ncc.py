@@ -95,13 +95,14 @@ class Ncc(Method):
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
         return self.refine(query, self.correlate(query))
 
-    def correlate(self, query: Query, coarser: int | None = None) -> Result:
+    def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
 
         Args:
             query: the frame.
             coarser: levels above the one whose pixels are like the frame's; None takes the finest that there is
                 time for.
+            try_turns: whether a refused frame is tried with its heading a few degrees off.
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
@@ -119,7 +120,7 @@ class Ncc(Method):
             result = found if isinstance(found, NoFix) else self.judge(query, found)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix) and found.features is not None:
             result = self._look_again(query, found, result)
-            if isinstance(result, NoFix):
+            if isinstance(result, NoFix) and try_turns:
                 result = self._look_turned(query, coarser, works[coarser], result)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             result = replace(result, candidates=self._candidates(query, found))

@@ -1,0 +1,42 @@
+"""Where NCC and SIFT differ: at one place SIFT's pose is taken and made vaguer, at two places nothing is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import Fix, NoFix, OrthoMap, SceneMatcher
+from engine.methods.ncc import Ncc
+from engine.values import Reason
+
+NADIR = np.array([310.0, 305.0])
+
+
+@pytest.fixture(scope="module")
+def site(ground):
+    """The ground with a surface model, which says how flat it is."""
+    flat = np.zeros(ground.gray.shape, np.float32)
+    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
+
+
+@pytest.mark.parametrize(("off_m", "same_place"), [(4.0, True), (25.0, False)])
+def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
+    ground, site, camera, monkeypatch, off_m, same_place
+):
+    frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
+    sift = SceneMatcher(site, camera, "sift", "cpu").locate(frame, prior)
+    own = Ncc.correlate
+
+    def off(self, query, *args, **kwargs):
+        fix = own(self, query, *args, **kwargs)
+        return replace(fix, east_m=fix.east_m + off_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+
+    monkeypatch.setattr(Ncc, "correlate", off)
+    result = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
+    if same_place:
+        assert isinstance(result, Fix)
+        assert (result.east_m, result.north_m) == (sift.east_m, sift.north_m)
+        assert result.covariance_m2[0, 0] > sift.covariance_m2[0, 0] + 0.8 * off_m**2
+    else:
+        assert isinstance(result, NoFix)
+        assert result.reason is Reason.INCONSISTENT
