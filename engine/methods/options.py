@@ -181,7 +181,7 @@ class LearnedOptions:
     max_picture_px: int = 130_000
     max_keypoints: int = 512
     max_map_keypoints: int = 2048
-    max_window_px: int = 1 << 21
+    max_window_px: int = 1 << 22
     tolerance_px: float = 2.0
     min_match_confidence: float = 0.5
 
