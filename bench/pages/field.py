@@ -27,7 +27,8 @@ NAMES = {
     "classical": "plain classical recipe",
 }  # fmt: skip
 INTRO = (
-    "Made by `python -m bench.accuracy.field`, one run of it, on {machine}, one thread. Each flight goes through "
+    "Made by `python -m bench.accuracy.field` on {machine}, one thread, beside other work: its milliseconds are "
+    "upper bounds, and no comparison with those before. Each flight goes through "
     "`track` with default settings and the telemetry that was recorded; a flight without positions in its "
     "telemetry starts at its true place (sigma 15 m)."
 )
