@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.geo import enu_from_body
 from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
@@ -91,7 +90,7 @@ def view_of(
     Returns:
         GroundView | None: None where a ray of a corner exceeds :data:`MAX_RAY_DEG` or does not meet the plane.
     """
-    enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
+    enu_from_camera = camera.enu_from_camera(attitude)
     rays = camera.frame_rays @ enu_from_camera.T
     down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
     if down.min() < np.cos(np.radians(MAX_RAY_DEG)):
@@ -209,7 +208,8 @@ MAX_PICTURE_PX = 8 << 20
 """Most pixels of one: where it would cover more, its height is out of proportion to the map."""
 _NODES = 17  # along each side of the lattice on which the projection is computed; bilinear between
 _BORDER_RAYS = 16  # along each side of the frame
-_RIM_PX = 5  # of an orthorectified frame: gradients there would be those of its edge
+RIM_PX = 5
+"""What an orthorectified frame shows ends so far within its edge, whose gradients are none of the ground."""
 
 Relief = Callable[[Array], Array]
 """Heights (...,) in metres above the ground below the camera, at offsets (..., 2) from the nadir in map pixels."""
@@ -223,13 +223,13 @@ class Orthophoto:
         gray: (h, w) uint8; the edge is repeated where the frame shows nothing.
         valid: (h, w) bool, where the frame shows the ground, its rim left out.
         offset_px: (2,) of its top-left pixel from the assumed nadir, in map pixels.
-        frame_px: (h, w, 2) float32, the place in the frame that each pixel was taken from.
+        frame_px: x and y, (h, w) float32 each, of the place in the frame that each pixel was taken from.
     """
 
     gray: NDArray[np.uint8]
     valid: NDArray[np.bool_]
     offset_px: Array
-    frame_px: NDArray[np.float32]
+    frame_px: tuple[NDArray[np.float32], NDArray[np.float32]]
 
     def to_frame(self, xy_px: Array) -> Array:
         """Places in the frame, bilinear.
@@ -243,8 +243,8 @@ class Orthophoto:
         if not len(xy_px):
             return np.zeros((0, 2))
         at = xy_px.astype(np.float32)
-        found = cv2.remap(self.frame_px, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)
-        return np.asarray(found.reshape(-1, 2), np.float64)
+        x, y = (cv2.remap(plane, at[:, 0], at[:, 1], cv2.INTER_LINEAR) for plane in self.frame_px)
+        return np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
 
 
 def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array) -> Array | None:
@@ -260,7 +260,7 @@ def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_ja
         (2, 2) lower and upper corner in map pixels from the nadir; None where the middle of the frame looks beyond
         that angle.
     """
-    rays = _border_rays(camera) @ _enu_from_camera(camera, attitude).T
+    rays = _border_rays(camera) @ camera.enu_from_camera(attitude).T
     reach = np.hypot(rays[:, 0], rays[:, 1])
     limit = math.tan(math.radians(MAX_FIELD_DEG))
     if rays[-1, 2] >= 0.0 or reach[-1] > -rays[-1, 2] * limit * (1.0 - 1e-9):
@@ -300,33 +300,38 @@ def orthorectify(
     if side * side > MAX_PICTURE_PX:
         return None
     corner = np.floor(bounds.mean(axis=0) - (side - 1) / 2.0)
-    (left, top), (right, bottom) = corner, corner + side - 1.0
-    columns, rows = np.linspace(left, right, _NODES), np.linspace(top, bottom, _NODES)
-    nodes = np.stack(np.meshgrid(columns, rows), axis=-1)
+    enu_from_camera = camera.enu_from_camera(attitude)
+    nodes = np.stack(np.meshgrid(*np.linspace(corner, corner + side - 1.0, _NODES, axis=1)), axis=-1)
     up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
-    seen = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1) @ _enu_from_camera(camera, attitude)
+    ground_m = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1)
+    x_px, y_px, seen = cv2.split(_between_nodes(_projected(ground_m, camera, enu_from_camera), side))
+    slant_m = height_m / max(-enu_from_camera[2, 2], 1e-3)
+    scale = slant_m / camera.focal_px / math.sqrt(abs(float(np.linalg.det(enu_jacobian))))
+    inside = (x_px >= 0) & (x_px <= gray.shape[1] - 1) & (y_px >= 0) & (y_px <= gray.shape[0] - 1) & (seen > 0.999)
+    rim = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    valid = cv2.erode(inside.astype(np.uint8), rim, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    return Orthophoto(_drawn(gray, scale, x_px, y_px), valid, corner, (x_px, y_px))
+
+
+def _projected(ground_m: Array, camera: Camera, enu_from_camera: Array) -> NDArray[np.float32]:
+    """Places (..., 2) in the frame of ground (..., 3) about the camera, and 1 where it can show it, else 0."""
+    seen = ground_m @ enu_from_camera
     ahead = seen[..., 2] > 0.0
-    steep = -up_m >= np.linalg.norm(seen, axis=-1) * math.cos(math.radians(MAX_FIELD_DEG + 1.0))
+    steep = -ground_m[..., 2] >= np.linalg.norm(seen, axis=-1) * math.cos(math.radians(MAX_FIELD_DEG + 1.0))
     projected = seen @ camera.matrix.T / np.where(ahead, seen[..., 2], 1.0)[..., None]
     projected[..., 2] = ahead & steep
-    between = _between_nodes(projected.astype(np.float32), (side, side))
-    frame_px = np.ascontiguousarray(between[..., :2])
-    slant_m = height_m / max(-_enu_from_camera(camera, attitude)[2, 2], 1e-3)
-    scale = slant_m / camera.focal_px / math.sqrt(abs(float(np.linalg.det(enu_jacobian))))
+    return np.asarray(projected, np.float32)
+
+
+def _drawn(
+    gray: NDArray[np.uint8], scale: float, x_px: NDArray[np.float32], y_px: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """The frame at places (h, w) of it, averaged down first where it is much finer than the map."""
     picture, picture_from_image = shrink(gray, scale)
-    factor, shift = np.diag(picture_from_image)[:2], picture_from_image[:2, 2]
-    at = frame_px * factor.astype(np.float32) + shift.astype(np.float32)
-    drawn = cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    limit = np.array([gray.shape[1] - 1, gray.shape[0] - 1], np.float32)
-    inside = (((frame_px >= 0) & (frame_px <= limit)).all(axis=-1) & (between[..., 2] > 0.999)).astype(np.uint8)
-    rim = np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)
-    valid = cv2.erode(inside, rim, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return Orthophoto(np.asarray(drawn, np.uint8), valid, corner, frame_px)
-
-
-def _enu_from_camera(camera: Camera, attitude: Attitude) -> Array:
-    turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
-    return np.asarray(turn @ camera.mount)
+    if picture is not gray:
+        (sx, _, left), (_, sy, top) = picture_from_image[:2].astype(np.float32)
+        x_px, y_px = x_px * sx + left, y_px * sy + top
+    return np.asarray(cv2.remap(picture, x_px, y_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def _border_rays(camera: Camera) -> Array:
@@ -340,7 +345,7 @@ def _border_rays(camera: Camera) -> Array:
     return np.asarray(rays, np.float64)
 
 
-def _between_nodes(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """A lattice (n, n, C) from corner to corner, bilinear at every pixel of a size (width, height)."""
-    columns, rows = (np.linspace(0.0, _NODES - 1.0, n, dtype=np.float32) for n in size)
-    return np.asarray(cv2.remap(values, *np.meshgrid(columns, rows), cv2.INTER_LINEAR), np.float32)
+def _between_nodes(values: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
+    """A lattice (n, n, C) from corner to corner, bilinear at every pixel of a square."""
+    at = np.linspace(0.0, _NODES - 1.0, side_px, dtype=np.float32)
+    return np.asarray(cv2.remap(values, *np.meshgrid(at, at), cv2.INTER_LINEAR), np.float32)

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import CalibrationError
+from engine.geo import enu_from_body
+from engine.values import Attitude
 
 Array = NDArray[np.float64]
 
@@ -206,6 +208,18 @@ class Camera:
     def focal_px(self) -> float:
         """Mean focal length in pixels."""
         return float((self.matrix[0, 0] + self.matrix[1, 1]) / 2.0)
+
+    def enu_from_camera(self, attitude: Attitude) -> Array:
+        """Rotation from the camera's axes to east, north, up.
+
+        Args:
+            attitude: of the body, its heading from the north that is meant.
+
+        Returns:
+            (3, 3) v_enu = R v_camera.
+        """
+        turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
+        return np.asarray(turn @ self.mount)
 
     @cached_property
     def frame_rays(self) -> Array:

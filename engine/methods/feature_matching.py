@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from engine.align import Orthophoto, orthorectify
 from engine.features import match, sift
-from engine.geo import enu_from_body, wrap_heading_deg
+from engine.geo import wrap_heading_deg
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.methods.options import SiftOptions
 from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.relief import ground_relief
-from engine.methods.views import MapView, TelemetryHypothesis, slant_factor
+from engine.methods.views import MapView, TelemetryHypothesis, map_px_per_pixel, slant_m
 from engine.methods.votes import Vote, similarity, vote
 from engine.orthomap import OrthoMap
 from engine.pose import PoseStart
@@ -120,10 +120,8 @@ def _by_orthophoto(
     else:
         photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-    weights = roughness_weights(query.site, ground_m) / (1.0 + (scale_px / _BLUNT_PX) ** 2)
-    # Pixels of the frame that are one of the level, in the middle of the frame.
-    slant_m = height_m * slant_factor(query.camera, attitude)
-    per_px = query.site.gsd_m_per_px * 2.0**view.level * query.camera.focal_px / slant_m
+    weights = _weights(query.site, ground_m, scale_px)
+    per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # pixels of the frame that are one of the level
     matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
     with query.scheduler.stage("vote"):
         return _voted(query, options, matched, photo, photo_px, map_px, attitude, height_m)
@@ -169,19 +167,18 @@ def _voted(
 ) -> Matched:
     """The matches with the pose that most of them vote for."""
     site, level = query.site, matched.view.level
-    slant_m = height_m * slant_factor(query.camera, attitude)
-    radius_px = max(options.vote_share * slant_m / (site.gsd_m_per_px * 2.0**level), 2.0 * options.tolerance_px)
+    share_px = options.vote_share * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
+    radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
     found = vote(photo_px - middle, map_px, radius_px)
     if found is None:
         return matched
     nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px
     nadir_px = site.full_from_level(nadir, level)
-    heading_deg = wrap_heading_deg(attitude.heading_deg + found.turn_deg)
-    enu_from_camera = enu_from_body(attitude.roll_deg, attitude.pitch_deg, heading_deg) @ query.camera.mount
+    turned = replace(attitude, heading_deg=wrap_heading_deg(attitude.heading_deg + found.turn_deg))
     up_m = site.ground_at(nadir_px) + height_m * found.scale
     start = PoseStart(
-        enu_from_camera.T,
+        query.camera.enu_from_camera(turned).T,
         np.array([*site.enu_from_pixel(nadir_px), up_m]),
         radius_px / options.tolerance_px * matched.tolerance_px,
     )
@@ -233,9 +230,8 @@ def _by_frame(
             pairs = found.pairs().cpu().numpy()
             points_px = reduced.full(features.xy_px[0].cpu().numpy()[pairs[:, 0]])
             scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
-            weights = 1.0 / (1.0 + (scale_px / _BLUNT_PX) ** 2)
             points_m = known.points_m[pairs[:, 1]]
-            weights = weights * roughness_weights(query.site, points_m)
+            weights = _weights(query.site, points_m, scale_px)
             matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
     return matched
 
@@ -247,7 +243,7 @@ def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: 
     for view in views:
         points_px, map_px = finder.find(query, reduced.picture, valid, view)
         ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-        weights = roughness_weights(query.site, ground_m)
+        weights = _weights(query.site, ground_m, np.zeros(len(ground_m)))
         matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
     return matched
 
@@ -290,6 +286,7 @@ def lifted(site: OrthoMap, map_px: Array) -> Array:
     return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
 
 
-def roughness_weights(site: OrthoMap, points_m: Array) -> Array:
-    """Weights (N,) of landmarks: where the surface is rough, what they show may stand higher or lower."""
-    return site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGHNESS_REACH_PX)
+def _weights(site: OrthoMap, points_m: Array, scale_px: Array) -> Array:
+    """Weights (N,) of matches: blunt keypoints are less accurate, and on a rough surface they may stand higher."""
+    roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGHNESS_REACH_PX)
+    return roughness / (1.0 + (scale_px / _BLUNT_PX) ** 2)

@@ -16,9 +16,9 @@ from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
-from engine.methods.views import slant_factor
+from engine.methods.views import map_px_per_pixel
 from engine.orthomap import OrthoMap
-from engine.values import Attitude, NoFix, Result, Window
+from engine.values import NoFix, Result, Window
 
 METHOD = "learned"
 _REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
@@ -84,9 +84,6 @@ class Learned(Method):
         height_m = query.telemetry.height_agl_m
         if height_m is None:
             return min(1.0, math.sqrt(most / size))
-        attitude = query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0)
-        slant_m = height_m * slant_factor(query.camera, attitude)
-        # Pixels of the map for one of the frame, in its middle.
-        per_px = slant_m / (query.camera.focal_px * query.site.gsd_m_per_px)
+        per_px = map_px_per_pixel(query, height_m)
         level = max(0, math.ceil(math.log2(per_px * math.sqrt(size / most))))
         return min(1.0, per_px / 2.0**level)

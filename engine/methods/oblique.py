@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.align import Patch, orthorectify
-from engine.geo import enu_from_body
 from engine.methods.query import Query
 from engine.methods.relief import ground_relief
 from engine.orthomap import OrthoMap
@@ -27,8 +26,7 @@ _CELLS = 96  # along the longer side, by which the rectangle is found
 
 def is_oblique(query: Query, attitude: Attitude) -> bool:
     """Whether a frame looks far from the vertical."""
-    axis = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ query.camera.mount[:, 2]
-    return -float(axis[2]) < math.cos(math.radians(OBLIQUE_DEG))
+    return -float(query.camera.enu_from_camera(attitude)[2, 2]) < math.cos(math.radians(OBLIQUE_DEG))
 
 
 def oblique_patch(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from engine.align import RIM_PX
 from engine.indexes.keypoints import KeypointMap
 from engine.indexes.landmarks import as_picture
 from engine.learned import KeypointMatcher, PairMatcher
@@ -16,9 +17,6 @@ from engine.methods.query import Query
 from engine.methods.views import MapView
 
 Array = NDArray[np.float64]
-
-
-_RIM_PX = 5  # what is valid ends so far within the frame's edge
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +91,7 @@ class PointFinder:
 
 def _plain_outside(picture: torch.Tensor, valid: NDArray[np.bool_]) -> torch.Tensor:
     """The picture with its mean where it shows nothing: a repeated edge is full of lines, which networks see."""
-    side = 2 * _RIM_PX + 1
+    side = 2 * RIM_PX + 1
     shown = cv2.dilate(valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
     if shown.all() or not shown.any():
         return picture

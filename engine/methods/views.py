@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.align import ground_bounds_px
-from engine.camera import Camera
-from engine.geo import enu_from_body
 from engine.indexes.landmarks import PREPARED_PX
 from engine.methods.query import Query
 from engine.values import Attitude, NoFix, Window
@@ -67,10 +65,7 @@ def x_axis_deg(query: Query) -> float | None:
     attitude = query.telemetry.grid_attitude
     if attitude is None:
         return None
-    enu_from_camera = (
-        enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ query.camera.mount
-    )
-    x, y, _ = enu_from_camera.T @ np.array([*query.jacobian[:, 0], 0.0])
+    x, y, _ = query.camera.enu_from_camera(attitude).T @ np.array([*query.jacobian[:, 0], 0.0])
     return math.degrees(math.atan2(y, x))
 
 
@@ -87,7 +82,7 @@ def views_of(
         scale: of the reduced frame.
     """
     site, heights_m = query.site, hypothesis.heights_m
-    per_height = _slant(query) / (query.camera.focal_px * scale * site.gsd_m_per_px)
+    per_height = map_px_per_pixel(query, 1.0, scale)
     if hypothesis.height_m is not None:
         first = last = level_at(query, hypothesis.height_m, scale)
     else:
@@ -105,14 +100,12 @@ def views_of(
 
 def view_in(query: Query, window: Window, height_m: float, scale: float) -> MapView:
     """The view of a window that is known, at one height; see :func:`views_of`."""
-    per_px = height_m * _slant(query) / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
-    return _view(query, window, level_at(query, height_m, scale), per_px)
+    return _view(query, window, level_at(query, height_m, scale), map_px_per_pixel(query, height_m, scale))
 
 
 def level_at(query: Query, height_m: float, scale: float) -> int:
     """The level whose pixels are like those of a frame that was reduced to a scale, and no larger."""
-    per_px = height_m * _slant(query) / (query.camera.focal_px * scale * query.site.gsd_m_per_px)
-    return level_for(1.0, per_px * _NO_LARGER, query.site.levels)
+    return level_for(1.0, map_px_per_pixel(query, height_m, scale) * _NO_LARGER, query.site.levels)
 
 
 def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
@@ -139,11 +132,12 @@ def _window(query: Query, height_m: float, has_heading: bool, method: str, margi
     return window or query.refuse_outside(method)
 
 
-def slant_factor(camera: Camera, attitude: Attitude) -> float:
-    """Distance to the ground along the optical axis over the height; bounded near the horizon."""
-    turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
-    return 1.0 / max(-float((turn @ camera.mount)[2, 2]), _MIN_DOWN)
+def slant_m(query: Query, height_m: float) -> float:
+    """Distance to the ground along the optical axis at a height; bounded near the horizon."""
+    attitude = query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0)
+    return height_m / max(-float(query.camera.enu_from_camera(attitude)[2, 2]), _MIN_DOWN)
 
 
-def _slant(query: Query) -> float:
-    return slant_factor(query.camera, query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0))
+def map_px_per_pixel(query: Query, height_m: float, scale: float = 1.0) -> float:
+    """Full-resolution map pixels that one pixel in the middle of the frame covers, reduced to a scale."""
+    return slant_m(query, height_m) / (query.camera.focal_px * scale * query.site.gsd_m_per_px)

@@ -14,7 +14,6 @@ import numpy as np
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.geo import enu_from_body
 from engine.sim.light import Array, Float32
 from engine.values import Attitude
 
@@ -69,7 +68,7 @@ class Rays:
         sample = np.array([[1 / fine, 0, offset], [0, 1 / fine, offset], [0, 0, 1.0]])
         if _axis_deg(camera, attitude) > MAX_AXIS_DEG:
             raise OptionError(f"attitude: expected a camera that looks at the ground, got {attitude}")
-        rays = _enu_from_camera(camera, attitude) @ np.linalg.inv(camera.matrix) @ sample
+        rays = camera.enu_from_camera(attitude) @ np.linalg.inv(camera.matrix) @ sample
         size = (camera.width_px * fine, camera.height_px * fine)
         return cls(px_from_enu @ rays[:2], -rays[2], rays[:2], nadir_px, camera_m, size)
 
@@ -158,10 +157,5 @@ def stretch(camera: Camera, attitude: Attitude) -> float:
 
 def _axis_deg(camera: Camera, attitude: Attitude) -> float:
     """Angle of the ray through the middle of the picture."""
-    ray = _enu_from_camera(camera, attitude) @ camera.frame_rays[4]
+    ray = camera.enu_from_camera(attitude) @ camera.frame_rays[4]
     return math.degrees(math.atan2(math.hypot(ray[0], ray[1]), -ray[2]))
-
-
-def _enu_from_camera(camera: Camera, attitude: Attitude) -> Array:
-    body = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
-    return np.asarray(body @ camera.mount)
