@@ -335,9 +335,9 @@ class OrthoMap(Georeference):
         xy = np.asarray(xy_px, np.float64)
         if self._surface is None:
             return np.ones(xy.shape[:-1])
-        about = [(0.0, 0.0), *((x, y) for x in (-reach_px, reach_px) for y in (-reach_px, reach_px))]
-        heights = [self.surface_at(xy + np.array(step)) for step in about]
-        return np.asarray(1.0 / (1.0 + (np.ptp(heights, axis=0) / _ROUGH_M) ** 2))
+        about = reach_px * np.array([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
+        heights = self.surface_at(xy[..., None, :] + about)
+        return np.asarray(1.0 / (1.0 + (np.ptp(heights, axis=-1) / _ROUGH_M) ** 2))
 
     @property
     def from_file(self) -> bool:

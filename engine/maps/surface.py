@@ -110,17 +110,13 @@ class SurfaceModel:
             (...,) metres, NaN outside and next to nodata.
         """
         height, width = self._heights_m.shape
-        last = np.array([width - 1.0, height - 1.0])
         at = self._from_map(map_xy)
-        inside = np.asarray(((at >= -0.5) & (at <= last + 0.5)).all(axis=-1))
-        at = np.clip(np.where(inside[..., None], at, 0.0), 0.0, last)
-        low = at.astype(np.intp)
-        (x0, y0), (x1, y1) = np.moveaxis(low, -1, 0), np.moveaxis(np.minimum(low + 1, last.astype(np.intp)), -1, 0)
-        u, v = np.moveaxis(at - low, -1, 0)
+        x0, x1, u, in_x = _neighbours(at[..., 0], width)
+        y0, y1, v, in_y = _neighbours(at[..., 1], height)
         grid = self._heights_m
         top = grid[y0, x0] * (1.0 - u) + grid[y0, x1] * u
         bottom = grid[y1, x0] * (1.0 - u) + grid[y1, x1] * u
-        return np.where(inside, top * (1.0 - v) + bottom * v, np.nan)
+        return np.where(in_x & in_y, top * (1.0 - v) + bottom * v, np.nan)
 
     def ground_plane(self, map_xy: Array, reach_px: float) -> tuple[float, Array] | None:
         """The plane with a fifth of the surface below it in a square about one map pixel (2,).
@@ -149,6 +145,14 @@ class SurfaceModel:
             assert self._decimated is not None  # what is read in tiles comes with it
             return self._decimated.range_m
         return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
+
+
+def _neighbours(at: Array, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, NDArray[np.bool_]]:
+    """Indices before and after places along one axis, the share of the latter, and which places are inside."""
+    inside = (at >= -0.5) & (at <= size - 0.5)
+    at = np.clip(np.where(inside, at, 0.0), 0.0, size - 1.0)
+    low = at.astype(np.intp)
+    return low, np.minimum(low + 1, size - 1), at - low, inside
 
 
 def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:

@@ -95,8 +95,8 @@ def _log10_nfa(
     if votes < 2:
         return math.log10(total * len(TURNS_DEG) * len(SCALES))
     some = slice(None, None, -(-total // _PAIRED))
-    apart = map_px[None, :] - photo_px[some, None] - shift_px
-    near = np.einsum("ijk,ijk->ij", apart, apart) <= radius_px * radius_px
+    apart_x, apart_y = (np.subtract.outer(photo_px[some, k] + shift_px[k], map_px[:, k]) for k in (0, 1))
+    near = apart_x * apart_x + apart_y * apart_y <= radius_px * radius_px
     agree = int(np.count_nonzero(near)) - int(np.count_nonzero(voters[some]))
     extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
     uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])
