@@ -17,11 +17,13 @@ from engine.ncc_fft import match_template, ncc
 from engine.peaks import find_peak
 from engine.scores import enhance
 from engine.values import GridPose, NoFix, Peak, Reason, Window
-from engine.window import level_crop
+from engine.window import SPREAD_SIGMAS, level_crop
 
 Array = NDArray[np.float64]
 
 METHOD = "ncc"
+_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
+_MIN_SIDE_PX = 24  # of what is correlated there
 _GROUND_SHARE = 0.3  # of the height: within this distance of a frame's middle its ground is taken for a plane
 _SPREAD_SIGMAS = 2.0  # and within so many sigmas of the prior, where the position is less certain
 
@@ -206,3 +208,22 @@ class Correlator:
         """The camera's nadir (2,) in map pixels, from where its patch was found."""
         place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
         return self.query.site.full_from_level(place, aligned.level)
+
+
+def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
+    """Expected pixels of the window, by levels above the frame's own; the cost is proportional to them."""
+    site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
+    assert height_m is not None  # asked for before
+    assert query.prior is not None
+    own = query.level_of(height_m)
+    out = {}
+    for coarser in _COARSER:
+        gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
+        per_px = height_m / (camera.focal_px * gsd_m)
+        side_px = options.fraction * min(camera.width_px, camera.height_px) * per_px
+        if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
+            slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
+            width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
+            rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
+            out[coarser] = min(width, columns) * min(height, rows)
+    return out

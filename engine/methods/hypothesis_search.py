@@ -26,7 +26,7 @@ from engine.values import GridPose, NoFix, Peak, Window
 Array = NDArray[np.float64]
 
 
-_MAX_COARSE_PLACES = 4_000_000  # hypotheses times places on the coarse level, unless the template gets too small
+_MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
 _MIN_TEMPLATE_PX = 20
 _CANDIDATES = 8
 _SEMIFINALISTS = 4

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from engine.acceptance import judge_peak, judge_second_look
-from engine.confidence import SECOND_LOOK_MODEL, PeakFeatures, peak_features, prior_agreement, probability
+from engine.confidence import (
+    SECOND_LOOK_MODEL,
+    PeakFeatures,
+    PriorAgreement,
+    peak_features,
+    prior_agreement,
+    probability,
+)
 from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
 from engine.methods import hypothesis_search
-from engine.methods.correlation import METHOD, Aligned, Correlator
+from engine.methods.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.methods.explanation import Explanation, explain_correlation
 from engine.methods.method import Method
 from engine.methods.oblique import is_oblique
@@ -25,15 +33,14 @@ from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
 from engine.scores import enhance
-from engine.values import Attitude, Fix, NoFix, Peak, Reason, Result, Window
-from engine.window import SPREAD_SIGMAS
+from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
-_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
-_MIN_SIDE_PX = 24  # of what is correlated there
 _MAX_CANDIDATES = 4  # of a refused frame
 _SECOND_LOOK = "ncc second look"
+_SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
+_EXPECTED_CHI_SQUARE = 2.0  # of two degrees of freedom
 _TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
 _TURNED_SIGMA_DEG = 2.0  # of the heading then
 _MIN_CONFIDENCE_TURNED = 0.9995
@@ -85,11 +92,11 @@ class Ncc(Method):
         if query.prior is None or not self._trusts(query):
             self.locate(query)  # a search has one variant
             return
-        for coarser in self._expected_window_px(query):
+        for coarser in expected_window_px(query, self.options):
             self.refine(query, self.correlate(query, coarser))
         found = self.find(query)
         if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
-            self._costed_second_look(query, found)
+            self._costed_second_look(query, found, found.fix.window)
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
@@ -110,7 +117,7 @@ class Ncc(Method):
             step = "ncc search" if query.prior is None else "ncc hypotheses"
             works = {0: float(query.site.width_px * query.site.height_px)}
         else:
-            step, works = "ncc", self._expected_window_px(query)
+            step, works = "ncc", expected_window_px(query, self.options)
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
         if coarser is None:
@@ -118,12 +125,12 @@ class Ncc(Method):
         with query.scheduler.costed(step, works[coarser]):
             found = self.find(query, coarser=coarser)
             result = found if isinstance(found, NoFix) else self.judge(query, found)
-        if isinstance(found, PeakCandidate) and isinstance(result, NoFix) and found.features is not None:
-            result = self._look_again(query, found, result)
-            if isinstance(result, NoFix) and try_turns:
-                result = self._look_turned(query, coarser, works[coarser], result)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
-            result = replace(result, candidates=self._candidates(query, found))
+            result = self._look_again(query, found, result)
+            if isinstance(result, NoFix) and try_turns and found.features is not None:
+                result = self._look_turned(query, coarser, works[coarser], result)
+            if isinstance(result, NoFix):
+                result = replace(result, candidates=self._candidates(query, found))
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def refine(self, query: Query, result: Result) -> Result:
@@ -252,34 +259,48 @@ class Ncc(Method):
         return refusal if best is None else best
 
     def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
-        """The fix of the second look at the same window, where that is wanted and affordable, else the refusal."""
-        if not self.options.second_look or not query.scheduler.can_afford(_SECOND_LOOK, _window_px(found)):
+        """The fix of the second look about the same place, if wanted and affordable, else the refusal."""
+        if not self.options.second_look:
             return refusal
-        again = self._costed_second_look(query, found)
+        window = self._looked_at(query, found)
+        if not query.scheduler.can_afford(_SECOND_LOOK, _level_px(window, found.aligned)):
+            return refusal
+        again = self._costed_second_look(query, found, window)
         return refusal if again is None else self.judge_again(query, again)
 
-    def _costed_second_look(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
-        with query.scheduler.costed(_SECOND_LOOK, _window_px(found)), query.scheduler.stage("second look"):
-            return self.find_again(query, found)
+    def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
+        """The window of a second look: the first one's, or of what was searched for the place's surroundings."""
+        if found.features is not None:
+            return found.fix.window
+        place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
+        correlator = Correlator(replace(query, prior=place), self.prepared, self.options)
+        return correlator.window(found.aligned) or found.fix.window
 
-    def find_again(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
+    def _costed_second_look(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
+        work_px = _level_px(window, found.aligned)
+        with query.scheduler.costed(_SECOND_LOOK, work_px), query.scheduler.stage("second look"):
+            return self.find_again(query, found, window)
+
+    def find_again(self, query: Query, found: PeakCandidate, window: Window | None = None) -> PeakCandidate | None:
         """The highest peak of the second look, see :mod:`engine.methods.second_look`.
 
         Args:
             query: the frame.
-            found: at the first look, with features.
+            found: at the first look.
+            window: that is looked at; None takes that of the first look, which the fix names in any case.
         """
-        correlator, window = Correlator(query, self.prepared, self.options), found.fix.window
-        assert query.prior is not None
-        assert query.prior_px is not None
+        correlator, window = Correlator(query, self.prepared, self.options), window or found.fix.window
         looked = second_look(correlator, found.aligned, window)
         if looked is None:
             return None
-        fix = self._fix(correlator, found.aligned, looked.peak, window, searched=False)
-        agreement = prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
-        features = peak_features(looked.peak, looked.chance_sigma, agreement)
+        peak = looked.peak
+        if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
+            elsewhere = found.peak.second_score / found.peak.score * peak.score
+            peak = replace(peak, second_score=max(peak.second_score, elsewhere))
+        fix = self._fix(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
+        features = peak_features(peak, looked.chance_sigma, self._agreement(query, fix))
         fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
-        return PeakCandidate(looked.peak, found.aligned, fix, features, found.searched)
+        return PeakCandidate(peak, found.aligned, fix, features, found.searched)
 
     def judge_again(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where the peak of the second look is accepted, else a refusal."""
@@ -328,10 +349,15 @@ class Ncc(Method):
 
     def _features(self, query: Query, aligned: Aligned, peak: Peak, fix: Fix) -> PeakFeatures:
         """What the confidence model is told of a peak."""
-        assert query.prior is not None
-        assert query.prior_px is not None
-        agreement = prior_agreement(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
-        return peak_features(peak, score_sigma(aligned.template.numel()), agreement)
+        return peak_features(peak, score_sigma(aligned.template.numel()), self._agreement(query, fix))
+
+    def _agreement(self, query: Query, fix: Fix) -> PriorAgreement:
+        """Of a fix with the prior; without one any place of the map is as good as another."""
+        site = query.site
+        if query.prior is None or query.prior_px is None:
+            area_m2 = site.width_px * site.height_px * site.gsd_m_per_px**2
+            return PriorAgreement(_EXPECTED_CHI_SQUARE, math.sqrt(area_m2 / 12.0))
+        return prior_agreement(fix, site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
 
     def _null_score(self, correlator: Correlator, aligned: Aligned, window: Window) -> float:
         """The best score of the null-hypothesis templates: what this window gives to chance."""
@@ -363,27 +389,7 @@ class Ncc(Method):
             map_sigma_m=errors.map_m,
         )
 
-    def _expected_window_px(self, query: Query) -> dict[int, float]:
-        """Expected pixels of the window, by levels above the frame's own; the cost is proportional to them."""
-        site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
-        assert height_m is not None  # asked for before
-        assert query.prior is not None
-        own, options = query.level_of(height_m), self.options
-        out = {}
-        for coarser in _COARSER:
-            gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
-            per_px = height_m / (camera.focal_px * gsd_m)
-            side_px = options.fraction * min(camera.width_px, camera.height_px) * per_px
-            if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
-                slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
-                width, height = (
-                    options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px)
-                )
-                rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
-                out[coarser] = min(width, columns) * min(height, rows)
-        return out
 
-
-def _window_px(found: PeakCandidate) -> float:
-    """Pixels of the window that was searched, on its level."""
-    return float(found.fix.window.area_px >> 2 * found.aligned.level)
+def _level_px(window: Window, aligned: Aligned) -> float:
+    """Pixels of a window on the level that is matched."""
+    return float(window.area_px >> 2 * aligned.level)
