@@ -70,7 +70,7 @@ class Node:
     ) -> None:
         """Subscribe, and call ``every_second`` once a second until shutdown or for ``seconds``."""
         for topic, (msgtype, handler) in handlers.items():
-            limits = {} if not msgtype.endswith("/Image") else {"queue_size": 1, "buff_size": _IMAGE_BUFFER_BYTES}
+            limits = {} if not msgtype.endswith("Image") else {"queue_size": 1, "buff_size": _IMAGE_BUFFER_BYTES}
             self._rospy.Subscriber(topic, find_class(msgtype), handler, tcp_nodelay=True, **limits)
         end_s = None if seconds is None else time.monotonic() + seconds
         while not self._rospy.is_shutdown() and (end_s is None or time.monotonic() < end_s):

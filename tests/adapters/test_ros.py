@@ -10,6 +10,7 @@ import threading
 import time
 from types import ModuleType, SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
@@ -99,6 +100,30 @@ def test_grey_stays_grey(ros, maker, encoding):
     picture[0, 0] ^= 255  # a copy, not the message's own bytes
 
 
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+def test_a_mosaic_becomes_the_colours_that_it_was_made_of(ros, maker, encoding):
+    rgb = np.zeros((8, 12, 3), np.uint8) + np.array([200, 120, 40], np.uint8)
+    mosaic = np.zeros(rgb.shape[:2], np.uint8)
+    for k, colour in enumerate(encoding.removeprefix("bayer_")[:4]):
+        row, column = divmod(k, 2)
+        mosaic[row::2, column::2] = rgb[row::2, column::2, "rgb".index(colour)]
+    rows = [row.tobytes() + b"\x00" * 4 for row in mosaic]
+    picture = image_from_message(wired(ros, raw_image(maker, encoding, rows, 16, 12)))
+    assert np.array_equal(picture, rgb)
+
+
+@pytest.mark.parametrize(("encoding", "big"), [("mono16", False), ("mono16", True), ("16UC1", False)])
+def test_deep_pictures_keep_their_contrast(ros, maker, encoding, big):
+    levels = np.linspace(100, 4095, 30 * 40).astype(np.uint16).reshape(30, 40)  # of a camera of 12 bits
+    rows = [row.astype(">u2" if big else "<u2").tobytes() + b"\x00" * 6 for row in levels]
+    message = raw_image(maker, encoding, rows, 86, 40)
+    message.is_bigendian = int(big)
+    picture = image_from_message(wired(ros, message)).astype(float)
+    assert picture.dtype == float
+    assert picture.max() == 255.0
+    assert np.abs(picture - levels / 4095.0 * 255.0).max() < 2.0
+
+
 @pytest.mark.parametrize(
     "kind", [bytes, bytearray, lambda b: array.array("B", b), lambda b: np.frombuffer(b, np.uint8)]
 )
@@ -111,7 +136,9 @@ def test_bytes_as_rospy_and_rclpy_have_them(maker, kind):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"encoding": "bayer_rggb8"}, "got 'bayer_rggb8'"),
+        ({"encoding": "32FC1"}, "got '32FC1'"),
+        ({"encoding": "bayer_rggb8", "width": 1, "height": 1}, "2 x 2 pixels of a Bayer mosaic"),
+        ({"encoding": "mono16", "width": 10}, "10 x 4 mono16"),
         ({"step": 8}, "rows of 8 bytes"),
         ({"height": 5}, "got 36 bytes"),
         ({"width": 0}, "0 x 4"),
@@ -212,6 +239,13 @@ def a_range(maker, range_m):
                                                (math.nan, None), (-math.inf, None)])  # fmt: skip
 def test_ranges_beyond_reach_are_unknown(maker, range_m, told):
     assert range_from_message(a_range(maker, range_m)) == told
+
+
+def test_a_range_of_any_sensor_says_nothing(maker):
+    """MAVROS' rangefinder states 0 to 1000 m of every sensor, and one of 50 m reports 50 m from 150."""
+    message = a_range(maker, 50.0)
+    message.min_range, message.max_range = 0.0, 1000.0
+    assert range_from_message(message) is None
 
 
 def test_positions_carry_the_worse_axis(ros, maker):
@@ -501,6 +535,64 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
     assert (status.restarts, status.counts.submitted, status.counts.answered) == (1, 3, 3)
 
 
+def a_compressed(maker, time_ns, picture):
+    _, data = cv2.imencode(".png", picture)
+    return maker.make("sensor_msgs/msg/CompressedImage", header=maker.header(time_ns, ""), format="png", data=data)
+
+
+def test_compressed_pictures_are_live_too(ros, maker, sim_site):
+    node, picture = StandIn(maker), np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        handlers = bridge.handlers(RosTopics(image="/camera/image_raw/compressed"))
+        kind, handler = handlers["/camera/image_raw/compressed"]
+        message = wired(ros, a_compressed(maker, NOW_NS, picture))
+        assert message.__msgtype__ == kind
+        handler(message)
+        node.wait_for("pose", 1)
+    assert np.array_equal(seen.frames[0].image, picture)
+
+
+def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
+    node, after_ns = StandIn(maker), NOW_NS + 40_000_000
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        bridge.on_imu(maker.imu(NOW_NS - 60_000_000, "", 0.0, -6.0, 0.0))
+        bridge.on_image(an_image(maker, NOW_NS))
+        assert bridge.status.counts.submitted == 0
+        bridge.on_imu(maker.imu(after_ns, "", 0.0, 4.0, 0.0))
+        node.wait_for("pose", 1)
+        assert seen.frames[0].pitch_deg == pytest.approx(0.0, abs=1e-6)
+        bridge.on_image(an_image(maker, after_ns + 1))  # no attitude follows: it goes on as it is
+        node.wait_for("pose", 2)
+        bridge.on_image(an_image(maker, after_ns + 1_000_000_000))  # attitudes have ended: none is waited for
+        assert bridge.status.counts.submitted == 3
+
+
+def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
+    """A simulator at a tenth of the real speed, and one that runs away."""
+    node, answers = StandIn(maker), threading.Event()
+
+    def slowly(frame):
+        answers.wait(5.0)
+        return a_fix(sim_site)
+
+    bridge = RosBridge(
+        node, sim_site, lambda start: Answers(slowly), RosOptions(), None, LiveOptions(deadline_ms=50)
+    )
+    try:
+        bridge.on_image(an_image(maker, NOW_NS))
+        time.sleep(0.2)
+        answers.set()  # 200 ms here, none there
+        node.wait_for("pose", 1)
+        answers.clear()
+        bridge.on_image(an_image(maker, NOW_NS + 1))
+        node.time_ns = NOW_NS + 60_000_000
+        node.wait_for("diagnostics", 2)
+        answers.set()
+    finally:
+        bridge.close()
+    assert bridge.status.refused == {"late": 1}
+
+
 def test_silence_is_told(maker, sim_site, monkeypatch):
     node = StandIn(maker)
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
@@ -521,6 +613,7 @@ def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
     assert "" not in kinds
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
+    assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
 
 
