@@ -21,6 +21,7 @@ from engine.adapters.ros_out import FIRMWARES, RosOptions, diagnostics, pose, wi
 from engine.adapters.vehicle import NedOrigin, VehicleState
 from engine.camera import Camera
 from engine.cli.app import run as main
+from engine.cli.argument_names import ros_arguments_last
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.formats.ros.messages import (
     NO_POSITION,
@@ -643,8 +644,11 @@ class Rclpy(ModuleType):
         super().__init__("rclpy")
         self.messages, self.published, self.subscribed, self.turns = messages, {}, {}, 0
 
-    def init(self):
-        self.is_ok = True
+    def init(self, args):
+        self.arguments = args
+
+    def declare_parameter(self, name, default):
+        return SimpleNamespace(value={"method": "sift"}.get(name, default))
 
     def ok(self):
         return self.turns < 20
@@ -686,7 +690,9 @@ def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
     monkeypatch.setitem(sys.modules, "rclpy.qos", quality)
     from engine.adapters import ros2
 
-    node = ros2.Node("scenematch")
+    node = ros2.Node("scenematch", ["--ros-args", "-r", "__ns:=/uav1"])
+    assert rclpy.arguments == ["--ros-args", "-r", "__ns:=/uav1"]
+    assert (node.parameter("method", "auto"), node.parameter("start", "")) == ("sift", "")
     assert (ros2.os.environ["ROS_LOCALHOST_ONLY"], ros2.os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]) == (
         "1",
         "LOCALHOST",
@@ -713,8 +719,8 @@ class Rospy(ModuleType):
         self.messages, self.published, self.subscribed, self.named = messages, {}, {}, None
         self.Time = SimpleNamespace(now=lambda: SimpleNamespace(to_nsec=lambda: NOW_NS))
 
-    def init_node(self, name):
-        self.named = name
+    def init_node(self, name, argv):
+        self.named, self.arguments = name, argv
 
     def is_shutdown(self):
         return False
@@ -748,7 +754,8 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     from engine.adapters import ros1
 
-    node = ros1.Node("scenematch")
+    node = ros1.Node("scenematch", ["/a:=/b"])
+    assert rospy.arguments == ["/a:=/b"]
     assert ros1.os.environ["ROS_IP"] == "127.0.0.1"
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
@@ -777,6 +784,31 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
         assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "map.tif")]) == code
         assert told in capsys.readouterr().err
     assert main(["bridge", "ros", "--map", str(tmp_path / "map.tif"), "--firmware", "x"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("typed", "moved"),
+    [
+        (["--ros", "2", "--map", "m"], ["--ros", "2", "--map", "m"]),
+        (["/a:=/b", "--map", "m", "__name:=x"], ["--map", "m", "--", "/a:=/b", "__name:=x"]),
+        (
+            ["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
+            ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"],
+        ),
+    ],
+)
+def test_arguments_of_ros_are_told_apart(typed, moved):
+    assert ros_arguments_last(typed) == moved
+
+
+def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
+    for version, given, told in (
+        ("1", ["--ros-args", "-r", "a:=b"], "expected NAME:=VALUE for ROS 1, got --ros-args -r"),
+        ("2", ["a:=b"], "expected --ros-args -r NAME:=VALUE, got a:=b"),
+        ("1", ["nonsense"], "expected NAME:=VALUE for ROS 1, got nonsense"),
+    ):
+        assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "m.tif"), *given]) == 2
+        assert told in capsys.readouterr().err
 
 
 def test_the_command_line_names_the_topics_of_the_code(capsys):
