@@ -73,11 +73,14 @@ def map_sigma_of(site: OrthoMap) -> float:
 
 
 def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
-    """The errors with the standard deviations that the frame states in place of those assumed of any telemetry."""
+    """The errors with what the frame states in place of what is assumed of any telemetry, and with its lag."""
     stated = {"heading_deg": frame.heading_sigma_deg, "tilt_deg": frame.tilt_sigma_deg}
     if frame.height_sigma_m is not None:
         stated |= {"height_m": frame.height_sigma_m, "height_share": _NO_SHARE}
     known = {name: value for name, value in stated.items() if value is not None}
+    for name, lag_deg in (("tilt_deg", frame.tilt_lag_deg), ("heading_deg", frame.heading_lag_deg)):
+        if lag_deg:
+            known[name] = math.hypot(known.get(name, getattr(errors, name)), lag_deg)
     return replace(errors, **known) if known else errors
 
 

@@ -23,6 +23,7 @@ _log = logging.getLogger("scenematch")
 _JOIN_S = 5.0  # that closing waits for abandoned workers; one that hangs for good is left behind
 _MAX_MS = 60_000.0  # of any wait in flight
 _MAX_DOUBLINGS = 10  # how often the time to create a navigator is doubled at most
+_LOOK_S = 0.02  # how often a clock of another speed is read while a frame is due
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +79,7 @@ class _Job:
     frame: Frame
     prior: Prior | None
     captured_ns: int
+    submitted_s: float  # on time.monotonic, as a worker that hangs does so on this machine's time
     answered: bool = False
 
 
@@ -90,10 +92,11 @@ class Live:
         deliver: takes each answer, one at a time, from one of the engine's threads.
         start: where the flight begins.
         options: settings.
+        clock_ns: on which frames are captured and grow old, such as a simulator's.
 
     Convention:
-        Ages are on ``time.monotonic_ns``. Python cannot stop a thread: one that hangs is left behind, and nothing
-        of it is used any more. A hang that holds Python's lock stops the whole process.
+        Python cannot stop a thread: one that hangs is left behind, and nothing of it is used any more. A hang that
+        holds Python's lock stops the whole process.
     """
 
     def __init__(
@@ -102,9 +105,10 @@ class Live:
         deliver: Callable[[Answer], None],
         start: Prior | None = None,
         options: LiveOptions | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._make_navigator, self._deliver = make_navigator, deliver
-        self._options = options or LiveOptions()
+        self._options, self._clock_ns = options or LiveOptions(), clock_ns
         self._last: tuple[Fix, int] | None = None
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
@@ -131,12 +135,12 @@ class Live:
         Args:
             frame: newer than every frame before it.
             prior: of its position by another source.
-            captured_ns: when it was captured, on ``time.monotonic_ns``; None is now.
+            captured_ns: when it was captured, on the clock of this pipeline; None is now.
 
         Raises:
             StateError: the pipeline was closed.
         """
-        job = _Job(frame, prior, time.monotonic_ns() if captured_ns is None else captured_ns)
+        job = _Job(frame, prior, self._clock_ns() if captured_ns is None else captured_ns, time.monotonic())
         with self._changed:
             if self._closed:
                 raise StateError("submit: expected an open pipeline, got one that was closed")
@@ -215,7 +219,7 @@ class Live:
 
     def _match(self, navigator: Navigator, job: _Job) -> tuple[Result, bool]:
         """The result of one frame, and whether the navigator is still usable."""
-        left_ms = self._options.deadline_ms - _age_ms(job)
+        left_ms = self._options.deadline_ms - self._age_ms(job)
         if left_ms <= 0:
             return _refusal(job, Reason.LATE, "the frame waited until its deadline"), True
         try:
@@ -234,14 +238,17 @@ class Live:
                 if self._closed and self._working is None:
                     return
                 jobs = [job for job in (self._working, self._waiting) if job is not None and not job.answered]
-                due = [job for job in jobs if _age_ms(job) >= self._options.deadline_ms]
+                due = [job for job in jobs if self._age_ms(job) >= self._options.deadline_ms]
                 hangs_in_ms, number = self._hangs_in_ms(), self._number
                 hung = hangs_in_ms <= 0
                 if self._waiting in due:
                     self._waiting = None
                 if not due and not hung:
-                    left_ms = min([hangs_in_ms, *(self._options.deadline_ms - _age_ms(job) for job in jobs)])
-                    self._changed.wait(max(left_ms, 0.0) * 1e-3 if math.isfinite(left_ms) else None)
+                    left_ms = min([hangs_in_ms, *(self._options.deadline_ms - self._age_ms(job) for job in jobs)])
+                    wait_s = max(left_ms, 0.0) * 1e-3 if math.isfinite(left_ms) else None
+                    if wait_s is not None and self._clock_ns is not time.monotonic_ns:
+                        wait_s = min(wait_s, _LOOK_S)
+                    self._changed.wait(wait_s)
                     continue
             for job in due:
                 self._answer(job, _refusal(job, Reason.LATE, "no answer by the deadline"))
@@ -257,12 +264,12 @@ class Live:
             return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_creations, _MAX_DOUBLINGS) - creating_for_ms
         if self._working is None or not self._working.answered:
             return math.inf
-        return deadline_ms + patience_ms - _age_ms(self._working)
+        return deadline_ms + patience_ms - (time.monotonic() - self._working.submitted_s) * 1e3
 
     def _answer(self, job: _Job, result: Result) -> None:
         """Deliver one answer a frame; a fix that came too late becomes a refusal."""
         with self._delivering:
-            age_ms = _age_ms(job)
+            age_ms = self._age_ms(job)
             late = age_ms > self._options.deadline_ms
             with self._changed:
                 if job.answered:
@@ -298,7 +305,7 @@ class Live:
         if last is None:
             return None
         fix, captured_ns = last
-        moved_m = self._options.max_speed_mps * (time.monotonic_ns() - captured_ns) * 1e-9
+        moved_m = self._options.max_speed_mps * max(self._clock_ns() - captured_ns, 0) * 1e-9
         return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + moved_m)
 
     def _count(self, *names: str) -> None:
@@ -310,9 +317,8 @@ class Live:
         with self._changed:
             self._threads = [*(other for other in self._threads if other.is_alive()), thread]
 
-
-def _age_ms(job: _Job) -> float:
-    return (time.monotonic_ns() - job.captured_ns) * 1e-6
+    def _age_ms(self, job: _Job) -> float:
+        return max(self._clock_ns() - job.captured_ns, 0) * 1e-6
 
 
 def _refusal(job: _Job, reason: Reason, detail: str) -> NoFix:

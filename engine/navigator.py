@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.attitude_lag import AttitudeLag
 from engine.budget import Budget
 from engine.covariance import map_sigma_of
 from engine.evidence import (
@@ -109,6 +110,7 @@ class Navigator:
         self._options = o = options or NavigatorOptions()
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
+        self._attitude_lag = AttitudeLag(o.attitude_lag_s, o.attitude_jitter_s)
         self._velocity: VelocityEstimate | None = None  # by the last fixes
         self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
         self._anchor = None if start is None else _Anchor(position_of(start, matcher.site), None)
@@ -166,6 +168,11 @@ class Navigator:
         """How far the map is off by the priors of :meth:`update`; no fix is moved by it. None without priors."""
         return self._map_offset.offset
 
+    @property
+    def attitude_lag_s(self) -> float:
+        """How late the frames' attitude is, as far as fixes measured it."""
+        return self._attitude_lag.mean_s
+
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
 
@@ -183,7 +190,8 @@ class Navigator:
         late = self._odometry.is_late(frame)
         now = self._odometry.sample(frame, self._velocity)
         sources = self._sources(now, prior, late=late)
-        result = self._matcher.locate(self._with_height(frame), sources.prior, budget or self._budget)
+        shown = frame if late else self._attitude_lag.corrected(frame)
+        result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
@@ -194,6 +202,8 @@ class Navigator:
         elif not late and result.reason is not Reason.LATE:
             result = self._add_doubted(result, now, sources, frame.height_agl_m)
         if not late:
+            if isinstance(result, Fix):
+                self._attitude_lag.note(result)
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
                 self._refusals += 1  # a lack of time is no evidence about the position

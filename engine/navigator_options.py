@@ -29,6 +29,8 @@ class NavigatorOptions:
             reckoning leads.
         hold_s: how long dead reckoning by measured velocities may contradict fixes that agree with each other.
         late_s: how much older than the newest frame a frame may be.
+        attitude_lag_s: standard deviation of how late the telemetry's attitude is, while no picture measured it.
+        attitude_jitter_s: of a single frame's lag about its mean.
         healthy_s: age of the last fix up to which the navigator calls itself healthy.
     """
 
@@ -45,6 +47,8 @@ class NavigatorOptions:
     search_every: int = 3
     hold_s: float = 15.0
     late_s: float = 2.0
+    attitude_lag_s: float = 0.1
+    attitude_jitter_s: float = 0.03
     healthy_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -60,5 +64,5 @@ class NavigatorOptions:
         return math.log(self.min_confidence / (1.0 - self.min_confidence))
 
 
-ACCEPT_ALL = NavigatorOptions(gate=1e12, min_confidence=1e-12)
+ACCEPT_ALL = NavigatorOptions(gate=1e12, min_confidence=1e-12, attitude_lag_s=1e-9, attitude_jitter_s=1e-9)
 """Every match is accepted, as by the paper's recipe: the baseline."""

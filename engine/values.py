@@ -64,6 +64,9 @@ class Frame:
         height_sigma_m: standard deviation of the height; None is what the matcher assumes, as of the next two.
         heading_sigma_deg: standard deviation of the heading.
         tilt_sigma_deg: standard deviation of roll and of pitch.
+        tilt_lag_deg: by how much roll and pitch may have changed since they were measured; adds to their
+            standard deviation.
+        heading_lag_deg: the same of the heading.
 
     Raises:
         ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
@@ -82,6 +85,8 @@ class Frame:
     height_sigma_m: float | None = None
     heading_sigma_deg: float | None = None
     tilt_sigma_deg: float | None = None
+    tilt_lag_deg: float | None = None
+    heading_lag_deg: float | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.image.shape)
@@ -97,6 +102,10 @@ class Frame:
             sigma = getattr(self, name)
             if sigma is not None and not 0.0 < sigma <= MAX_SIGMA_M:
                 raise TelemetryError(f"{name}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {sigma}")
+        for name in ("tilt_lag_deg", "heading_lag_deg"):
+            lag_deg = getattr(self, name)
+            if lag_deg is not None and not 0.0 <= lag_deg < math.inf:
+                raise TelemetryError(f"{name}: expected 0 degrees or more, got {lag_deg}")
 
     @property
     def attitude(self) -> Attitude | None:

@@ -6,6 +6,7 @@ published without its covariance; a refusal is published in the diagnostics only
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 import threading
@@ -15,9 +16,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from engine.adapters.ros_out import RosOptions, diagnostics, is_finite, pose, window_picture
 from engine.adapters.vehicle import ANGLES, RecentValues, VehicleState, scalar
-from engine.errors import EngineError
+from engine.errors import EngineError, StateError
 from engine.formats.ros import bags
 from engine.formats.ros.messages import (
     MessageFactory,
@@ -42,6 +46,8 @@ OUTPUTS = {
 """Message type of each topic that is published."""
 
 _RESTART_NS = 1_000_000_000  # a stamp that much older than the last: a simulator or a bag was restarted
+_ATTITUDE_COMES_NS = 300_000_000  # age of the newest attitude up to which another is expected
+_ATTITUDE_WAIT_S = 0.05  # that a picture waits for the attitude after its capture
 _MAX_SILENCE_S = 2.0  # without an image, before the diagnostics report it
 _OK, _WARN, _ERROR = 0, 1, 2
 
@@ -80,10 +86,11 @@ class RosTopics:
     """Names of the topics that the bridge subscribes to; an empty name disables one.
 
     Attributes:
-        image: sensor_msgs/Image.
+        image: sensor_msgs/Image, or CompressedImage where the name ends with ``/compressed``.
         camera_info: sensor_msgs/CameraInfo, used where no calibration file is given.
         imu: sensor_msgs/Imu, whose orientation is the attitude.
-        compass: std_msgs/Float64, degrees clockwise from north; takes precedence over the heading of the Imu.
+        compass: std_msgs/Float64, degrees clockwise from north, for an Imu whose heading has another origin; it
+            has no stamp, and takes precedence.
         height: std_msgs/Float64, metres above take-off.
         range: sensor_msgs/Range along the body's down axis; takes precedence over the height.
         velocity: geometry_msgs/TwistStamped, east and north in m/s.
@@ -92,10 +99,15 @@ class RosTopics:
     image: str = bags.IMAGE
     camera_info: str = bags.CAMERA_INFO
     imu: str = bags.IMU
-    compass: str = bags.COMPASS
+    compass: str = ""
     height: str = bags.HEIGHT
     range: str = bags.RANGE
     velocity: str = bags.VELOCITY
+
+    @property
+    def image_type(self) -> str:
+        """Message type of the images."""
+        return f"sensor_msgs/msg/{'CompressedImage' if self.image.endswith('/compressed') else 'Image'}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +142,12 @@ class RosTelemetry:
         attitude = attitude_from_message(message)
         if attitude is not None:
             self._add(self._attitude, stamp_ns(message), *attitude)
+
+    def waits_for_attitude(self, time_ns: int) -> bool:
+        """Whether the attitude at a ROS time is still to come: it arrives, and its newest is older than that."""
+        with self._lock:
+            last_ns = self._attitude.last_ns
+        return last_ns is not None and last_ns < time_ns <= last_ns + _ATTITUDE_COMES_NS
 
     def compass(self, heading_deg: float, now_ns: int) -> None:
         """Store a heading that has no stamp."""
@@ -207,7 +225,8 @@ class RosBridge:
         self._watch = watch
         self._node, self._site, self._options, self._start = node, site, options, start
         self._make_navigator, self._live_options = make_navigator, live
-        self._live = Live(make_navigator, self.deliver, start, live)
+        self._live = self._start_live()
+        self._held = _Held()
         self._last_ns: int | None = None
         self._last_image_s = time.monotonic()
         self._fixes = self._unusable = self._restarts = 0
@@ -216,6 +235,7 @@ class RosBridge:
 
     def close(self) -> None:
         """Answer the frame in progress and stop."""
+        self._held.drop()
         self._live.close()
 
     @property
@@ -229,8 +249,8 @@ class RosBridge:
         """Type and handler of every topic to subscribe to, by name."""
         telemetry, now_ns = self.telemetry, self._node.now_ns
         handlers: dict[str, tuple[str, Handler]] = {
-            topics.image: ("sensor_msgs/msg/Image", self.on_image),
-            topics.imu: ("sensor_msgs/msg/Imu", telemetry.imu),
+            topics.image: (topics.image_type, self.on_image),
+            topics.imu: ("sensor_msgs/msg/Imu", self.on_imu),
             topics.compass: ("std_msgs/msg/Float64", lambda m: telemetry.compass(m.data, now_ns())),
             topics.height: ("std_msgs/msg/Float64", lambda m: telemetry.height(m.data, now_ns())),
             topics.range: ("sensor_msgs/msg/Range", telemetry.range),
@@ -238,8 +258,13 @@ class RosBridge:
         }
         return {name: handler for name, handler in handlers.items() if name}
 
+    def on_imu(self, message: Any) -> None:
+        """Store an attitude; a picture that waits for it goes on."""
+        self.telemetry.imu(message)
+        self._held.release(lambda captured_ns: not self.telemetry.waits_for_attitude(captured_ns))
+
     def on_image(self, message: Any) -> None:
-        """Submit the newest sensor_msgs/Image; one without a stamp counts as captured now."""
+        """Submit the newest picture, once the attitude of its capture is known; one without a stamp is of now."""
         now_ns = self._node.now_ns()
         captured_ns = stamp_ns(message) or now_ns
         self._last_image_s = time.monotonic()
@@ -249,21 +274,43 @@ class RosBridge:
             self._unusable += 1
             return
         try:
-            frame = self.telemetry.vehicle(captured_ns).frame(image_from_message(message), captured_ns)
+            image = image_from_message(message)
         except EngineError as error:
             self._unusable += 1
             self._diagnose(captured_ns, _ERROR, str(error), {})
             return
         self._last_ns = captured_ns
-        age_ns = max(now_ns - captured_ns, 0)  # a stamp ahead of the clock counts as now
-        self._live.submit(frame, captured_ns=time.monotonic_ns() - age_ns)
+
+        def submit() -> None:
+            self._submit(image, captured_ns, now_ns)
+
+        if self.telemetry.waits_for_attitude(captured_ns):
+            self._held.hold(captured_ns, submit)
+        else:
+            self._held.drop()  # an older picture, which this one overtook
+            submit()
+
+    def _submit(self, image: NDArray[np.uint8], captured_ns: int, arrived_ns: int) -> None:
+        try:
+            frame = self.telemetry.vehicle(captured_ns).frame(image, captured_ns)
+        except EngineError as error:
+            self._unusable += 1
+            self._diagnose(captured_ns, _ERROR, str(error), {})
+            return
+        with contextlib.suppress(StateError):  # closed meanwhile
+            self._live.submit(frame, captured_ns=min(captured_ns, arrived_ns))  # a stamp ahead counts as of now
+
+    def _start_live(self) -> Live:
+        make, options = self._make_navigator, self._live_options
+        return Live(make, self.deliver, self._start, options, self._node.now_ns)
 
     def _restart(self) -> None:
         """Start over, since the time went back: another run of a simulator, or a bag from its beginning."""
+        self._held.drop()
         self._live.close()
         self._counts_before = self.status.counts
         self._restarts += 1
-        self._live = Live(self._make_navigator, self.deliver, self._start, self._live_options)
+        self._live = self._start_live()
         self._last_ns = None
 
     def deliver(self, answer: Answer) -> None:
@@ -307,6 +354,40 @@ class RosBridge:
         self._node.publish(
             "diagnostics", diagnostics(self._node.messages, time_ns, level, text, values | counters)
         )
+
+
+class _Held:
+    """At most one picture that waits for the attitude of its capture, and for no longer than a while."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: tuple[int, Callable[[], None], threading.Timer] | None = None
+
+    def hold(self, captured_ns: int, submit: Callable[[], None]) -> None:
+        """Keep a picture; one that still waited is submitted as it is."""
+        self.release(lambda _: True)
+        timer = threading.Timer(_ATTITUDE_WAIT_S, self.release, [lambda waiting_ns: waiting_ns == captured_ns])
+        timer.daemon = True
+        with self._lock:
+            self._waiting = (captured_ns, submit, timer)
+        timer.start()
+
+    def release(self, may_go: Callable[[int], bool]) -> None:
+        """Submit the picture, where its capture's time passes."""
+        with self._lock:
+            waiting = self._waiting
+            if waiting is None or not may_go(waiting[0]):
+                return
+            self._waiting = None
+        waiting[2].cancel()
+        waiting[1]()
+
+    def drop(self) -> None:
+        """Forget the picture."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, None
+        if waiting is not None:
+            waiting[2].cancel()
 
 
 def find_class(name: str) -> Any:

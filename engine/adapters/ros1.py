@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from engine.adapters.ros import OUTPUTS, Handler, find_class
@@ -21,12 +21,13 @@ class Node:
 
     Args:
         name: name of the node, the prefix of its topics.
+        arguments: NAME:=VALUE for ROS, such as remaps, ``__name`` and ``__ns``.
 
     Raises:
         BackendError: rospy is not installed, or no master answers.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, arguments: Sequence[str] = ()) -> None:
         if not (os.environ.get("ROS_IP") or os.environ.get("ROS_HOSTNAME")):
             os.environ["ROS_IP"] = "127.0.0.1"  # without it rospy listens on every address
         try:
@@ -38,7 +39,7 @@ class Node:
         if not rosgraph.is_master_online():
             raise BackendError(f"bridge: expected a ROS master at {rosgraph.get_master_uri()}, got no answer")
         self._rospy = rospy
-        rospy.init_node(name)
+        rospy.init_node(name, argv=list(arguments))
         self.messages = MessageFactory(find_class, True, genpy.Time, octets=lambda values: values.tobytes())
         self._publishers = {
             output: rospy.Publisher(_topic(output), find_class(kind), queue_size=10, tcp_nodelay=True)
@@ -70,7 +71,7 @@ class Node:
     ) -> None:
         """Subscribe, and call ``every_second`` once a second until shutdown or for ``seconds``."""
         for topic, (msgtype, handler) in handlers.items():
-            limits = {} if not msgtype.endswith("/Image") else {"queue_size": 1, "buff_size": _IMAGE_BUFFER_BYTES}
+            limits = {} if not msgtype.endswith("Image") else {"queue_size": 1, "buff_size": _IMAGE_BUFFER_BYTES}
             self._rospy.Subscriber(topic, find_class(msgtype), handler, tcp_nodelay=True, **limits)
         end_s = None if seconds is None else time.monotonic() + seconds
         while not self._rospy.is_shutdown() and (end_s is None or time.monotonic() < end_s):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import array
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from engine.adapters.ros import OUTPUTS, Handler, find_class
@@ -22,12 +22,13 @@ class Node:
 
     Args:
         name: name of the node, the prefix of its topics.
+        arguments: for ROS, from ``--ros-args`` on: remaps, parameters, a namespace.
 
     Raises:
         BackendError: rclpy is not installed.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, arguments: Sequence[str] = ()) -> None:
         if not any(variable in os.environ for variable in _LOOPBACK):
             os.environ.update(_LOOPBACK)
         try:
@@ -35,7 +36,7 @@ class Node:
             from rclpy.qos import qos_profile_sensor_data
         except ImportError as error:
             raise BackendError(f"bridge: expected rclpy to be importable (see docs/ros.md): {error}") from None
-        rclpy.init()
+        rclpy.init(args=list(arguments))
         self._rclpy, self._qos = rclpy, qos_profile_sensor_data
         self._node = rclpy.create_node(name)
         self.messages = MessageFactory(
@@ -48,6 +49,10 @@ class Node:
             output: self._node.create_publisher(find_class(kind), _topic(output), 10)
             for output, kind in OUTPUTS.items()
         }
+
+    def parameter(self, name: str, default: Any) -> Any:
+        """The value of a ROS parameter of the default's type."""
+        return self._node.declare_parameter(name, default).value
 
     def now_ns(self) -> int:
         """ROS time in nanoseconds, simulated where the node is so configured."""

@@ -8,7 +8,7 @@ import typer
 from typer.main import get_command
 
 from engine.cli import console
-from engine.cli.argument_names import Command, error_as_typed
+from engine.cli.argument_names import Command, error_as_typed, ros_arguments_last
 from engine.cli.commands import (
     bag,
     bridge,
@@ -67,6 +67,8 @@ INTERRUPTED = 130
 
 def run(arguments: list[str]) -> int:
     """Run the command line and return its exit code."""
+    if arguments[:2] == ["bridge", "ros"]:
+        arguments = [*arguments[:2], *ros_arguments_last(arguments[2:])]
     try:
         result = get_command(app).main(args=arguments or ["--help"], prog_name="scenematch", standalone_mode=False)
     except _UsageError as error:

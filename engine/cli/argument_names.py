@@ -34,6 +34,20 @@ def _names(parameter: Any) -> dict[str, str]:
     return {parameter.name: option, option[2:].replace("-", "_"): option}
 
 
+def ros_arguments_last(arguments: list[str]) -> list[str]:
+    """The arguments of `bridge ros`, those of ROS last: NAME:=VALUE, and from `--ros-args` to a `--`."""
+    own, others, in_ros = [], [], False
+    for argument in arguments:
+        if argument == "--ros-args":
+            in_ros = True
+        if in_ros or (":=" in argument and not argument.startswith("-")):
+            others.append(argument)
+        else:
+            own.append(argument)
+        in_ros = in_ros and argument != "--"
+    return [*own, "--", *others] if others else own
+
+
 def as_typed(text: str) -> str:
     """A text for a person with its arguments in backquotes as they were typed."""
     return rename_quoted(text, _typed.get(), quote="")

@@ -41,9 +41,10 @@ class RosSettings:
         camera_pitch_deg: of the camera, -90 looks straight down.
         firmware: for whom the poses are, behind MAVROS: "none", "ardupilot" or "px4".
         origin: of the poses, "LAT,LON"; None is the map's.
+        arguments: for ROS: "NAME:=VALUE" for ROS 1, those from "--ros-args" on for ROS 2.
 
     Raises:
-        OptionError: the topic of the images has no name.
+        OptionError: the topic of the images has no name, or the arguments are not for this ROS.
     """
 
     map: StrPath
@@ -58,8 +59,14 @@ class RosSettings:
     version: int = 1
     firmware: str = "none"
     origin: str | None = None
+    arguments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        wrong = [argument for argument in self.arguments if ":=" not in argument]
+        if self.version == 1 and wrong:
+            raise OptionError(f"ros_arguments: expected NAME:=VALUE for ROS 1, got {' '.join(wrong)}")
+        if self.version == 2 and self.arguments and self.arguments[0] != "--ros-args":
+            raise OptionError(f"ros_arguments: expected --ros-args -r NAME:=VALUE, got {self.arguments[0]}")
         if not self.topics.image:
             raise OptionError("image_topic: expected a name, got nothing")
         self.camera_files()
@@ -84,6 +91,7 @@ def run_ros_bridge(
     ros: RosSettings,
     settings: BridgeSettings | None = None,
     *,
+    node: RosNode | None = None,
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     progress: Progress = SILENT,
 ) -> RosStatus:
@@ -92,6 +100,7 @@ def run_ros_bridge(
     Args:
         ros: what is heard and published.
         settings: how frames are matched; None is the defaults.
+        node: that hears and publishes; None creates one.
         live_view: where the live view goes.
         progress: is shown what the node does.
 
@@ -111,7 +120,7 @@ def run_ros_bridge(
     check_position("start", start, site, OptionError)
     described = ros.camera_files()
     camera = None if ros.camera is None else described.load(None)
-    node = _node(ros.version)
+    node = node or _node(ros.version, ros.arguments)
     camera = camera or described.mounted(_published_camera(node, ros.topics.camera_info, progress))
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
@@ -126,15 +135,15 @@ def run_ros_bridge(
     return bridge.status
 
 
-def _node(version: int) -> RosNode:
+def _node(version: int, arguments: tuple[str, ...]) -> RosNode:
     if version == 1:
         from engine.adapters import ros1
 
-        return ros1.Node("scenematch")
+        return ros1.Node("scenematch", arguments)
     if version == 2:
         from engine.adapters import ros2
 
-        return ros2.Node("scenematch")
+        return ros2.Node("scenematch", arguments)
     raise OptionError(f"version: expected 1 or 2, got {version}")
 
 

@@ -1,4 +1,7 @@
-"""Drapes a map over the ground of the Gazebo world: a mesh with the map as its picture, as model://map_ground."""
+"""Drapes a map over the ground of a Gazebo world: a mesh with the map as its picture, as model://map_ground.
+
+The model's x is east, its y is north. It has a version for Gazebo classic and one for Gazebo Harmonic.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from engine import OrthoMap
 from engine.adapters.vehicle import NedOrigin, north_east_m
 
 MODEL = """<?xml version="1.0"?>
-<sdf version="1.6">
+<sdf version="{sdf}">
   <model name="map_ground">
     <static>true</static>
     <link name="link">
@@ -29,7 +32,7 @@ MODEL = """<?xml version="1.0"?>
           <mesh>
             <uri>model://map_ground/meshes/ground.obj</uri>
           </mesh>
-        </geometry>
+        </geometry>{material}
       </visual>
     </link>
   </model>
@@ -40,9 +43,25 @@ CONFIG = """<?xml version="1.0"?>
   <name>map_ground</name>
   <version>1.0</version>
   <sdf version="1.6">model.sdf</sdf>
+  <sdf version="1.9">model-harmonic.sdf</sdf>
   <description>A map draped over the ground.</description>
 </model>
 """
+# Gazebo Harmonic ignores the mesh's material: the picture shines by itself, as nothing else does.
+GLOWING = """
+        <material>
+          <diffuse>0 0 0 1</diffuse>
+          <specular>0 0 0 1</specular>
+          <emissive>1 1 1 1</emissive>
+          <pbr>
+            <metal>
+              <albedo_map>model://map_ground/materials/textures/map.png</albedo_map>
+              <emissive_map>model://map_ground/materials/textures/map.png</emissive_map>
+              <metalness>0</metalness>
+              <roughness>1</roughness>
+            </metal>
+          </pbr>
+        </material>"""
 # Lit by the ambient light alone, it looks as the photograph does.
 MATERIAL = "newmtl ground\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd ../materials/textures/map.png\n"
 
@@ -92,7 +111,9 @@ def write_ground(map_path: Path, surface: Path | None, models: Path, step_px: in
     Image.fromarray(picture.squeeze()).save(folder / "materials/textures/map.png")
     places, in_picture, shape = vertices(site, step_px)
     extent_m = np.ptp(places[:, :2], axis=0)
-    (folder / "model.sdf").write_text(MODEL.format(width_m=extent_m[0], height_m=extent_m[1]), encoding="utf-8")
+    for name, sdf, material in (("model.sdf", "1.6", ""), ("model-harmonic.sdf", "1.9", GLOWING)):
+        text = MODEL.format(sdf=sdf, width_m=extent_m[0], height_m=extent_m[1], material=material)
+        (folder / name).write_text(text, encoding="utf-8")
     (folder / "model.config").write_text(CONFIG, encoding="utf-8")
     (folder / "meshes/ground.obj").write_text(obj(places, in_picture, shape), encoding="utf-8")
     (folder / "meshes/ground.mtl").write_text(MATERIAL, encoding="utf-8")
@@ -100,7 +121,7 @@ def write_ground(map_path: Path, surface: Path | None, models: Path, step_px: in
 
 
 def main() -> None:
-    """Write the model, and print where SITL has to begin."""
+    """Write the model, and print where the world has its origin, for the launch files and for SITL."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("map", type=Path, help="GeoTIFF of 8 bits")
     parser.add_argument("--surface", type=Path, help="surface model; without it the ground is flat")
@@ -108,7 +129,9 @@ def main() -> None:
     parser.add_argument("--step-px", type=int, default=8, help="of the mesh, in pixels of the map")
     wanted = parser.parse_args()
     site = write_ground(wanted.map, wanted.surface, wanted.models, wanted.step_px)
-    print(f"--custom-location={site.frame.lat_deg:.7f},{site.frame.lon_deg:.7f},0,0")
+    lat_lon = f"{site.frame.lat_deg:.7f},{site.frame.lon_deg:.7f}"
+    print(f"origin:={lat_lon}")
+    print(f"--custom-location={lat_lon},0,0")
 
 
 if __name__ == "__main__":

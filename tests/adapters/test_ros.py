@@ -10,6 +10,7 @@ import threading
 import time
 from types import ModuleType, SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
@@ -20,6 +21,7 @@ from engine.adapters.ros_out import FIRMWARES, RosOptions, diagnostics, pose, wi
 from engine.adapters.vehicle import NedOrigin, VehicleState
 from engine.camera import Camera
 from engine.cli.app import run as main
+from engine.cli.argument_names import ros_arguments_last
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.formats.ros.messages import (
     NO_POSITION,
@@ -99,6 +101,30 @@ def test_grey_stays_grey(ros, maker, encoding):
     picture[0, 0] ^= 255  # a copy, not the message's own bytes
 
 
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+def test_a_mosaic_becomes_the_colours_that_it_was_made_of(ros, maker, encoding):
+    rgb = np.zeros((8, 12, 3), np.uint8) + np.array([200, 120, 40], np.uint8)
+    mosaic = np.zeros(rgb.shape[:2], np.uint8)
+    for k, colour in enumerate(encoding.removeprefix("bayer_")[:4]):
+        row, column = divmod(k, 2)
+        mosaic[row::2, column::2] = rgb[row::2, column::2, "rgb".index(colour)]
+    rows = [row.tobytes() + b"\x00" * 4 for row in mosaic]
+    picture = image_from_message(wired(ros, raw_image(maker, encoding, rows, 16, 12)))
+    assert np.array_equal(picture, rgb)
+
+
+@pytest.mark.parametrize(("encoding", "big"), [("mono16", False), ("mono16", True), ("16UC1", False)])
+def test_deep_pictures_keep_their_contrast(ros, maker, encoding, big):
+    levels = np.linspace(100, 4095, 30 * 40).astype(np.uint16).reshape(30, 40)  # of a camera of 12 bits
+    rows = [row.astype(">u2" if big else "<u2").tobytes() + b"\x00" * 6 for row in levels]
+    message = raw_image(maker, encoding, rows, 86, 40)
+    message.is_bigendian = int(big)
+    picture = image_from_message(wired(ros, message)).astype(float)
+    assert picture.dtype == float
+    assert picture.max() == 255.0
+    assert np.abs(picture - levels / 4095.0 * 255.0).max() < 2.0
+
+
 @pytest.mark.parametrize(
     "kind", [bytes, bytearray, lambda b: array.array("B", b), lambda b: np.frombuffer(b, np.uint8)]
 )
@@ -111,7 +137,9 @@ def test_bytes_as_rospy_and_rclpy_have_them(maker, kind):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"encoding": "bayer_rggb8"}, "got 'bayer_rggb8'"),
+        ({"encoding": "32FC1"}, "got '32FC1'"),
+        ({"encoding": "bayer_rggb8", "width": 1, "height": 1}, "2 x 2 pixels of a Bayer mosaic"),
+        ({"encoding": "mono16", "width": 10}, "10 x 4 mono16"),
         ({"step": 8}, "rows of 8 bytes"),
         ({"height": 5}, "got 36 bytes"),
         ({"width": 0}, "0 x 4"),
@@ -212,6 +240,13 @@ def a_range(maker, range_m):
                                                (math.nan, None), (-math.inf, None)])  # fmt: skip
 def test_ranges_beyond_reach_are_unknown(maker, range_m, told):
     assert range_from_message(a_range(maker, range_m)) == told
+
+
+def test_a_range_of_any_sensor_says_nothing(maker):
+    """MAVROS' rangefinder states 0 to 1000 m of every sensor, and one of 50 m reports 50 m from 150."""
+    message = a_range(maker, 50.0)
+    message.min_range, message.max_range = 0.0, 1000.0
+    assert range_from_message(message) is None
 
 
 def test_positions_carry_the_worse_axis(ros, maker):
@@ -501,6 +536,64 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
     assert (status.restarts, status.counts.submitted, status.counts.answered) == (1, 3, 3)
 
 
+def a_compressed(maker, time_ns, picture):
+    _, data = cv2.imencode(".png", picture)
+    return maker.make("sensor_msgs/msg/CompressedImage", header=maker.header(time_ns, ""), format="png", data=data)
+
+
+def test_compressed_pictures_are_live_too(ros, maker, sim_site):
+    node, picture = StandIn(maker), np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        handlers = bridge.handlers(RosTopics(image="/camera/image_raw/compressed"))
+        kind, handler = handlers["/camera/image_raw/compressed"]
+        message = wired(ros, a_compressed(maker, NOW_NS, picture))
+        assert message.__msgtype__ == kind
+        handler(message)
+        node.wait_for("pose", 1)
+    assert np.array_equal(seen.frames[0].image, picture)
+
+
+def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
+    node, after_ns = StandIn(maker), NOW_NS + 40_000_000
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        bridge.on_imu(maker.imu(NOW_NS - 60_000_000, "", 0.0, -6.0, 0.0))
+        bridge.on_image(an_image(maker, NOW_NS))
+        assert bridge.status.counts.submitted == 0
+        bridge.on_imu(maker.imu(after_ns, "", 0.0, 4.0, 0.0))
+        node.wait_for("pose", 1)
+        assert seen.frames[0].pitch_deg == pytest.approx(0.0, abs=1e-6)
+        bridge.on_image(an_image(maker, after_ns + 1))  # no attitude follows: it goes on as it is
+        node.wait_for("pose", 2)
+        bridge.on_image(an_image(maker, after_ns + 1_000_000_000))  # attitudes have ended: none is waited for
+        assert bridge.status.counts.submitted == 3
+
+
+def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
+    """A simulator at a tenth of the real speed, and one that runs away."""
+    node, answers = StandIn(maker), threading.Event()
+
+    def slowly(frame):
+        answers.wait(5.0)
+        return a_fix(sim_site)
+
+    bridge = RosBridge(
+        node, sim_site, lambda start: Answers(slowly), RosOptions(), None, LiveOptions(deadline_ms=50)
+    )
+    try:
+        bridge.on_image(an_image(maker, NOW_NS))
+        time.sleep(0.2)
+        answers.set()  # 200 ms here, none there
+        node.wait_for("pose", 1)
+        answers.clear()
+        bridge.on_image(an_image(maker, NOW_NS + 1))
+        node.time_ns = NOW_NS + 60_000_000
+        node.wait_for("diagnostics", 2)
+        answers.set()
+    finally:
+        bridge.close()
+    assert bridge.status.refused == {"late": 1}
+
+
 def test_silence_is_told(maker, sim_site, monkeypatch):
     node = StandIn(maker)
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
@@ -521,6 +614,7 @@ def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
     assert "" not in kinds
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
+    assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
 
 
@@ -550,8 +644,11 @@ class Rclpy(ModuleType):
         super().__init__("rclpy")
         self.messages, self.published, self.subscribed, self.turns = messages, {}, {}, 0
 
-    def init(self):
-        self.is_ok = True
+    def init(self, args):
+        self.arguments = args
+
+    def declare_parameter(self, name, default):
+        return SimpleNamespace(value={"method": "sift"}.get(name, default))
 
     def ok(self):
         return self.turns < 20
@@ -593,7 +690,9 @@ def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
     monkeypatch.setitem(sys.modules, "rclpy.qos", quality)
     from engine.adapters import ros2
 
-    node = ros2.Node("scenematch")
+    node = ros2.Node("scenematch", ["--ros-args", "-r", "__ns:=/uav1"])
+    assert rclpy.arguments == ["--ros-args", "-r", "__ns:=/uav1"]
+    assert (node.parameter("method", "auto"), node.parameter("start", "")) == ("sift", "")
     assert (ros2.os.environ["ROS_LOCALHOST_ONLY"], ros2.os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]) == (
         "1",
         "LOCALHOST",
@@ -620,8 +719,8 @@ class Rospy(ModuleType):
         self.messages, self.published, self.subscribed, self.named = messages, {}, {}, None
         self.Time = SimpleNamespace(now=lambda: SimpleNamespace(to_nsec=lambda: NOW_NS))
 
-    def init_node(self, name):
-        self.named = name
+    def init_node(self, name, argv):
+        self.named, self.arguments = name, argv
 
     def is_shutdown(self):
         return False
@@ -655,7 +754,8 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     from engine.adapters import ros1
 
-    node = ros1.Node("scenematch")
+    node = ros1.Node("scenematch", ["/a:=/b"])
+    assert rospy.arguments == ["/a:=/b"]
     assert ros1.os.environ["ROS_IP"] == "127.0.0.1"
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
@@ -684,6 +784,31 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
         assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "map.tif")]) == code
         assert told in capsys.readouterr().err
     assert main(["bridge", "ros", "--map", str(tmp_path / "map.tif"), "--firmware", "x"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("typed", "moved"),
+    [
+        (["--ros", "2", "--map", "m"], ["--ros", "2", "--map", "m"]),
+        (["/a:=/b", "--map", "m", "__name:=x"], ["--map", "m", "--", "/a:=/b", "__name:=x"]),
+        (
+            ["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
+            ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"],
+        ),
+    ],
+)
+def test_arguments_of_ros_are_told_apart(typed, moved):
+    assert ros_arguments_last(typed) == moved
+
+
+def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
+    for version, given, told in (
+        ("1", ["--ros-args", "-r", "a:=b"], "expected NAME:=VALUE for ROS 1, got --ros-args -r"),
+        ("2", ["a:=b"], "expected --ros-args -r NAME:=VALUE, got a:=b"),
+        ("1", ["nonsense"], "expected NAME:=VALUE for ROS 1, got nonsense"),
+    ):
+        assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "m.tif"), *given]) == 2
+        assert told in capsys.readouterr().err
 
 
 def test_the_command_line_names_the_topics_of_the_code(capsys):

@@ -189,6 +189,25 @@ def test_frames_out_of_order_are_refused(tmp_path, maker):
         BagFrames(written(tmp_path / "x.bag", {IMAGE: messages})).stamps_ns()
 
 
+def test_a_picture_that_is_published_again_counts_once(tmp_path, maker):
+    stamps_ns = [10**9, 10**9, 2 * 10**9, 2 * 10**9, 3 * 10**9]
+    pictures = [np.full((4, 6), level, np.uint8) for level in (10, 10, 20, 20, 30)]
+    messages = [(k, maker.image(t, "", p)) for k, (t, p) in enumerate(zip(stamps_ns, pictures, strict=True))]
+    source = BagFrames(written(tmp_path / "x.bag", {IMAGE: messages}))
+    assert source.names == ["0", "2", "4"]
+    assert source.stamps_ns() == [10**9, 2 * 10**9, 3 * 10**9]
+    assert [source.read(name)[0, 0, 0] for name in source.names] == [10, 20, 30]
+
+
+def test_the_heading_with_a_stamp_precedes_the_one_without(tmp_path, maker):
+    imu = [(k, maker.imu(k, "base_link", 0.0, 0.0, 100.0)) for k in (10**9, 2 * 10**9)]
+    compass = [(k, maker.float64(110.0)) for k in (10**9, 2 * 10**9)]
+    one = {"/mavros/imu/data": imu, "/mavros/global_position/compass_hdg": compass}
+    assert read_bag(written(tmp_path / "one.bag", one)).series["heading_deg"].values == pytest.approx(100.0)
+    raw = {"/imu/data": imu, "/mavros/global_position/compass_hdg": compass}
+    assert read_bag(written(tmp_path / "raw.bag", raw)).series["heading_deg"].values == pytest.approx(110.0)
+
+
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
     path = written(tmp_path / "x.bag", {IMAGE: [(10**9, maker.image(10**9, "", np.zeros((4, 6), np.uint8)))]})
     with pytest.raises(TelemetryError, match="attitude, height, velocity or position"):

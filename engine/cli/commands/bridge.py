@@ -155,6 +155,10 @@ def mavlink_params(
 
 def ros(
     map_path: MapOption,
+    ros_arguments: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME:=VALUE", help="Of ROS, also after --ros-args: remaps, parameters."),
+    ] = None,
     version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
@@ -167,7 +171,7 @@ def ros(
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
     image: Annotated[
-        str, typer.Option("--image-topic", metavar="NAME", help="sensor_msgs/Image.")
+        str, typer.Option("--image-topic", metavar="NAME", help="sensor_msgs/Image; CompressedImage by its name.")
     ] = "/camera/image_raw",
     camera_info: Annotated[
         str, typer.Option("--camera-info-topic", metavar="NAME", help="sensor_msgs/CameraInfo.")
@@ -177,7 +181,7 @@ def ros(
     ] = "/mavros/imu/data",
     compass: Annotated[
         str, typer.Option("--compass-topic", metavar="NAME", help="std_msgs/Float64, degrees; outranks the Imu.")
-    ] = "/mavros/global_position/compass_hdg",
+    ] = "",
     height: Annotated[
         str, typer.Option("--height-topic", metavar="NAME", help="std_msgs/Float64, metres above take-off.")
     ] = "/mavros/global_position/rel_alt",
@@ -227,7 +231,7 @@ def ros(
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
         firmware=firmware, origin=origin, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
-        camera_pitch_deg=camera_pitch_deg,
+        camera_pitch_deg=camera_pitch_deg, arguments=tuple(ros_arguments or ()),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)

@@ -63,6 +63,8 @@ def is_bag(path: str | Path) -> bool:
 class BagFrames(FrameSource):
     """The images of one topic of a bag, read forward; going back restarts at the first.
 
+    Of pictures with the same stamp the first counts; names are indices among all of the topic.
+
     Args:
         path: the bag.
         topic: topic of the images; None where there is only one.
@@ -75,16 +77,18 @@ class BagFrames(FrameSource):
         self.path = path
         with _opened(path) as reader:
             self.topic = _image_topic(path, reader, topic)
-            self._stamps_ns = [time_ns for _, time_ns, _ in _messages(path, reader, {self.topic}, _IMAGES)]
-        if not self._stamps_ns:
+            stamps_ns = [time_ns for _, time_ns, _ in _messages(path, reader, {self.topic}, _IMAGES)]
+        if not stamps_ns:
             raise TelemetryError(f"{path}: expected pictures on {self.topic}, got none")
-        self.names = [str(index) for index in range(len(self._stamps_ns))]
+        # Simulators publish a picture again where there is no new one yet.
+        fresh = [k for k in range(len(stamps_ns)) if k == 0 or stamps_ns[k] != stamps_ns[k - 1]]
+        self.names, self._stamps_ns = [str(index) for index in fresh], [stamps_ns[index] for index in fresh]
         self._reset()
 
     @property
     def description(self) -> str:
         """The range of indices, for messages."""
-        return f"an index from 0 to {len(self.names) - 1} of {self.topic}"
+        return f"an index from 0 to {self.names[-1]} of {self.topic}"
 
     def stamps_ns(self) -> list[int]:
         """Capture time of each frame in nanoseconds.
@@ -92,10 +96,10 @@ class BagFrames(FrameSource):
         Raises:
             TelemetryError: a stamp is not later than the one before it.
         """
-        for index, (before, after) in enumerate(itertools.pairwise(self._stamps_ns), start=1):
+        for name, (before, after) in zip(self.names[1:], itertools.pairwise(self._stamps_ns), strict=True):
             if after <= before:
                 raise TelemetryError(
-                    f"{self.path}: {self.topic}: expected frame {index} after {before / 1e9:.6f} s, "
+                    f"{self.path}: {self.topic}: expected frame {name} after {before / 1e9:.6f} s, "
                     f"got {after / 1e9:.6f} s"
                 )
         return list(self._stamps_ns)
@@ -162,7 +166,7 @@ def read_bag(path: Path, *, truth: bool = False) -> FlightLog:
     """Read the telemetry of a bag.
 
     ==========================  ===========================================================================
-    ``.../compass_hdg``         heading_deg; without it that of the Imu
+    ``.../compass_hdg``         heading_deg, unless the same MAVROS' Imu has it with a stamp
     sensor_msgs/Imu             roll_deg, pitch_deg
     sensor_msgs/Range           height along the body's down axis
     ``.../rel_alt``             height above take-off
@@ -188,6 +192,8 @@ def read_bag(path: Path, *, truth: bool = False) -> FlightLog:
             numbers = _TAKEN[names[topic]][1](message)
             if numbers is not None:
                 known[names[topic]].append((time_ns, numbers))
+    if _is_same_mavros(found.get("imu"), found.get("compass")):
+        known.pop("compass", None)
     column = _columns(known)
     (position_ns, lat_deg), (_, lon_deg) = column("place", 0), column("place", 1)
     series: dict[str, TimeSeries | None] = {
@@ -228,6 +234,14 @@ _TRUTH_SUFFIXES = {
     "altitude": (TRUTH_ALTITUDE,),
     "place": (TRUTH,),
 }
+
+
+def _is_same_mavros(imu: str | None, compass: str | None) -> bool:
+    """Whether both topics are of one MAVROS, whose Imu has the same heading, with the time of its measurement."""
+    ends = "/imu/data", "/global_position/compass_hdg"
+    if imu is None or compass is None or not (imu.endswith(ends[0]) and compass.endswith(ends[1])):
+        return False
+    return imu.removesuffix(ends[0]) == compass.removesuffix(ends[1])
 
 
 def _columns(known: dict[str, list[Sample]]) -> Callable[[str, int], tuple[Stamps, Floats]]:

@@ -22,7 +22,14 @@ from engine.errors import CalibrationError, TelemetryError
 from engine.geo import Array, attitude_from_rotation, enu_from_body
 
 CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
-"""Supported encodings of sensor_msgs/Image and their bytes per pixel; 8UC3 and 8UC4 are in BGR order."""
+"""Encodings of sensor_msgs/Image by channels of one byte; 8UC3 and 8UC4 are in BGR order."""
+BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
+"""Encodings of raw colour pictures, and OpenCV's name of each, which begins at its second pixel and row."""
+DEEP = ("mono16", "16UC1")
+"""Encodings of grey pictures with two bytes per pixel."""
+ENCODINGS = (*CHANNELS, *BAYER, *DEEP)
+_WHITE_PERCENTILE = 99.9  # of a deep picture: few pixels are brighter, and the others keep their contrast
+_ANY_SENSOR_M = (0.0, 1000.0)  # that MAVROS' rangefinder states of every sensor, whatever it reaches
 _FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])  # its own inverse
 _NORM_TOLERANCE = 0.01  # of the squared norm of a quaternion
 _COVARIANCE_KNOWN = 3  # NavSatFix.COVARIANCE_TYPE_KNOWN
@@ -48,28 +55,52 @@ def image_from_message(message: Any) -> NDArray[np.uint8]:
         (H, W) grey or (H, W, 3) RGB, uint8.
 
     Raises:
-        TelemetryError: the encoding is not in :data:`CHANNELS`, or there are too few bytes or no valid image.
+        TelemetryError: the encoding is not in :data:`ENCODINGS`, or there are too few bytes or no valid image.
     """
     if not hasattr(message, "encoding"):
         return _decode(bytes(memoryview(message.data)))
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    channels = CHANNELS.get(message.encoding)
+    encoding = message.encoding
+    if encoding in BAYER:
+        return _demosaiced(_pixels(message, 1), BAYER[encoding])
+    if encoding in DEEP:
+        return _of_8_bits(_pixels(message, 2).view(">u2" if message.is_bigendian else "<u2"))
+    channels = CHANNELS.get(encoding)
     if channels is None:
-        raise TelemetryError(f"image: expected an encoding of {', '.join(CHANNELS)}, got {message.encoding!r}")
+        raise TelemetryError(f"image: expected an encoding of {', '.join(ENCODINGS)}, got {encoding!r}")
+    pixels = _pixels(message, channels)
+    if channels == 1:
+        return pixels
+    order = (0, 1, 2) if encoding.startswith("rgb") else (2, 1, 0)
+    return np.ascontiguousarray(pixels.reshape(*pixels.shape[:1], -1, channels)[:, :, order])
+
+
+def _pixels(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
+    """Copy of the rows (H, W * pixel_bytes) without their padding."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
-    row = width * channels
+    row = width * pixel_bytes
     if height < 1 or width < 1 or step < row or data.size < (height - 1) * step + row:
         raise TelemetryError(
             f"image: expected {height} rows of {step} bytes for {width} x {height} {message.encoding}, "
             f"got {data.size} bytes"
         )
     # The last row may lack padding.
-    rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
-    if channels == 1:
-        return rows.copy()
-    pixels = rows.reshape(height, width, channels)
-    order = (0, 1, 2) if message.encoding.startswith("rgb") else (2, 1, 0)
-    return np.ascontiguousarray(pixels[:, :, order])
+    return np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False).copy()
+
+
+def _demosaiced(mosaic: NDArray[np.uint8], pattern: str) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a raw colour picture."""
+    import cv2
+
+    if min(mosaic.shape) < 2:
+        raise TelemetryError(f"image: expected at least 2 x 2 pixels of a Bayer mosaic, got {mosaic.shape}")
+    return np.asarray(cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{pattern}2RGB")), np.uint8)
+
+
+def _of_8_bits(levels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """(H, W) of a picture whose levels fill 10, 12, 14 or 16 bits."""
+    white = max(float(np.percentile(levels, _WHITE_PERCENTILE)), 1.0)
+    return np.asarray(np.clip(levels.astype(np.float32) * (255.0 / white), 0.0, 255.0), np.uint8)
 
 
 def _decode(data: bytes) -> NDArray[np.uint8]:
@@ -122,8 +153,13 @@ def attitude_from_message(message: Any) -> tuple[float, float, float] | None:
 
 
 def range_from_message(message: Any) -> float | None:
-    """Distance in metres along the beam of a sensor_msgs/Range; None outside the range that it states."""
+    """Distance in metres along the beam of a sensor_msgs/Range; None outside the range that it states.
+
+    None also where it states that of any sensor: beyond its reach, a sonar then reports its largest distance.
+    """
     range_m = float(message.range)
+    if (message.min_range, message.max_range) == _ANY_SENSOR_M:
+        return None
     return range_m if range_m > 0.0 and message.min_range <= range_m <= message.max_range else None
 
 

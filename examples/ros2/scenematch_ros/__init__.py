@@ -1,0 +1,1 @@
+"""scenematch as a package of ROS 2."""

@@ -1,0 +1,56 @@
+"""The node: what `scenematch bridge ros --ros 2` is told by options, this is told by ROS parameters."""
+
+import sys
+
+from engine.adapters.ros import RosTopics
+from engine.adapters.ros2 import Node
+from engine.device import set_threads
+from engine.errors import EngineError, OptionError
+from engine.runs.mavlink_bridge import BridgeSettings
+from engine.runs.ros_bridge import RosSettings, run_ros_bridge
+
+FILES = ("map", "surface", "camera", "start", "origin", "mount")
+"""Parameters of text; an empty one is not given."""
+TOPICS = RosTopics()
+
+
+def settings_of(node):
+    """What the parameters say: of ROS, and of the matching."""
+    text = {name: node.parameter(name, "") or None for name in FILES}
+    topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in RosTopics.__slots__}
+    if text["map"] is None:
+        raise OptionError("map: expected a file, got nothing; -p map:=site.tif gives it")
+    map_sigma_m = node.parameter("map_sigma_m", 0.0)
+    ros = RosSettings(
+        map=text["map"],
+        surface=text["surface"],
+        camera=text["camera"],
+        mount=text["mount"],
+        origin=text["origin"],
+        map_sigma_m=map_sigma_m or None,
+        firmware=node.parameter("firmware", "none"),
+        topics=RosTopics(**topics),
+        version=2,
+    )
+    matching = BridgeSettings(
+        method=node.parameter("method", "auto"),
+        device=node.parameter("device", "auto"),
+        deadline_ms=node.parameter("deadline_ms", BridgeSettings().deadline_ms),
+        start=text["start"],
+    )
+    return ros, matching
+
+
+def main():
+    """Run until ROS ends it."""
+    try:
+        node = Node("scenematch", sys.argv)
+        set_threads(node.parameter("threads", 1))
+        ros, matching = settings_of(node)
+        print(run_ros_bridge(ros, matching, node=node))
+    except EngineError as error:
+        sys.exit(f"scenematch: {error}")
+
+
+if __name__ == "__main__":
+    main()
