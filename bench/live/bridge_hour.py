@@ -22,8 +22,9 @@ from bench.live.bridge_minutes import minutes_real
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import machine, paragraph, table
 from engine.adapters.links import Connection
-from engine.adapters.mavlink import MIN_RATE_HZ, MavlinkBridge
+from engine.adapters.mavlink import MavlinkBridge
 from engine.adapters.mavlink_out import MavlinkOptions
+from engine.adapters.mavlink_status import MIN_RATE_HZ
 from engine.adapters.vehicle import NedOrigin
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window

@@ -193,6 +193,33 @@ def command_message(system_id: int, command: int, *values: float) -> Any:
     return mavlink.MAVLink_command_long_message(system_id, AUTOPILOT_COMPONENT, command, 0, *padded)
 
 
+def notice_message(severity: int, text: str) -> Any:
+    """STATUSTEXT, which the autopilot passes on to the ground station."""
+    return mavlink.MAVLink_statustext_message(severity, text.encode("ascii", "replace"))
+
+
+def acknowledgement_message(command: int, *, accepted: bool) -> Any:
+    """COMMAND_ACK."""
+    result = mavlink.MAV_RESULT_ACCEPTED if accepted else mavlink.MAV_RESULT_UNSUPPORTED
+    return mavlink.MAVLink_command_ack_message(command, result)
+
+
+def no_position_message(now_ns: int) -> Any:
+    """ODOMETRY that says: the camera works, and knows no position.
+
+    ArduPilot does not arm unless something has come from its visual odometry within 0.3 s, and on the ground a
+    camera sees nothing. By its quality the message is not used for navigation.
+    """
+    nan = math.nan
+    # Older than any fix: the quickest message counts as the one without delay, and must be a fix.
+    stamp_us = (now_ns - round(MAX_DELAY_MS * 1e6)) // 1000
+    return mavlink.MAVLink_odometry_message(
+        max(stamp_us, 0), mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, *(0.0, 0.0, 0.0),
+        [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, [nan] * 21, [nan] * 21, 0, mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        -1,  # failed
+    )  # fmt: skip
+
+
 def pose_covariance(fix: Fix) -> list[float]:
     """Upper triangle, row by row, of the (6, 6) covariance of north, east, down, roll, pitch and yaw.
 

@@ -30,8 +30,9 @@ from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import with_weights
 
 if TYPE_CHECKING:
-    from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
+    from engine.adapters.mavlink import MavlinkBridge
     from engine.adapters.mavlink_out import MavlinkOptions
+    from engine.adapters.mavlink_status import MavlinkStatus
 
 _MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
@@ -119,6 +120,7 @@ class MavlinkSettings:
         set_origin: give an autopilot without an origin the map's.
         origin_alt_m: height of that origin above sea level; None is the map's ground.
         use_velocity: whether the autopilot's velocity is used between fixes.
+        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
 
     Raises:
         OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
@@ -134,6 +136,7 @@ class MavlinkSettings:
     set_origin: bool = True
     origin_alt_m: float | None = None
     use_velocity: bool = True
+    check_gnss: bool = True
 
     def __post_init__(self) -> None:
         if not self.set_origin:
@@ -246,8 +249,8 @@ def run_mavlink_bridge(
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(),
-                origin=link.origin(site), use_velocity=link.use_velocity, system_id=link.system_id, key=key,
-                watch=watcher,
+                origin=link.origin(site), use_velocity=link.use_velocity, site=site, check_gnss=link.check_gnss,
+                system_id=link.system_id, key=key, watch=watcher,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -309,7 +312,7 @@ def _run(
         now = time.monotonic()
         if now - reported >= _MESSAGE_PERIOD_S:
             reported = now
-            progress.message(_status_line(bridge.status))
+            progress.message(bridge.status.line())
         if seconds is not None and now - begin >= seconds:
             return
     if count == 0:
@@ -332,12 +335,3 @@ def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
     while answered() not in (before, count) and time.monotonic() < until:
         before = answered()
         time.sleep(0.3)
-
-
-def _status_line(status: MavlinkStatus) -> str:
-    from engine.adapters.mavlink import MIN_RATE_HZ
-
-    reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"
-    heard = "autopilot heard" if status.connected else "no autopilot"
-    slow = f" (below {MIN_RATE_HZ:g} Hz an estimator may let go)" if status.rate_hz < MIN_RATE_HZ else ""
-    return f"{heard}; sent {status.sent}, {status.rate_hz:.1f} Hz{slow}; not sent: {reasons}"

@@ -22,7 +22,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.links import parse_connection
-from engine.adapters.mavlink import MIN_RATE_HZ, MavlinkBridge
+from engine.adapters.mavlink import MavlinkBridge
 from engine.adapters.mavlink_in import HANDLED_MESSAGES, AutopilotClock, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
@@ -38,6 +38,7 @@ from engine.adapters.mavlink_out import (
     timesync_message,
     withhold_reason,
 )
+from engine.adapters.mavlink_status import MIN_RATE_HZ
 from engine.adapters.packets import PacketDecoder, PacketEncoder, read_key, signing_time
 from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import replay

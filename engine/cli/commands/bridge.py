@@ -93,6 +93,10 @@ def mavlink(
     use_velocity: Annotated[
         bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is used.")
     ] = True,
+    check_gnss: Annotated[
+        bool,
+        typer.Option("--check-gnss/--no-check-gnss", help="Hold the first fixes against its GNSS receiver."),
+    ] = True,
     method: MethodOption = "auto",
     weights: WeightsOption = None,
     start: StartOption = None,
@@ -122,7 +126,7 @@ def mavlink(
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
         message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
-        use_velocity=use_velocity,
+        use_velocity=use_velocity, check_gnss=check_gnss,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
