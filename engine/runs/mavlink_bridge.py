@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,7 +51,7 @@ class BridgeFiles:
         surface: surface model, a GeoTIFF of heights.
         frames: pictures that are played at their own pace, a folder or a video.
         telemetry: telemetry.csv, whose stamps set that pace.
-        camera_source: number of a camera or URL of a stream, by OpenCV.
+        camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: pace of pictures without stamps; None is 10.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
@@ -96,8 +97,11 @@ class BridgeFiles:
         """What is said of the camera."""
         return CameraFiles(calibration=Path(self.camera), mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
 
-    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage]:
-        """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
+    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage | None]:
+        """Pictures as they are captured, None where a camera gives none for a while.
+
+        Those of a flight that is played begin when ``wait`` returns.
+        """
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)
             return replay(Path(self.frames), telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
@@ -256,7 +260,8 @@ def run_mavlink_bridge(
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
             pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
-            _run(bridge, pictures, camera, settings.seconds, progress)
+            with suppress(KeyboardInterrupt):  # the usual end beside a camera, and no reason to lose the counts
+                _run(bridge, pictures, camera, settings.seconds, progress)
             return bridge.status
 
 
@@ -294,7 +299,7 @@ def _outgoing(firmware: str, message: str, max_sigma_m: float) -> MavlinkOptions
 
 def _run(
     bridge: MavlinkBridge,
-    pictures: Iterator[CapturedImage],
+    pictures: Iterator[CapturedImage | None],
     camera: Camera,
     seconds: float | None,
     progress: Progress,
@@ -302,13 +307,10 @@ def _run(
     """Every picture to the bridge; now and then a line of what it does."""
     begin = reported = time.monotonic()
     count = 0
-    for image, captured_ns in pictures:
-        count += 1
-        try:
-            camera.check_size(image.shape)
-        except CalibrationError as error:
-            raise CalibrationError(f"picture {count}: {error}") from None
-        bridge.submit(image, captured_ns)
+    for picture in pictures:
+        if picture is not None:
+            count += 1
+            _submit(bridge, picture, camera, count)
         now = time.monotonic()
         if now - reported >= _MESSAGE_PERIOD_S:
             reported = now
@@ -318,6 +320,15 @@ def _run(
     if count == 0:
         raise TelemetryError("frames: expected at least one picture, got none")
     _wait_for_answers(lambda: bridge.status.answered, count)
+
+
+def _submit(bridge: MavlinkBridge, picture: CapturedImage, camera: Camera, number: int) -> None:
+    image, captured_ns = picture
+    try:
+        camera.check_size(image.shape)
+    except CalibrationError as error:
+        raise CalibrationError(f"picture {number}: {error}") from None
+    bridge.submit(image, captured_ns)
 
 
 def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress) -> None:
