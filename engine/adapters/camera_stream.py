@@ -103,7 +103,7 @@ class _CommandSource:
             self._process: Any = subprocess.Popen(shlex.split(command), stdout=subprocess.PIPE, bufsize=0)
         except (OSError, ValueError, IndexError) as error:
             raise TelemetryError(f"camera_source: {quoted(command)} cannot be run: {error}") from None
-        self._buffer = bytearray()
+        self._buffer, self._arrived_ns = bytearray(), 0
 
     def read(self) -> tuple[Image, int] | None:
         while True:

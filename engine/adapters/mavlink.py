@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from engine.adapters.fix_velocity import VelocityFromFixes
 from engine.adapters.links import Connection, Link, PeerAddress, parse_connection
 from engine.adapters.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, REQUESTED_RATES_HZ, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     FixReport,
     MavlinkOptions,
-    VelocityFromFixes,
     acknowledgement_message,
     command_message,
     fix_message,
@@ -246,13 +246,17 @@ class MavlinkBridge:
         unix_offset_ns = self.telemetry.unix_offset_ns()
         if unix_offset_ns is None:
             unix_offset_ns = time.time_ns() - time.monotonic_ns()
+        origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
+        if origin is None and self._origin is not None and vehicle.down_m is not None:
+            # Before it has a position an autopilot reports a height above sea level of 0.
+            vehicle = replace(vehicle, alt_amsl_m=self._origin.alt_amsl_m - vehicle.down_m)
         return FixReport(
             fix,
             captured_ns,
             (time.monotonic_ns() - captured_ns) * 1e-6,
-            self.telemetry.vehicle(captured_ns),
-            self.telemetry.origin,
-            self._velocity.add(fix, captured_ns, resets),
+            vehicle,
+            origin,
+            self._velocity.add(fix, captured_ns, resets, vehicle),
             resets % 256,
             captured_ns + unix_offset_ns,
         )
@@ -337,7 +341,8 @@ class MavlinkBridge:
         self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
         # An autopilot with a receiver sets its origin itself, in a better place, when that has a fix.
         waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if self.telemetry.has_receiver else _ORIGIN_TIMEOUT_NS
-        if self._origin is not None and now_ns - self._without_origin_ns > waited_ns:
+        wanted = self._origin is not None and self._options.kind != "gps_input"
+        if self._origin is not None and wanted and now_ns - self._without_origin_ns > waited_ns:
             self._send(set_origin_message(self._system_id, self._origin, now_ns))
 
     def _command(self, command: int, *values: float) -> None:

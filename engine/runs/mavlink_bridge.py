@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from engine.adapters.delay_memory import measured_delay_ms, remember_delay
 from engine.adapters.links import parse_connection
-from engine.adapters.parameters import parameter_file
+from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import CapturedImage, capture, replay
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
+from engine.evidence import position_of
 from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
@@ -29,6 +31,7 @@ from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import with_weights
+from engine.values import Prior
 
 if TYPE_CHECKING:
     from engine.adapters.mavlink import MavlinkBridge
@@ -39,6 +42,7 @@ _MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
 _MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
 _MAX_GRAB_MS = 10_000.0
+_DEFAULT_DELAY_MS = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,6 +129,7 @@ class MavlinkSettings:
         origin_alt_m: height of that origin above sea level; None is the map's ground.
         use_velocity: whether the autopilot's velocity is used between fixes.
         check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
+        gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first.
 
     Raises:
         OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
@@ -141,6 +146,7 @@ class MavlinkSettings:
     origin_alt_m: float | None = None
     use_velocity: bool = True
     check_gnss: bool = True
+    gps_id: int = 0
 
     def __post_init__(self) -> None:
         if not self.set_origin:
@@ -156,14 +162,21 @@ class MavlinkSettings:
         Raises:
             OptionError: the firmware, the message or the accuracy is none that can be.
         """
-        return _outgoing(self.firmware, self.message, self.max_sigma_m)
+        return _outgoing(self.firmware, self.message, self.max_sigma_m, self.gps_id)
 
-    def origin(self, site: OrthoMap) -> NedOrigin | None:
-        """The map's, at the height of its ground where none is given; None where none is to be set."""
+    def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
+        """The start of the flight or else the map's middle; None where none is to be set.
+
+        Its height is that of the ground there, of the map's ground in general, or as it was given.
+        """
         if not self.set_origin:
             return None
-        alt_m = site.ground_m if self.origin_alt_m is None else self.origin_alt_m
-        return NedOrigin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
+        lat_deg, lon_deg, ground_m = site.frame.lat_deg, site.frame.lon_deg, site.ground_m
+        if start is not None:
+            place_m = position_of(start, site).en_m
+            lat_deg, lon_deg = (float(v) for v in site.frame.geodetic_from_enu(*place_m))
+            ground_m = site.ground_at(site.pixel_from_enu(place_m))
+        return NedOrigin(lat_deg, lon_deg, ground_m if self.origin_alt_m is None else self.origin_alt_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,7 +188,7 @@ class BridgeSettings:
         weights: files of the learned method.
         device: where tensors live.
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
-        deadline_ms: age by which a frame is answered.
+        deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
         seconds: ends after this time; None ends with the pictures.
 
     Raises:
@@ -187,7 +200,7 @@ class BridgeSettings:
     weights: tuple[StrPath, ...] = ()
     device: str = "auto"
     start: str | None = None
-    deadline_ms: float = 121.0
+    deadline_ms: float | None = None
     seconds: float | None = None
 
     def __post_init__(self) -> None:
@@ -201,9 +214,9 @@ class BridgeSettings:
         """What of it is the matcher's."""
         return MatcherOptions(learned=with_weights(self.method, self.weights))
 
-    def live_options(self) -> LiveOptions:
-        """The deadlines of the frames."""
-        return LiveOptions(deadline_ms=self.deadline_ms)
+    def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
+        """The deadlines of the frames, with the one that counts where none was set."""
+        return LiveOptions(deadline_ms=deadline_ms if self.deadline_ms is None else self.deadline_ms)
 
 
 def run_mavlink_bridge(
@@ -252,9 +265,9 @@ def run_mavlink_bridge(
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
-                connection, make_navigator, outgoing, start, settings.live_options(),
-                origin=link.origin(site), use_velocity=link.use_velocity, site=site, check_gnss=link.check_gnss,
-                system_id=link.system_id, key=key, watch=watcher,
+                connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
+                origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
+                check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -262,6 +275,8 @@ def run_mavlink_bridge(
             pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
             with suppress(KeyboardInterrupt):  # the usual end beside a camera, and no reason to lose the counts
                 _run(bridge, pictures, camera, settings.seconds, progress)
+            if files.camera_source is not None:
+                remember_delay(bridge.status.least_age_ms)
             return bridge.status
 
 
@@ -270,31 +285,44 @@ def write_parameter_file(
     message: str,
     out: StrPath,
     *,
-    delay_ms: int = 100,
+    takeoff: str = "none",
+    gps_id: int = 0,
+    delay_ms: int | None = None,
     max_sigma_m: float = 10.0,
     force: bool = False,
-) -> None:
+) -> int:
     """Write the parameters that let an autopilot fly by the bridge's fixes.
 
     Args:
         firmware: "ardupilot" or "px4".
         message: that is sent; "" is the firmware's usual one.
         out: the file.
-        delay_ms: from capture to arrival.
+        takeoff: "none" without GNSS, or "gnss", from which ArduPilot is switched over in flight.
+        gps_id: receiver that GPS_INPUT poses as.
+        delay_ms: from capture to arrival; None is what the last bridge with a camera measured, else 100.
         max_sigma_m: of the fixes that are sent.
         force: whether the file may be there already.
+
+    Returns:
+        The delay that was written.
     """
     require("pymavlink", "mavlink")
-    out, outgoing = Path(out), _outgoing(firmware, message, max_sigma_m)
-    text = parameter_file(firmware, outgoing.kind, delay_ms=delay_ms, max_sigma_m=max_sigma_m)
+    out, outgoing = Path(out), _outgoing(firmware, message, max_sigma_m, gps_id)
+    delay_ms = (measured_delay_ms() or _DEFAULT_DELAY_MS) if delay_ms is None else delay_ms
+    options = ParameterOptions(
+        firmware=firmware, message=outgoing.kind, takeoff=takeoff, gps_id=gps_id, delay_ms=delay_ms,
+        max_sigma_m=max_sigma_m,
+    )  # fmt: skip
+    text = parameter_file(options)
     check_file(out, force)
     out.write_text(text, encoding="utf-8")
+    return delay_ms
 
 
-def _outgoing(firmware: str, message: str, max_sigma_m: float) -> MavlinkOptions:
+def _outgoing(firmware: str, message: str, max_sigma_m: float, gps_id: int) -> MavlinkOptions:
     from engine.adapters.mavlink_out import MavlinkOptions
 
-    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
+    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m, gps_id=gps_id)
 
 
 def _run(

@@ -21,15 +21,15 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from engine.adapters.delay_memory import remember_delay
+from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
 from engine.adapters.links import parse_connection
 from engine.adapters.mavlink import MavlinkBridge
 from engine.adapters.mavlink_in import HANDLED_MESSAGES, AutopilotClock, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
     FixReport,
-    GroundVelocity,
     MavlinkOptions,
-    VelocityFromFixes,
     command_message,
     fix_message,
     heartbeat_message,
@@ -40,7 +40,7 @@ from engine.adapters.mavlink_out import (
 )
 from engine.adapters.mavlink_status import MIN_RATE_HZ
 from engine.adapters.packets import PacketDecoder, PacketEncoder, read_key, signing_time
-from engine.adapters.parameters import parameter_file
+from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import replay
 from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
 from engine.cli.app import run as main
@@ -215,6 +215,9 @@ def test_gps_input_carries_velocity_and_accuracies():
     assert (m.vn, m.ve, m.vd) == (-2.5, 1.5, -0.5)
     assert (m.speed_accuracy, m.horiz_accuracy) == pytest.approx((0.7, 0.5))
     assert m.ignore_flags == 0
+    assert (m.hdop, m.satellites_visible) == pytest.approx((0.5, 20))
+    poor = fix_message(sending(fix=fix(sigma_m=4.0)), MavlinkOptions(message="gps_input"))
+    assert (poor.hdop, poor.satellites_visible) == pytest.approx((4.0, 2))  # which no arming check passes
     bare = fix_message(sending(vehicle=VehicleState()), MavlinkOptions(message="gps_input"))
     assert bare.ignore_flags == mavlink.GPS_INPUT_IGNORE_FLAG_ALT | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
 
@@ -250,11 +253,23 @@ def test_options_are_refused_in_one_line(values):
 
 
 def test_velocity_is_that_of_the_last_fixes_and_forgets_at_a_reset():
-    by_fixes = VelocityFromFixes()
-    found = [by_fixes.add(fix(east_m=3.0 * t, north_m=-t), round(t * 1e9), 0) for t in np.arange(1.0, 4.0, 0.2)]
+    by_fixes, still = VelocityFromFixes(), VehicleState()
+    times = np.arange(1.0, 4.0, 0.1)
+    found = [by_fixes.add(fix(east_m=3.0 * t, north_m=-t), round(t * 1e9), 0, still) for t in times]
     assert found[0] is None
     assert (found[-1].east_mps, found[-1].north_mps) == pytest.approx((3.0, -1.0))
-    assert by_fixes.add(fix(east_m=500.0), 4_200_000_000, 1) is None
+    assert found[-1].sigma_mps < 1.0  # what EKF3 asks for before it starts by GPS_INPUT
+    assert by_fixes.add(fix(east_m=500.0), 4_200_000_000, 1, still) is None
+
+
+def test_velocity_holds_at_the_last_fix_while_the_vehicle_brakes():
+    """Its own velocity is wrong by a constant, and only its change is used."""
+    by_fixes = VelocityFromFixes()
+    for t in np.arange(0.0, 3.0, 0.1):
+        own = VehicleState(east_velocity_mps=9.0 - 2.0 * t + 0.7, north_velocity_mps=0.4)
+        found = by_fixes.add(fix(east_m=9.0 * t - t**2), round(1e9 * (1.0 + t)), 0, own)
+    assert (found.east_mps, found.north_mps) == pytest.approx((9.0 - 2.0 * t, 0.0), abs=0.05)
+    assert found.sigma_mps < 0.6
 
 
 # ------------------------------------------------------------------------------------------ what is heard
@@ -513,19 +528,53 @@ def test_loopback_is_listened_on(host):
 # ---------------------------------------------------------------------------------------------- parameters
 
 
+def parameters(**options):
+    """Values by name of a parameter file of ArduPilot."""
+    text = parameter_file(ParameterOptions(firmware="ardupilot", **options))
+    return dict(line.split(",") for line in text.splitlines() if not line.startswith("#"))
+
+
 def test_parameter_files():
-    text = parameter_file("ardupilot", "vision_position_estimate", delay_ms=120, max_sigma_m=10.0)
-    values = dict(line.split(",") for line in text.splitlines() if not line.startswith("#"))
+    values = parameters(message="vision_position_estimate", delay_ms=120)
     assert (values["VISO_TYPE"], values["VISO_DELAY_MS"], values["EK3_SRC1_POSXY"]) == ("1", "120", "6")
-    gps = parameter_file("ardupilot", "gps_input", delay_ms=0, max_sigma_m=10.0)
-    assert "GPS1_TYPE,14\n" in gps
-    px4 = parameter_file("px4", "global_position_sensor", delay_ms=120, max_sigma_m=10.0)
-    rows = [line.split("\t") for line in px4.splitlines() if not line.startswith("#")]
+    assert values["GPS1_TYPE"] == "0"
+    text = parameter_file(ParameterOptions(firmware="px4", message="global_position_sensor", delay_ms=120))
+    rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     assert all(len(row) == 5 and row[:2] == ["1", "1"] and len(row[2]) <= 16 for row in rows)
     assert ["1", "1", "EKF2_AGP0_CTRL", "1", "6"] in rows
-    assert "EKF2_EV_CTRL\t1\t6" in parameter_file("px4", "odometry", delay_ms=0, max_sigma_m=10.0)
+    assert "EKF2_EV_CTRL\t1\t6" in parameter_file(ParameterOptions(firmware="px4", message="odometry"))
     with pytest.raises(OptionError, match="250"):
-        parameter_file("ardupilot", "vision_position_estimate", delay_ms=251, max_sigma_m=10.0)
+        ParameterOptions(firmware="ardupilot", message="vision_position_estimate", delay_ms=251)
+
+
+def test_a_take_off_with_gnss_leaves_the_receiver_in_the_first_source_set_and_a_switch():
+    values = parameters(message="vision_position_estimate", takeoff="gnss")
+    assert (values["EK3_SRC1_POSXY"], values["EK3_SRC2_POSXY"], values["RC7_OPTION"]) == ("3", "6", "90")
+    assert "GPS1_TYPE" not in values
+    assert {"FS_EKF_ACTION", "FS_EKF_THRESH"} <= set(values)
+    with pytest.raises(OptionError, match="takeoff: expected none for px4"):
+        ParameterOptions(firmware="px4", message="odometry", takeoff="gnss")
+
+
+def test_gps_input_stands_beside_a_receiver_as_the_second():
+    values = parameters(message="gps_input", takeoff="gnss", gps_id=1, delay_ms=30)
+    assert (values["GPS2_TYPE"], values["GPS2_DELAY_MS"]) == ("14", "30")
+    assert parameters(message="gps_input", delay_ms=0)["GPS1_DELAY_MS"] == "1"  # 0 would mean 200
+    assert fix_message(sending(), MavlinkOptions(message="gps_input", gps_id=1)).gps_id == 1
+    with pytest.raises(OptionError, match="gps_id: expected 1 or more beside a receiver"):
+        ParameterOptions(firmware="ardupilot", message="gps_input", takeoff="gnss")
+    with pytest.raises(OptionError, match="gps_id: expected with gps_input only"):
+        MavlinkOptions(gps_id=1)
+
+
+def test_the_delay_is_what_the_last_bridge_measured(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    words = ["bridge", "mavlink-params", "--force", "--out", str(tmp_path / "x.param")]
+    assert main(words) == 0
+    assert "100 ms" in capsys.readouterr().err
+    remember_delay(33.4)
+    assert main(words) == 0
+    assert "VISO_DELAY_MS,33\n" in (tmp_path / "x.param").read_text(encoding="utf-8")
 
 
 def test_the_command_line_writes_them_and_refuses_in_one_line(tmp_path, capsys):

@@ -10,6 +10,7 @@ import typer
 
 from engine.cli import console
 from engine.cli.options import (
+    BridgeDeadlineOption,
     CameraOption,
     CameraPitchOption,
     DeadlineOption,
@@ -64,7 +65,8 @@ def mavlink(
         typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless given."),
     ] = None,
     camera_source: Annotated[
-        str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
+        str | None,
+        typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
     ] = None,
     exposure_to_grab_ms: Annotated[
         float | None,
@@ -73,6 +75,9 @@ def mavlink(
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
     max_sigma_m: MaxSigmaOption = 10.0,
+    gps_id: Annotated[
+        int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
+    ] = 0,
     system_id: Annotated[
         int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
     ] = 1,
@@ -101,7 +106,7 @@ def mavlink(
     weights: WeightsOption = None,
     start: StartOption = None,
     device: DeviceOption = "auto",
-    deadline_ms: DeadlineOption = 121.0,
+    deadline_ms: BridgeDeadlineOption = None,
     seconds: SecondsOption = None,
     recording: RerunOption = None,
     viewer: RerunConnectOption = None,
@@ -126,7 +131,7 @@ def mavlink(
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
         message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
-        use_velocity=use_velocity, check_gnss=check_gnss,
+        use_velocity=use_velocity, check_gnss=check_gnss, gps_id=gps_id,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
@@ -141,9 +146,18 @@ def mavlink_params(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, created by this run.")],
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
+    takeoff: Annotated[
+        str, typer.Option("--takeoff", metavar="none|gnss", help="What ArduPilot takes off with.")
+    ] = "none",
+    gps_id: Annotated[
+        int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
+    ] = 0,
     delay_ms: Annotated[
-        int, typer.Option("--delay-ms", metavar="MS", help="From capture to arrival; the bridge prints it.")
-    ] = 100,
+        int | None,
+        typer.Option(
+            "--delay-ms", metavar="MS", help="From capture to arrival; else as the last bridge measured."
+        ),
+    ] = None,
     max_sigma_m: MaxSigmaOption = 10.0,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
 ) -> None:
@@ -153,8 +167,17 @@ def mavlink_params(
     """
     from engine.runs.mavlink_bridge import write_parameter_file
 
-    write_parameter_file(firmware, message, out, delay_ms=delay_ms, max_sigma_m=max_sigma_m, force=force)
-    console.say(f"written to {out}")
+    written_ms = write_parameter_file(
+        firmware,
+        message,
+        out,
+        takeoff=takeoff,
+        gps_id=gps_id,
+        delay_ms=delay_ms,
+        max_sigma_m=max_sigma_m,
+        force=force,
+    )
+    console.say(f"written to {out}, for a delay of {written_ms} ms")
 
 
 def ros(
