@@ -51,7 +51,7 @@ class TrackGuard:
         self._rival: _Place | None = None  # the newest match that contradicted the track
         self._contradictions = self._agreements = 0
         self._distance_m = 0.0
-        self.has_fix = False
+        self.has_fix = False  # whether the autopilot was sent one
 
     @property
     def is_disputed(self) -> bool:
@@ -69,7 +69,7 @@ class TrackGuard:
         self._contradictions = self._agreements = 0
 
     def anchor(self, position: PositionEstimate) -> None:
-        """Take another source's position at the newest frame for the track, until a first fix is trusted."""
+        """Take another source's position at the newest frame for the track, until a first fix is sent."""
         if not self.has_fix:
             self._track = _Place(position, self._now)
 
@@ -105,7 +105,7 @@ class TrackGuard:
             return False
         if isinstance(result, NoFix):
             return False
-        self._track, self._rival, self.has_fix = here, None, True
+        self._track, self._rival = here, None
         return True
 
     def _settle(self, fix: Fix, *, contradicts: bool) -> None:

@@ -38,7 +38,9 @@ class Flight:
         east_mps, north_mps = (SPEED_MPS, 0.0) if velocity else (None, None)
         frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, east_mps, north_mps)
         self.guard.advance(frame, round(self.time_s * 1e9))
-        return self.guard.trusts(result(self.east_m))
+        trusted = self.guard.trusts(result(self.east_m))
+        self.guard.has_fix |= trusted
+        return trusted
 
     def fly(self, seconds, result, *, velocity=True):
         return [self.step(result, velocity=velocity) for _ in range(round(seconds / STEP_S))]

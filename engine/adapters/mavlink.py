@@ -219,13 +219,22 @@ class MavlinkBridge:
             cause = "other firmware"
         if cause is None and not trusted:
             cause = "contradicts the track"
+        if cause is None and self._awaits_receiver():
+            cause = "receiver not heard yet"
         if cause is None and not self._send(fix_message(report, self._options)):
             cause = "link down"
         if cause is None:
+            self._guard.has_fix = True
             self._counters.add_sent(report.age_ms)
         else:
             self._counters.add_withheld(cause)
         return cause
+
+    def _awaits_receiver(self) -> bool:
+        """Whether the first fix waits for what the autopilot says of its receiver, which is asked for."""
+        checked = self._site is not None and self._check_gnss and not self._guard.has_fix
+        recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
+        return checked and recent and self.telemetry.has_receiver is None
 
     def _tell(self, notices: list[Notice]) -> None:
         for severity, text in notices:

@@ -24,8 +24,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from engine.adapters.delay_memory import remember_delay
 from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
 from engine.adapters.links import parse_connection
-from engine.adapters.mavlink import MavlinkBridge
-from engine.adapters.mavlink_in import HANDLED_MESSAGES, AutopilotClock, MavlinkTelemetry
+from engine.adapters.mavlink import CONFIRM_COMMAND, MavlinkBridge
+from engine.adapters.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
     FixReport,
@@ -599,7 +599,7 @@ class Standin:
 
     BOOT_NS = 5_000_000_000
 
-    def __init__(self, port, *, origin=None, key=None, system=1):
+    def __init__(self, port, *, origin=None, key=None, system=1, local=True, receiver=None, flags=None):
         self.mav = autopilot(key, system=system)
         self.parser = mavlink.MAVLink(None)
         self.parser.robust_parsing = True
@@ -607,6 +607,7 @@ class Standin:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.connect(("127.0.0.1", port))
         self.socket.settimeout(0.02)
+        self.local, self.receiver, self.flags, self.armed = local, receiver, flags, False
         self.origin, self.got, self.silent, self.over = origin, [], False, threading.Event()
         self.thread = threading.Thread(target=self.run)
         self.begin_ns = time.monotonic_ns()
@@ -633,10 +634,19 @@ class Standin:
         while not self.over.is_set():
             ms = self.boot_ns() // 1_000_000
             if tick % 10 == 0:
-                self.send(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+                self.send(mavlink.MAVLink_heartbeat_message(2, 3, 128 if self.armed else 0, 0, 4, 3))
                 self.send(mavlink.MAVLink_timesync_message(0, self.boot_ns()))
             self.send(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.5, 0, 0, 0))
-            self.send(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -100.0, 0, 0, 0))
+            if self.local:
+                self.send(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -100.0, 0, 0, 0))
+            if self.receiver is not None:
+                fix_type, lat_1e7, lon_1e7 = self.receiver
+                more = {"h_acc": 1000}
+                self.send(
+                    mavlink.MAVLink_gps_raw_int_message(0, fix_type, lat_1e7, lon_1e7, 0, 0, 0, 0, 0, 9, **more)
+                )
+            if self.flags is not None:
+                self.send(mavlink.MAVLink_ekf_status_report_message(self.flags, 0, 0, 0, 0, 0))
             self.send(mavlink.MAVLink_global_position_int_message(ms, 1, 1, 0, 100_000, 0, 0, 0, 0))
             tick += 1
             self.listen()
@@ -793,6 +803,111 @@ def test_an_origin_that_is_there_is_not_set_again(bridge_to):
     with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 5)
         assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
+
+
+def test_without_a_position_the_height_above_home_is_sent(bridge_to):
+    """ArduPilot has no local position before the first fix, and must get that fix all the same."""
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000), local=False) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 3)
+        assert pilot.of("VISION_POSITION_ESTIMATE")[-1][0].z == pytest.approx(-100.0)
+        pilot.local = True
+
+
+def test_the_height_goes_on_where_the_local_position_ends():
+    """Home is 20 m above the origin, so that 100 m above home is 120 m above the origin."""
+    telemetry = MavlinkTelemetry()
+    for ms in range(0, 3000, 100):
+        now_ns = 10_000_000_000 + ms * 1_000_000
+        if ms < 1000:
+            telemetry.update(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -120.0, 0, 0, 0), now_ns)
+        telemetry.update(mavlink.MAVLink_global_position_int_message(ms, 1, 1, 0, 100_000, 0, 0, 0, 0), now_ns)
+    assert telemetry.vehicle(now_ns).down_m == pytest.approx(-120.0)
+
+
+@pytest.mark.parametrize(("flags", "known"), [(831, True), (831 & ~2, False), (831 | 128, False), (167, False)])
+def test_a_velocity_that_the_estimator_does_not_know_is_none(flags, known):
+    telemetry = MavlinkTelemetry()
+    telemetry.update(mavlink.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0), 10_000_000_000)
+    telemetry.update(mavlink.MAVLink_global_position_int_message(5, 1, 1, 0, 9, 0, 0, 0, 0), 10_000_000_000)
+    assert (telemetry.vehicle(10_000_000_000).east_velocity_mps is not None) == known
+
+
+def test_each_firmware_is_asked_for_what_it_has(bridge_to):
+    made = bridge_to()
+    with Standin(made.port) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("COMMAND_LONG")) >= 8)
+        asked = {
+            m.param1 for m, _ in pilot.of("COMMAND_LONG") if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        }
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE not in asked  # "No ap_message for mavlink id 141"
+    assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in asked
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE in REQUESTED_RATES_HZ["px4"]
+
+
+def test_an_autopilot_whose_receiver_may_still_get_a_fix_sets_its_origin_itself(bridge_to, monkeypatch):
+    monkeypatch.setattr("engine.adapters.mavlink._ORIGIN_TIMEOUT_NS", 300_000_000)
+    made = bridge_to(origin=ORIGIN)
+    with Standin(made.port, receiver=(1, 0, 0)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("TIMESYNC")) > 6)
+        assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
+        pilot.receiver = (0, 0, 0)  # there is none after all
+        fly(made.bridge, lambda: pilot.of("SET_GPS_GLOBAL_ORIGIN"))
+
+
+def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(bridge_to):
+    """ArduPilot's check wants a message of visual odometry in the last 0.3 s; its quality says it is no fix."""
+    made = bridge_to()
+    made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("ODOMETRY")) >= 5)
+        assert {m.quality for m, _ in pilot.of("ODOMETRY")} == {-1}
+        pilot.armed = True
+        fly(made.bridge, lambda: made.bridge.telemetry.armed)
+        before = len(pilot.of("ODOMETRY"))
+        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+        assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
+        assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_the_pilot_is_told_when_fixes_begin_and_stop(bridge_to, monkeypatch):
+    monkeypatch.setattr("engine.adapters.notices._STOPPED_S", 0.3)
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("STATUSTEXT"))
+        made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 2)
+        made.navigator.result = None
+        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 3)
+        texts = [m.text for m, _ in pilot.of("STATUSTEXT")]
+    assert texts[0] == texts[2] == "Scenematch: fixes begin"
+    assert re.fullmatch(r"Scenematch: fixes stopped, \d+ refused: no texture", texts[1])
+
+
+def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(bridge_to):
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+        made.navigator.result = fix(east_m=40.0)
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 10)
+        before = len(pilot.of("VISION_POSITION_ESTIMATE"))
+        assert any(m.text.startswith("Scenematch: map doubted, 40 m off") for m, _ in pilot.of("STATUSTEXT"))
+        station = autopilot(system=255, component=190)  # on the vehicle's link, as an autopilot passes it on
+        number = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+        pilot.socket.send(word.pack(station))
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
+        assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_the_first_fixes_are_held_against_the_receiver(bridge_to):
+    site = SimpleNamespace(frame=LocalFrame(33.64, 72.99))
+    made = bridge_to(site=site)
+    made.navigator.result = fix(east_m=40.0)
+    with Standin(made.port, origin=(336400000, 729900000, 510000), receiver=(3, 336400000, 729900000)) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
+        made.navigator.result = fix(east_m=1.0)
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
 
 
 def test_reset_counter_steps_once_per_relocalisation(bridge_to):
