@@ -82,6 +82,7 @@ class MavlinkBridge:
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
+        on_sent: called with every fix that was sent; must return quickly.
 
     Raises:
         OSError: the link cannot be opened. After that, a link that fails is reopened.
@@ -102,9 +103,10 @@ class MavlinkBridge:
         system_id: int = 1,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
+        on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
         self.telemetry = MavlinkTelemetry()
-        self._watch = watch
+        self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
         self._system_id, self._key = system_id, key
@@ -226,6 +228,8 @@ class MavlinkBridge:
         if cause is None:
             self._guard.has_fix = True
             self._counters.add_sent(report.age_ms)
+            if self._on_sent is not None:
+                self._on_sent(fix)
         else:
             self._counters.add_withheld(cause)
         return cause

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from engine.adapters.delay_memory import measured_delay_ms, remember_delay
+from engine.adapters.delay_memory import remember_delay
 from engine.adapters.links import parse_connection
-from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import CapturedImage, capture, replay
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
@@ -26,11 +25,12 @@ from engine.orthomap import OrthoMap
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
-from engine.runs.folders import StrPath, check_file
+from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import with_weights
+from engine.runs.supervisor import SharedPosition, become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
 
 if TYPE_CHECKING:
@@ -42,7 +42,6 @@ _MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
 _MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
 _MAX_GRAB_MS = 10_000.0
-_DEFAULT_DELAY_MS = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,7 +161,7 @@ class MavlinkSettings:
         Raises:
             OptionError: the firmware, the message or the accuracy is none that can be.
         """
-        return _outgoing(self.firmware, self.message, self.max_sigma_m, self.gps_id)
+        return outgoing_options(self.firmware, self.message, self.max_sigma_m, self.gps_id)
 
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
         """The start of the flight or else the map's middle; None where none is to be set.
@@ -224,6 +223,7 @@ def run_mavlink_bridge(
     link: MavlinkSettings,
     settings: BridgeSettings | None = None,
     *,
+    supervise: bool = False,
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     progress: Progress = SILENT,
 ) -> MavlinkStatus:
@@ -233,6 +233,7 @@ def run_mavlink_bridge(
         files: map, camera and pictures.
         link: the autopilot.
         settings: how frames are matched; None is the defaults.
+        supervise: whether this process stays behind with what is loaded, to replace a worker that is killed.
         live_view: where the live view goes.
         progress: is shown what the bridge does.
 
@@ -261,13 +262,20 @@ def run_mavlink_bridge(
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
+    last_position = SharedPosition()
+    if supervise:
+        check_supervision(matcher.device)
+        become_worker(progress)
+        start = last_position.prior(settings.live_options().max_speed_mps) or start
 
+    end_on_sigterm()
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
                 check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
+                on_sent=last_position.keep,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -280,46 +288,12 @@ def run_mavlink_bridge(
             return bridge.status
 
 
-def write_parameter_file(
-    firmware: str,
-    message: str,
-    out: StrPath,
-    *,
-    takeoff: str = "none",
-    gps_id: int = 0,
-    delay_ms: int | None = None,
-    max_sigma_m: float = 10.0,
-    force: bool = False,
-) -> int:
-    """Write the parameters that let an autopilot fly by the bridge's fixes.
+def outgoing_options(firmware: str, message: str, max_sigma_m: float, gps_id: int) -> MavlinkOptions:
+    """What is sent.
 
-    Args:
-        firmware: "ardupilot" or "px4".
-        message: that is sent; "" is the firmware's usual one.
-        out: the file.
-        takeoff: "none" without GNSS, or "gnss", from which ArduPilot is switched over in flight.
-        gps_id: receiver that GPS_INPUT poses as.
-        delay_ms: from capture to arrival; None is what the last bridge with a camera measured, else 100.
-        max_sigma_m: of the fixes that are sent.
-        force: whether the file may be there already.
-
-    Returns:
-        The delay that was written.
+    Raises:
+        OptionError: the firmware, the message or a number is none that can be.
     """
-    require("pymavlink", "mavlink")
-    out, outgoing = Path(out), _outgoing(firmware, message, max_sigma_m, gps_id)
-    delay_ms = (measured_delay_ms() or _DEFAULT_DELAY_MS) if delay_ms is None else delay_ms
-    options = ParameterOptions(
-        firmware=firmware, message=outgoing.kind, takeoff=takeoff, gps_id=gps_id, delay_ms=delay_ms,
-        max_sigma_m=max_sigma_m,
-    )  # fmt: skip
-    text = parameter_file(options)
-    check_file(out, force)
-    out.write_text(text, encoding="utf-8")
-    return delay_ms
-
-
-def _outgoing(firmware: str, message: str, max_sigma_m: float, gps_id: int) -> MavlinkOptions:
     from engine.adapters.mavlink_out import MavlinkOptions
 
     return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m, gps_id=gps_id)

@@ -108,6 +108,9 @@ def mavlink(
     device: DeviceOption = "auto",
     deadline_ms: BridgeDeadlineOption = None,
     seconds: SecondsOption = None,
+    supervise: Annotated[
+        bool, typer.Option("--supervise", help="Replace a worker that is killed, with all that is loaded.")
+    ] = False,
     recording: RerunOption = None,
     viewer: RerunConnectOption = None,
     threads: ThreadsOption = 1,
@@ -138,7 +141,9 @@ def mavlink(
         seconds=seconds,
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
-    status = run_mavlink_bridge(files, link, settings, live_view=live_view, progress=console.PROGRESS)
+    status = run_mavlink_bridge(
+        files, link, settings, supervise=supervise, live_view=live_view, progress=console.PROGRESS
+    )
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
 
 
@@ -165,7 +170,7 @@ def mavlink_params(
 
     Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
     """
-    from engine.runs.mavlink_bridge import write_parameter_file
+    from engine.runs.mavlink_parameters import write_parameter_file
 
     written_ms = write_parameter_file(
         firmware,
