@@ -35,15 +35,10 @@ except KeyboardInterrupt:
 
 @pytest.fixture
 def supervisor():
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    yield process
-    process.kill()
-    process.wait()
+    there = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True, env=there) as process:
+        yield process
+        process.kill()
 
 
 def test_a_worker_that_is_killed_is_replaced_at_once_and_starts_at_the_last_fix(supervisor):
@@ -56,6 +51,7 @@ def test_a_worker_that_is_killed_is_replaced_at_once_and_starts_at_the_last_fix(
     assert other != pid
     assert position == "123"
     assert float(begun_s) - killed_s < 1.0
+    supervisor.kill()
     os.kill(int(other), signal.SIGKILL)
 
 
