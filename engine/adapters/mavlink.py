@@ -18,7 +18,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.fix_velocity import VelocityFromFixes
 from engine.adapters.links import Connection, Link, PeerAddress, parse_connection
-from engine.adapters.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, REQUESTED_RATES_HZ, MavlinkTelemetry
+from engine.adapters.mavlink_in import (
+    GIMBAL_RATES_HZ,
+    HANDLED_MESSAGES,
+    MAV_AUTOPILOTS,
+    REQUESTED_RATES_HZ,
+    MavlinkTelemetry,
+)
 from engine.adapters.mavlink_out import (
     FixReport,
     MavlinkOptions,
@@ -79,6 +85,7 @@ class MavlinkBridge:
         use_velocity: whether the autopilot's velocity is used for dead reckoning between fixes.
         site: the map; None holds the first fixes against neither the start nor a receiver.
         check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
+        gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None is a fixed one.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
@@ -100,12 +107,16 @@ class MavlinkBridge:
         use_velocity: bool = True,
         site: OrthoMap | None = None,
         check_gnss: bool = True,
+        gimbal_mount: NDArray[np.float64] | None = None,
         system_id: int = 1,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
         on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
-        self.telemetry = MavlinkTelemetry()
+        self.telemetry = MavlinkTelemetry(gimbal_mount)
+        self._rates_hz = REQUESTED_RATES_HZ[options.firmware]
+        if gimbal_mount is not None:
+            self._rates_hz = self._rates_hz | GIMBAL_RATES_HZ[options.firmware]
         self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
@@ -244,8 +255,6 @@ class MavlinkBridge:
         for severity, text in notices:
             self._send(notice_message(severity, text))
 
-    # ---------------------------------------------------------------------------------------------- fixes
-
     def _new_navigator(self, start: Prior | None) -> Navigator:
         """Create a navigator; replacing one counts as a reset, since the new one acquires the position afresh."""
         navigator = self._make_navigator(start)
@@ -273,8 +282,6 @@ class MavlinkBridge:
             resets % 256,
             captured_ns + unix_offset_ns,
         )
-
-    # ----------------------------------------------------------------------------------------------- link
 
     def _read(self) -> None:
         """Loop of the reader thread: handle received packets, answer requests, and reopen a failed link."""
@@ -349,7 +356,7 @@ class MavlinkBridge:
 
     def _request_streams(self, now_ns: int) -> None:
         """Request the telemetry messages and the origin; set an origin where the autopilot has none."""
-        for number, rate_hz in REQUESTED_RATES_HZ[self._options.firmware].items():
+        for number, rate_hz in self._rates_hz.items():
             self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
         self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
         # An autopilot with a receiver sets its origin itself, in a better place, when that has a fix.

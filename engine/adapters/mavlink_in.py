@@ -11,9 +11,13 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from engine.adapters.gimbal import body_behind, from_device, from_mount
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
+from engine.values import Attitude
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 """MAV_AUTOPILOT of each firmware, as its heartbeat states it."""
@@ -25,6 +29,14 @@ _COMMON_RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
 }
+GIMBAL_RATES_HZ = {
+    "ardupilot": {mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50},
+    "px4": {
+        mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50,
+        mavlink.MAVLINK_MSG_ID_MOUNT_ORIENTATION: 50,
+    },
+}
+"""The same of those that only a camera on a gimbal needs."""
 REQUESTED_RATES_HZ = {
     # Each firmware lacks what the other has, and complains to the pilot about every such request.
     "ardupilot": _COMMON_RATES_HZ
@@ -35,6 +47,7 @@ REQUESTED_RATES_HZ = {
 HANDLED_MESSAGES = frozenset(
     {
         *(number for rates in REQUESTED_RATES_HZ.values() for number in rates),
+        *GIMBAL_RATES_HZ["px4"],
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
@@ -118,6 +131,9 @@ class AutopilotClock:
 class MavlinkTelemetry:
     """Recent telemetry of one autopilot. May be read from another thread than the one that updates it.
 
+    Args:
+        gimbal_mount: (3, 3) mount of a camera on a gimbal; None is one that is fixed to the vehicle.
+
     Attributes:
         origin: NED origin of the autopilot; None where it has reported none.
         firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
@@ -127,9 +143,10 @@ class MavlinkTelemetry:
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gimbal_mount: NDArray[np.float64] | None = None) -> None:
         self._lock = threading.Lock()
         self._clock = AutopilotClock()
+        self._gimbal_mount, self._holder = gimbal_mount, RecentValues(ANGLES)
         self._attitude, self._velocity = RecentValues(ANGLES), RecentValues()
         self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
         self._alt_amsl, self._down = RecentValues(), RecentValues()
@@ -180,7 +197,12 @@ class MavlinkTelemetry:
                 height_agl_m=self._height_agl_m(time_ns, roll or 0.0, pitch or 0.0),
                 alt_amsl_m=scalar(self._alt_amsl.at(time_ns)),
                 down_m=self._down_m(time_ns),
+                holder=self._holder_at(time_ns),
             )
+
+    def _holder_at(self, time_ns: int) -> Attitude | None:
+        held = self._holder.at(time_ns)
+        return None if held is None else Attitude(held[0], held[1], held[2] % 360.0 % 360.0)
 
     def _down_m(self, time_ns: int) -> float | None:
         """Distance below the origin; without a position ArduPilot states only the height above home.
@@ -236,7 +258,7 @@ class MavlinkTelemetry:
         self.origin, self._unix_offset_ns, self._stale_stamps = None, None, 0
         self.has_receiver, self.gnss = None, None
         self._has_velocity, self._home_down_m = True, 0.0
-        for series in (self._attitude, self._velocity, self._range, self._clearance, self._relative):
+        for series in (self._holder, self._attitude, self._velocity, self._range, self._clearance, self._relative):
             series.clear()
         self._alt_amsl.clear()
         self._down.clear()
@@ -266,10 +288,24 @@ class MavlinkTelemetry:
             valid = message.min_distance < message.current_distance < message.max_distance
             if message.orientation == _DOWN and valid:
                 self._add_range(time_ns, message.current_distance * 1e-2)
+        elif kind in ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION"):
+            self._add_gimbal(message, time_ns)
         elif kind == "SYSTEM_TIME":
             dated = _UNIX_RANGE_US[0] < message.time_unix_usec < _UNIX_RANGE_US[1]
             if dated and self._unix_offset_ns is None:
                 self._unix_offset_ns = message.time_unix_usec * 1000 - time_ns
+
+    def _add_gimbal(self, message: Any, time_ns: int) -> None:
+        attitude = self._attitude.at(time_ns)
+        if self._gimbal_mount is None or attitude is None:
+            return
+        if message.get_type() == "MOUNT_ORIENTATION":
+            rotation = from_mount(message.roll, message.pitch, message.yaw, attitude[2])
+        else:
+            rotation = from_device(message.q, message.flags, attitude[2])
+        if rotation is not None:
+            held = body_behind(rotation, self._gimbal_mount)
+            self._holder.add(time_ns, held.roll_deg, held.pitch_deg, held.heading_deg)
 
     def _add_range(self, time_ns: int, range_m: float) -> None:
         if range_m > 0.0:

@@ -62,6 +62,7 @@ class BridgeFiles:
         map_crs: of a map that names none.
         mount: how the camera is mounted, by name; None is the calibration's.
         camera_pitch_deg: of the camera, -90 looks straight down.
+        gimbal: whether a gimbal, whose attitude the autopilot reports, turns it from there.
 
     Raises:
         OptionError: a number is out of its range, or an argument does not go with another.
@@ -80,6 +81,7 @@ class BridgeFiles:
     map_crs: str | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
+    gimbal: bool = False
 
     def __post_init__(self) -> None:
         self.camera_files()
@@ -275,7 +277,7 @@ def run_mavlink_bridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
                 check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
-                on_sent=last_position.keep,
+                on_sent=last_position.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None

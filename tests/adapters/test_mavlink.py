@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.quaternion import Quaternion
 
 from engine.adapters.delay_memory import remember_delay
 from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
@@ -43,6 +44,7 @@ from engine.adapters.packets import PacketDecoder, PacketEncoder, read_key, sign
 from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import replay
 from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
+from engine.camera import mount_rotation
 from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
@@ -191,8 +193,6 @@ def test_attitude_is_in_radians_and_the_same_in_both_forms(message):
     if message == "vision_position_estimate":
         assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
     else:
-        from pymavlink.quaternion import Quaternion
-
         assert m.q == pytest.approx(list(Quaternion(angles).q))
 
 
@@ -346,6 +346,28 @@ def test_clock_finds_the_offset_by_timesync_and_without():
     assert abs(by_sync.offset_ns - offset) < 1_000_000
     by_sync.accept_response(12345, 0, 10**11)  # nobody asked
     assert abs(by_sync.offset_ns - offset) < 1_000_000
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 250.0])
+@pytest.mark.parametrize("pitch_deg", [-90.0, -70.0])
+@pytest.mark.parametrize("kind", ["device", "locked", "mount"])
+def test_a_gimbal_turns_the_mount(heading_deg, pitch_deg, kind):
+    """The vehicle rolls by 10 degrees, and a stabilised camera stays where it points, down or 20 degrees ahead."""
+    telemetry, heading = MavlinkTelemetry(mount_rotation("nadir")), math.radians(heading_deg)
+    telemetry.update(mavlink.MAVLink_attitude_message(5, 0.17, 0.0, heading, 0, 0, 0), 10_000_000_000)
+    if kind == "mount":
+        message = mavlink.MAVLink_mount_orientation_message(5, 0.0, pitch_deg, 0.0)
+    else:
+        flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK if kind == "locked" else 32
+        angles = [0.0, math.radians(pitch_deg), heading if kind == "locked" else 0.0]
+        q = [float(v) for v in Quaternion(angles).q]
+        message = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, 5, flags, q, 0, 0, 0, 0)
+    telemetry.update(message, 10_000_000_000)
+    vehicle = telemetry.vehicle(10_000_000_000)
+    frame = vehicle.frame(np.zeros((2, 2), np.uint8), 1)
+    assert (frame.roll_deg, frame.pitch_deg) == pytest.approx((0.0, pitch_deg + 90.0), abs=1e-4)
+    assert math.remainder(frame.heading_deg - heading_deg, 360.0) == pytest.approx(0.0, abs=1e-4)
+    assert vehicle.roll_deg == pytest.approx(math.degrees(0.17))  # that of the messages to the autopilot
 
 
 def test_an_origin_of_zeros_is_none():

@@ -72,6 +72,9 @@ def mavlink(
         float | None,
         typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
     ] = None,
+    gimbal: Annotated[
+        bool, typer.Option("--gimbal", help="The camera hangs on a gimbal that the autopilot reports.")
+    ] = False,
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
     max_sigma_m: MaxSigmaOption = 10.0,
@@ -129,7 +132,7 @@ def mavlink(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
         camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
         map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
-        camera_pitch_deg=camera_pitch_deg,
+        camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
     )  # fmt: skip
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
