@@ -150,6 +150,38 @@ def mavlink(
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
 
 
+def camera_delay(
+    connect: Annotated[
+        str,
+        typer.Option("--connect", metavar="LINK", help="The autopilot, as of bridge mavlink."),
+    ],
+    camera: CameraOption,
+    camera_source: Annotated[
+        str,
+        typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
+    ],
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=5.0, metavar="S", help="How long pictures are taken.")
+    ] = 20.0,
+    listen_anywhere: Annotated[
+        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """How late a camera's pictures arrive.
+
+    Compares the turns that the pictures show with those of the autopilot's attitude, while the vehicle is tilted
+    to and fro by hand. The result is for --exposure-to-grab-ms.
+    """
+    from engine.runs.camera_delay import measure_camera_delay
+
+    found = measure_camera_delay(
+        connect, camera, camera_source, seconds=seconds, listen_anywhere=listen_anywhere, progress=console.PROGRESS
+    )
+    values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
+    console.facts(values, as_json, title=f"camera {camera_source}")
+
+
 def mavlink_params(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, created by this run.")],
     firmware: FirmwareOption = "ardupilot",
