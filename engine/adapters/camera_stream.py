@@ -32,6 +32,7 @@ EXEC = "exec:"
 
 _REOPEN_S = 1.0
 _STALL_S = 2.0  # without a picture, after which the camera is opened again
+_CLOSE_S = 3.0  # that closing waits for a read in progress
 _IDLE_S = 0.5  # without a new picture, after which the caller is woken
 _READ_BYTES = 65536
 _JPEG_BEGIN, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
@@ -52,6 +53,9 @@ class _Source(Protocol):
 
     def read(self) -> tuple[Image, int] | None:
         """The next picture (H, W, 3) RGB and its time of arrival on ``time.monotonic_ns``."""
+
+    def interrupt(self) -> None:
+        """Let a read that blocks return, where that can be done from another thread."""
 
     def close(self) -> None:
         """Release the camera."""
@@ -79,6 +83,9 @@ class _OpenCvSource:
         arrived_ns = time.monotonic_ns()
         good, image = self._camera.retrieve()
         return (_rgb(image), arrived_ns) if good and image is not None else None
+
+    def interrupt(self) -> None:
+        return  # the next picture or the timeout does
 
     def close(self) -> None:
         self._camera.release()
@@ -122,6 +129,9 @@ class _CommandSource:
             self._arrived_ns = time.monotonic_ns()
             self._buffer += data
 
+    def interrupt(self) -> None:
+        self._process.kill()
+
     def close(self) -> None:
         self._process.kill()
         self._process.wait()
@@ -150,7 +160,6 @@ class CameraStream:
         self._last: Image | None = None
         self._arrived_s = time.monotonic()
         self._number = 0  # of the present reader; an older one that still blocks is not listened to
-        self._closed = False
         self._start(self._open())
 
     def next(self, timeout_s: float) -> tuple[Image, int] | None:
@@ -165,17 +174,16 @@ class CameraStream:
         return None
 
     def close(self) -> None:
-        """Stop reading."""
-        with self._changed:
-            self._closed = True
-            self._number += 1
-            self._changed.notify_all()
+        """Stop reading; a process that ends while a thread is within compiled code is aborted."""
+        self._number += 1
+        self._source.interrupt()
+        self._thread.join(_CLOSE_S)
 
     def reopen(self, cause: str) -> None:
         """Abandon the present reader and open the source again."""
         _log.warning("camera %s: %s; opened again", quoted(self._name), cause)
-        with self._changed:
-            self._number += 1
+        self._number += 1
+        self._source.interrupt()
         self._arrived_s = time.monotonic()
         try:
             self._start(self._open())
@@ -200,6 +208,7 @@ class CameraStream:
         return _OpenCvSource(self._name)
 
     def _start(self, source: _Source) -> None:
+        self._source = source
         self._thread = threading.Thread(
             target=self._read, args=(source, self._number), name="scenematch-camera", daemon=True
         )
