@@ -151,7 +151,7 @@ def hour(minutes: float, flood_pieces: int = 20_000) -> dict[str, Any]:
             submitted += 1
             bridge.submit(IMAGE, captured_ns)
             end = time.perf_counter() + 2.0
-            while bridge._counts["answered"] < submitted and time.perf_counter() < end:
+            while bridge.status.answered < submitted and time.perf_counter() < end:
                 time.sleep(0)
             pilot.poll()
 
