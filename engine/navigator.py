@@ -391,7 +391,7 @@ class Navigator:
             apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
             sigma_m = math.hypot(against.sigma_m, fix.relative_sigma_m if against.on_map else fix.sigma_m)
             detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
-            return fix.refused(Reason.INCONSISTENT, detail)
+            return replace(fix.refused(Reason.INCONSISTENT, detail), candidates=(fix,))
         asked = f"{self._options.min_confidence:g} is asked for"
         return fix.refused(Reason.UNCONFIRMED, f"right with a probability of {probability(odds):.4f}, {asked}")
 

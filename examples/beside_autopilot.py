@@ -16,10 +16,11 @@ start = Prior(lat_deg=float(lat), lon_deg=float(lon), sigma_m=15.0)
 origin = NedOrigin(site.frame.lat_deg, site.frame.lon_deg, site.ground_m)  # for an autopilot that has none
 options = MavlinkOptions(firmware=firmware)
 bridge = MavlinkBridge(
-    parse_connection(link), lambda prior: Navigator(matcher, prior), options, start, origin=origin
+    parse_connection(link), lambda prior: Navigator(matcher, prior), options, start, origin=origin, site=site
 )
 with bridge:  # a camera, or without one the flight folder's pictures at their own pace
     pictures = capture(cameras[0]) if cameras else replay(Path("frames"), Path("telemetry.csv"), rate_hz=5.0)
-    for image, captured_ns in pictures:
-        bridge.submit(image, captured_ns)
+    for picture in pictures:
+        if picture is not None:  # a camera had none for a while
+            bridge.submit(*picture)
     print(bridge.status)

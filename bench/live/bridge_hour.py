@@ -22,8 +22,9 @@ from bench.live.bridge_minutes import minutes_real
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import machine, paragraph, table
 from engine.adapters.links import Connection
-from engine.adapters.mavlink import MIN_RATE_HZ, MavlinkBridge
+from engine.adapters.mavlink import MavlinkBridge
 from engine.adapters.mavlink_out import MavlinkOptions
+from engine.adapters.mavlink_status import MIN_RATE_HZ
 from engine.adapters.vehicle import NedOrigin
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
@@ -150,7 +151,7 @@ def hour(minutes: float, flood_pieces: int = 20_000) -> dict[str, Any]:
             submitted += 1
             bridge.submit(IMAGE, captured_ns)
             end = time.perf_counter() + 2.0
-            while bridge._counts["answered"] < submitted and time.perf_counter() < end:
+            while bridge.status.answered < submitted and time.perf_counter() < end:
                 time.sleep(0)
             pilot.poll()
 

@@ -8,33 +8,46 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from engine.adapters.fix_velocity import VelocityFromFixes
 from engine.adapters.links import Connection, Link, PeerAddress, parse_connection
-from engine.adapters.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, REQUESTED_RATES_HZ, MavlinkTelemetry
+from engine.adapters.mavlink_in import (
+    GIMBAL_RATES_HZ,
+    HANDLED_MESSAGES,
+    MAV_AUTOPILOTS,
+    REQUESTED_RATES_HZ,
+    MavlinkTelemetry,
+)
 from engine.adapters.mavlink_out import (
     FixReport,
     MavlinkOptions,
-    VelocityFromFixes,
+    acknowledgement_message,
     command_message,
     fix_message,
     heartbeat_message,
+    no_position_message,
+    notice_message,
     set_origin_message,
     timesync_message,
     withhold_reason,
 )
-from engine.adapters.packets import PacketDecoder, PacketEncoder
+from engine.adapters.mavlink_status import MavlinkCounters, MavlinkStatus
+from engine.adapters.notices import INFO, Notice, PilotNotices
+from engine.adapters.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder
 from engine.adapters.vehicle import NedOrigin
+from engine.evidence import position_of
 from engine.live import Answer, Live, LiveOptions
 from engine.navigator import Navigator
-from engine.values import Fix, NoFix, Prior
+from engine.orthomap import OrthoMap
+from engine.track_guard import TrackGuard
+from engine.values import Fix, Prior
 
 __all__ = [
     "Connection",
@@ -47,41 +60,15 @@ __all__ = [
 
 _log = logging.getLogger("scenematch")
 
-MIN_RATE_HZ = 4.0
-"""Minimum rate of fixes at which ArduPilot's estimator keeps using external navigation."""
+CONFIRM_COMMAND = mavlink.MAV_CMD_USER_1
+"""COMMAND_LONG to the bridge's component by which an operator vouches for the fixes that contradict the track."""
 
 _POLL_S = 0.02
 _SILENCE_NS = 5_000_000_000  # without a heartbeat, after which the vehicle counts as disconnected
 _REOPEN_S = 1.0
 _ORIGIN_TIMEOUT_NS = 3_000_000_000  # after which an origin is set on an autopilot that reports none
-_RATE_SPAN_S = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class MavlinkStatus:
-    """Counters of a bridge since it was opened.
-
-    Attributes:
-        connected: whether the autopilot is heard.
-        answered: number of frames answered.
-        sent: number of fixes sent to the autopilot.
-        withheld: number of fixes not sent, by cause.
-        refused: number of frames without a fix, by reason.
-        rate_hz: rate of the fixes sent in the last 2 seconds.
-        least_age_ms: shortest time from capture to sending; the value for VISO_DELAY_MS.
-        dropped: number of packets that were malformed or wrongly signed.
-        reconnections: number of times the vehicle was heard again after silence or a broken link.
-    """
-
-    connected: bool = False
-    answered: int = 0
-    sent: int = 0
-    withheld: dict[str, int] = field(default_factory=dict)
-    refused: dict[str, int] = field(default_factory=dict)
-    rate_hz: float = 0.0
-    least_age_ms: float | None = None
-    dropped: int = 0
-    reconnections: int = 0
+_ORIGIN_TIMEOUT_GNSS_NS = 60_000_000_000  # the same while its GNSS receiver may still get a first fix
+_GNSS_STALE_NS = 2_000_000_000
 
 
 class MavlinkBridge:
@@ -96,9 +83,13 @@ class MavlinkBridge:
         origin: NED origin to set on an autopilot that reports none; None sets none, so that local positions stay
             unsent.
         use_velocity: whether the autopilot's velocity is used for dead reckoning between fixes.
+        site: the map; None holds the first fixes against neither the start nor a receiver.
+        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
+        gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None is a fixed one.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
+        on_sent: called with every fix that was sent; must return quickly.
 
     Raises:
         OSError: the link cannot be opened. After that, a link that fails is reopened.
@@ -114,25 +105,32 @@ class MavlinkBridge:
         *,
         origin: NedOrigin | None = None,
         use_velocity: bool = True,
+        site: OrthoMap | None = None,
+        check_gnss: bool = True,
+        gimbal_mount: NDArray[np.float64] | None = None,
         system_id: int = 1,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
+        on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
-        self.telemetry = MavlinkTelemetry()
-        self._watch = watch
+        self.telemetry = MavlinkTelemetry(gimbal_mount)
+        self._rates_hz = REQUESTED_RATES_HZ[options.firmware]
+        if gimbal_mount is not None:
+            self._rates_hz = self._rates_hz | GIMBAL_RATES_HZ[options.firmware]
+        self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
         self._system_id, self._key = system_id, key
+        self._site, self._check_gnss = site, check_gnss
+        self._guard = TrackGuard(None if start is None or site is None else position_of(start, site))
+        self._notices = PilotNotices()
         self._encoder = PacketEncoder(system_id, key)
         self._sending = threading.Lock()
         self._navigator: Navigator | None = None
         self._resets_before = 0  # by navigators that have been replaced
         self._velocity = VelocityFromFixes()
-        self._sent_ns: deque[int] = deque(maxlen=256)
-        self._counts: Counter[str] = Counter()
-        self._withheld: Counter[str] = Counter()
-        self._refused: Counter[str] = Counter()
-        self._least_age_ms: float | None = None
+        self._counters = MavlinkCounters()
+        self._confirmed = False  # by an operator, for the next fix
         self._peer: PeerAddress = None
         self._connected_ns = 0  # when the vehicle was heard first, or again
         self._without_origin_ns = 0  # since when the autopilot has reported no origin
@@ -166,17 +164,7 @@ class MavlinkBridge:
     @property
     def status(self) -> MavlinkStatus:
         """Counters since the bridge was opened."""
-        return MavlinkStatus(
-            self.connected,
-            self._counts["answered"],
-            self._counts["sent"],
-            dict(self._withheld),
-            dict(self._refused),
-            self._rate_hz(),
-            self._least_age_ms,
-            self._counts["dropped"] + self._decoder.dropped,
-            self._counts["reconnections"],
-        )
+        return self._counters.status(connected=self.connected, dropped=self._decoder.dropped)
 
     def submit(self, image: NDArray[np.uint8], captured_ns: int) -> None:
         """Submit the newest image; one that still waits is dropped.
@@ -201,26 +189,71 @@ class MavlinkBridge:
             self._watch(answer)
 
     def _count_and_send(self, answer: Answer) -> None:
-        self._counts["answered"] += 1
-        if isinstance(answer.result, NoFix):
-            self._refused[answer.result.reason.value] += 1
+        now_s = time.monotonic()
+        trusted = self._is_trusted(answer, now_s)
+        if isinstance(answer.result, Fix):
+            cause = self._send_fix(answer.result, answer.frame.timestamp_ns or 0, trusted=trusted)
+        else:
+            cause = answer.result.reason.value
+            self._counters.add_refused(cause)
+        if cause is None:
+            self._tell(self._notices.sent(now_s))
             return
-        assert answer.frame.timestamp_ns is not None  # set by submit
-        report = self._compose(answer.result, answer.frame.timestamp_ns)
+        self._notices.not_sent(cause)
+        if self._options.needs_origin and self._options.firmware == "ardupilot" and not self.telemetry.armed:
+            self._send(no_position_message(time.monotonic_ns()))
+
+    def _is_trusted(self, answer: Answer, now_s: float) -> bool:
+        """Whether a fix continues the track that the autopilot was sent, or its GNSS before there is one."""
+        stamp_ns, gnss = answer.frame.timestamp_ns, self.telemetry.gnss
+        assert stamp_ns is not None  # set by submit
+        if self._confirmed:
+            self._guard.confirm()
+            self._confirmed = False
+        self._guard.advance(answer.frame, stamp_ns)
+        if (
+            self._site is not None
+            and self._check_gnss
+            and gnss is not None
+            and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS
+        ):
+            prior = Prior(lat_deg=gnss.lat_deg, lon_deg=gnss.lon_deg, sigma_m=gnss.sigma_m)
+            self._guard.anchor(position_of(prior, self._site))
+        trusted = self._guard.trusts(answer.result)
+        if self._guard.is_disputed:
+            self._tell(self._notices.doubted(self._guard.distance_m, now_s))
+        return trusted
+
+    def _send_fix(self, fix: Fix, captured_ns: int, *, trusted: bool) -> str | None:
+        """Send a fix; returns the cause where it is withheld."""
+        report = self._compose(fix, captured_ns)
         cause = withhold_reason(report, self._options) if self.connected else "no autopilot"
         if cause is None and self.telemetry.firmware != MAV_AUTOPILOTS[self._options.firmware]:
             cause = "other firmware"
-        if cause is not None:
-            self._withheld[cause] += 1
-            return
-        if not self._send(fix_message(report, self._options)):
-            self._withheld["link down"] += 1
-            return
-        self._counts["sent"] += 1
-        self._sent_ns.append(time.monotonic_ns())
-        self._least_age_ms = min(report.age_ms, self._least_age_ms or report.age_ms)
+        if cause is None and not trusted:
+            cause = "contradicts the track"
+        if cause is None and self._awaits_receiver():
+            cause = "receiver not heard yet"
+        if cause is None and not self._send(fix_message(report, self._options)):
+            cause = "link down"
+        if cause is None:
+            self._guard.has_fix = True
+            self._counters.add_sent(report.age_ms)
+            if self._on_sent is not None:
+                self._on_sent(fix)
+        else:
+            self._counters.add_withheld(cause)
+        return cause
 
-    # ---------------------------------------------------------------------------------------------- fixes
+    def _awaits_receiver(self) -> bool:
+        """Whether the first fix waits for what the autopilot says of its receiver, which is asked for."""
+        checked = self._site is not None and self._check_gnss and not self._guard.has_fix
+        recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
+        return checked and recent and self.telemetry.has_receiver is None
+
+    def _tell(self, notices: list[Notice]) -> None:
+        for severity, text in notices:
+            self._send(notice_message(severity, text))
 
     def _new_navigator(self, start: Prior | None) -> Navigator:
         """Create a navigator; replacing one counts as a reset, since the new one acquires the position afresh."""
@@ -235,22 +268,20 @@ class MavlinkBridge:
         unix_offset_ns = self.telemetry.unix_offset_ns()
         if unix_offset_ns is None:
             unix_offset_ns = time.time_ns() - time.monotonic_ns()
+        origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
+        if origin is None and self._origin is not None and vehicle.down_m is not None:
+            # Before it has a position an autopilot reports a height above sea level of 0.
+            vehicle = replace(vehicle, alt_amsl_m=self._origin.alt_amsl_m - vehicle.down_m)
         return FixReport(
             fix,
             captured_ns,
             (time.monotonic_ns() - captured_ns) * 1e-6,
-            self.telemetry.vehicle(captured_ns),
-            self.telemetry.origin,
-            self._velocity.add(fix, captured_ns, resets),
+            vehicle,
+            origin,
+            self._velocity.add(fix, captured_ns, resets, vehicle),
             resets % 256,
             captured_ns + unix_offset_ns,
         )
-
-    def _rate_hz(self) -> float:
-        since_ns = time.monotonic_ns() - round(_RATE_SPAN_S * 1e9)
-        return sum(sent >= since_ns for sent in list(self._sent_ns)) / _RATE_SPAN_S
-
-    # ----------------------------------------------------------------------------------------------- link
 
     def _read(self) -> None:
         """Loop of the reader thread: handle received packets, answer requests, and reopen a failed link."""
@@ -283,13 +314,26 @@ class MavlinkBridge:
                     self._on_connected(now_ns)
             if sender != self._peer:
                 continue  # only a heartbeat identifies the vehicle
+            if message.get_type() == "COMMAND_LONG":
+                self._obey(message)
+                continue
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 self._send(timesync_message(time.monotonic_ns(), message.ts1))
             self.telemetry.update(message, now_ns)
 
+    def _obey(self, message: Any) -> None:
+        """An operator's command to this component: to trust the fixes that contradict the track."""
+        if (message.target_system, message.target_component) != (self._system_id, BRIDGE_COMPONENT):
+            return
+        accepted = message.command == CONFIRM_COMMAND
+        if accepted:
+            self._confirmed = True
+            self._tell([(INFO, "Scenematch: position confirmed")])
+        self._send(acknowledgement_message(message.command, accepted=accepted))
+
     def _on_connected(self, now_ns: int) -> None:
         """Start over with a vehicle that is heard for the first time, or again."""
-        self._counts["reconnections"] += self._connected_ns != 0
+        self._counters.reconnections += self._connected_ns != 0
         self._connected_ns = self._without_origin_ns = now_ns
         self._last_done_ns["request"] = self._last_done_ns["timesync"] = 0
         self.telemetry.reset()
@@ -301,6 +345,7 @@ class MavlinkBridge:
             self._send(heartbeat_message())
         if not self.connected:
             return
+        self._tell(self._notices.due(now_ns * 1e-9))
         if self._is_due("timesync", now_ns, 0.5):
             self.telemetry.add_timesync_request(now_ns)
             self._send(timesync_message(now_ns))
@@ -311,10 +356,13 @@ class MavlinkBridge:
 
     def _request_streams(self, now_ns: int) -> None:
         """Request the telemetry messages and the origin; set an origin where the autopilot has none."""
-        for number, rate_hz in REQUESTED_RATES_HZ.items():
+        for number, rate_hz in self._rates_hz.items():
             self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
         self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        if self._origin is not None and now_ns - self._without_origin_ns > _ORIGIN_TIMEOUT_NS:
+        # An autopilot with a receiver sets its origin itself, in a better place, when that has a fix.
+        waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if self.telemetry.has_receiver else _ORIGIN_TIMEOUT_NS
+        wanted = self._origin is not None and self._options.kind != "gps_input"
+        if self._origin is not None and wanted and now_ns - self._without_origin_ns > waited_ns:
             self._send(set_origin_message(self._system_id, self._origin, now_ns))
 
     def _command(self, command: int, *values: float) -> None:
@@ -339,13 +387,14 @@ class MavlinkBridge:
             return True
 
     def _new_decoder(self, link: Link) -> PacketDecoder:
-        return PacketDecoder(self._system_id, HANDLED_MESSAGES, is_stream=link.is_stream, key=self._key)
+        numbers = HANDLED_MESSAGES | {mavlink.MAVLINK_MSG_ID_COMMAND_LONG}
+        return PacketDecoder(self._system_id, numbers, is_stream=link.is_stream, key=self._key)
 
     def _drop_link(self) -> None:
         with self._sending:
             if self._link is not None:
                 self._link.close()
-                self._counts["dropped"] += self._decoder.dropped
+                self._counters.dropped += self._decoder.dropped
                 self._decoder.dropped = 0
             self._link, self._peer, self.telemetry.heard_ns = None, None, None
 

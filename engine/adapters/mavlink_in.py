@@ -8,27 +8,46 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from engine.adapters.gimbal import body_behind, from_device, from_mount
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
+from engine.values import Attitude
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 """MAV_AUTOPILOT of each firmware, as its heartbeat states it."""
-REQUESTED_RATES_HZ = {
+_COMMON_RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 50,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 10,
-    mavlink.MAVLINK_MSG_ID_ALTITUDE: 10,
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 10,
-    mavlink.MAVLINK_MSG_ID_RANGEFINDER: 10,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
 }
-"""Messages that the bridge requests from the autopilot, and their rates."""
+GIMBAL_RATES_HZ = {
+    "ardupilot": {mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50},
+    "px4": {
+        mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50,
+        mavlink.MAVLINK_MSG_ID_MOUNT_ORIENTATION: 50,
+    },
+}
+"""The same of those that only a camera on a gimbal needs."""
+REQUESTED_RATES_HZ = {
+    # Each firmware lacks what the other has, and complains to the pilot about every such request.
+    "ardupilot": _COMMON_RATES_HZ
+    | {mavlink.MAVLINK_MSG_ID_RANGEFINDER: 10, mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5},
+    "px4": _COMMON_RATES_HZ | {mavlink.MAVLINK_MSG_ID_ALTITUDE: 10, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 5},
+}
+"""Messages that the bridge requests from each firmware, and their rates."""
 HANDLED_MESSAGES = frozenset(
     {
-        *REQUESTED_RATES_HZ,
+        *(number for rates in REQUESTED_RATES_HZ.values() for number in rates),
+        *GIMBAL_RATES_HZ["px4"],
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
@@ -42,6 +61,19 @@ _MAX_STALE_STAMPS = 20  # consecutive stamps that far back, after which it must 
 _UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
 _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
+# ESTIMATOR_STATUS of PX4 has the same bits as EKF_STATUS_REPORT of ArduPilot.
+_VELOCITY_KNOWN, _CONSTANT_POSITION = mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE
+_MIN_GNSS_SIGMA_M, _DEFAULT_GNSS_SIGMA_M = 0.5, 5.0  # the latter where the receiver states no accuracy
+
+
+@dataclass(frozen=True, slots=True)
+class GnssFix:
+    """A position by the autopilot's own receiver, in WGS84 degrees, with one standard deviation per axis."""
+
+    lat_deg: float
+    lon_deg: float
+    sigma_m: float
+    time_ns: int
 
 
 class AutopilotClock:
@@ -99,21 +131,33 @@ class AutopilotClock:
 class MavlinkTelemetry:
     """Recent telemetry of one autopilot. May be read from another thread than the one that updates it.
 
+    Args:
+        gimbal_mount: (3, 3) mount of a camera on a gimbal; None is one that is fixed to the vehicle.
+
     Attributes:
         origin: NED origin of the autopilot; None where it has reported none.
         firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
+        armed: whether its motors are armed.
+        has_receiver: whether a GNSS receiver is connected to it; None where it has not said.
+        gnss: the last three-dimensional fix of that receiver; None before the first.
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gimbal_mount: NDArray[np.float64] | None = None) -> None:
         self._lock = threading.Lock()
         self._clock = AutopilotClock()
+        self._gimbal_mount, self._holder = gimbal_mount, RecentValues(ANGLES)
         self._attitude, self._velocity = RecentValues(ANGLES), RecentValues()
         self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
         self._alt_amsl, self._down = RecentValues(), RecentValues()
         self._unix_offset_ns: int | None = None
         self._stale_stamps = 0
+        self._has_velocity = True
+        self._home_down_m = 0.0  # of its home below its origin
         self.origin: NedOrigin | None = None
+        self.has_receiver: bool | None = None
+        self.gnss: GnssFix | None = None
+        self.armed = False
         self.firmware: int | None = None
         self.heard_ns: int | None = None
 
@@ -139,7 +183,8 @@ class MavlinkTelemetry:
     def vehicle(self, time_ns: int) -> VehicleState:
         """The vehicle state at a local time; what is not known is None."""
         with self._lock:
-            attitude, velocity = self._attitude.at(time_ns), self._velocity.at(time_ns)
+            attitude = self._attitude.at(time_ns)
+            velocity = self._velocity.at(time_ns) if self._has_velocity else None
             roll, pitch, heading = attitude or (None, None, None)
             east, north, up = velocity or (None, None, None)
             return VehicleState(
@@ -151,8 +196,23 @@ class MavlinkTelemetry:
                 up_velocity_mps=up,
                 height_agl_m=self._height_agl_m(time_ns, roll or 0.0, pitch or 0.0),
                 alt_amsl_m=scalar(self._alt_amsl.at(time_ns)),
-                down_m=scalar(self._down.at(time_ns)),
+                down_m=self._down_m(time_ns),
+                holder=self._holder_at(time_ns),
             )
+
+    def _holder_at(self, time_ns: int) -> Attitude | None:
+        held = self._holder.at(time_ns)
+        return None if held is None else Attitude(held[0], held[1], held[2] % 360.0 % 360.0)
+
+    def _down_m(self, time_ns: int) -> float | None:
+        """Distance below the origin; without a position ArduPilot states only the height above home.
+
+        A fix is what it waits for then, so that one without a height would never be sent.
+        """
+        down_m, relative_m = scalar(self._down.at(time_ns)), scalar(self._relative.at(time_ns))
+        if down_m is not None or relative_m is None:
+            return down_m
+        return self._home_down_m - relative_m
 
     def _height_agl_m(self, time_ns: int, roll_deg: float, pitch_deg: float) -> float | None:
         slant_m = scalar(self._range.at(time_ns))
@@ -166,6 +226,7 @@ class MavlinkTelemetry:
         if kind == "HEARTBEAT":
             if message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
                 self.firmware, self.heard_ns = message.autopilot, arrival_ns
+                self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         elif kind == "TIMESYNC":
             if message.tc1 != 0 and not self._clock.accept_response(message.ts1, message.tc1, arrival_ns):
                 self._reset()
@@ -173,6 +234,11 @@ class MavlinkTelemetry:
             self._set_origin(message)
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
+        elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
+            # Where it knows no velocity it goes on to report one, of zero.
+            self._has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
+        elif kind == "GPS_RAW_INT":
+            self._set_gnss(message, arrival_ns)
         elif kind == "ALTITUDE":
             self._add_sample(message, self._time_ns(message.time_usec * 1000, arrival_ns))
         else:
@@ -190,7 +256,9 @@ class MavlinkTelemetry:
     def _reset(self) -> None:
         self._clock = AutopilotClock()
         self.origin, self._unix_offset_ns, self._stale_stamps = None, None, 0
-        for series in (self._attitude, self._velocity, self._range, self._clearance, self._relative):
+        self.has_receiver, self.gnss = None, None
+        self._has_velocity, self._home_down_m = True, 0.0
+        for series in (self._holder, self._attitude, self._velocity, self._range, self._clearance, self._relative):
             series.clear()
         self._alt_amsl.clear()
         self._down.clear()
@@ -204,6 +272,9 @@ class MavlinkTelemetry:
         elif kind == "GLOBAL_POSITION_INT":
             self._alt_amsl.add(time_ns, message.alt * 1e-3)
             self._relative.add(time_ns, message.relative_alt * 1e-3)
+            down_m = scalar(self._down.at(time_ns))
+            if down_m is not None:
+                self._home_down_m = down_m + message.relative_alt * 1e-3
             self._velocity.add(time_ns, message.vy * 1e-2, message.vx * 1e-2, -message.vz * 1e-2)
         elif kind == "LOCAL_POSITION_NED":
             self._down.add(time_ns, message.z)
@@ -217,14 +288,36 @@ class MavlinkTelemetry:
             valid = message.min_distance < message.current_distance < message.max_distance
             if message.orientation == _DOWN and valid:
                 self._add_range(time_ns, message.current_distance * 1e-2)
+        elif kind in ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION"):
+            self._add_gimbal(message, time_ns)
         elif kind == "SYSTEM_TIME":
             dated = _UNIX_RANGE_US[0] < message.time_unix_usec < _UNIX_RANGE_US[1]
             if dated and self._unix_offset_ns is None:
                 self._unix_offset_ns = message.time_unix_usec * 1000 - time_ns
 
+    def _add_gimbal(self, message: Any, time_ns: int) -> None:
+        attitude = self._attitude.at(time_ns)
+        if self._gimbal_mount is None or attitude is None:
+            return
+        if message.get_type() == "MOUNT_ORIENTATION":
+            rotation = from_mount(message.roll, message.pitch, message.yaw, attitude[2])
+        else:
+            rotation = from_device(message.q, message.flags, attitude[2])
+        if rotation is not None:
+            held = body_behind(rotation, self._gimbal_mount)
+            self._holder.add(time_ns, held.roll_deg, held.pitch_deg, held.heading_deg)
+
     def _add_range(self, time_ns: int, range_m: float) -> None:
         if range_m > 0.0:
             self._range.add(time_ns, range_m)
+
+    def _set_gnss(self, message: Any, arrival_ns: int) -> None:
+        """Store the receiver's position; its stamp has no clock in common with the others."""
+        self.has_receiver = message.fix_type != mavlink.GPS_FIX_TYPE_NO_GPS
+        if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+            stated_m = message.h_acc * 1e-3
+            sigma_m = max(stated_m, _MIN_GNSS_SIGMA_M) if stated_m > 0.0 else _DEFAULT_GNSS_SIGMA_M
+            self.gnss = GnssFix(message.lat * 1e-7, message.lon * 1e-7, sigma_m, arrival_ns)
 
     def _set_origin(self, message: Any) -> None:
         """Store the autopilot's origin; zero latitude and longitude mean that it has none."""

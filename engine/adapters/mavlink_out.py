@@ -6,13 +6,13 @@ Converts to radians, NED and 1e-7 degrees. Stamps are of capture.
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from engine.adapters.fix_velocity import GroundVelocity
 from engine.adapters.mavlink_in import MAV_AUTOPILOTS
 from engine.adapters.packets import AUTOPILOT_COMPONENT
 from engine.adapters.parameters import MAX_DELAY_MS
@@ -31,9 +31,10 @@ SENSOR_ID = 1
 """Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
 _GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
-_VELOCITY_BASELINE_S = (0.4, 1.5)  # interval between two fixes from which a velocity is computed
-_ACCELERATION_MPS2 = 3.0  # assumed 1 sigma: the velocity is that of the middle of the interval
-_SATELLITES = 10  # ArduPilot's arming check needs a count; GPS_INPUT has no value for unknown
+# There is no sky in a fix, and no value for unknown. What arming checks and estimators read stands for the
+# accuracy: a metre of sigma is a dilution of 1 and 10 satellites.
+_DILUTION_PER_M, _MIN_DILUTION = 1.0, 0.5
+_MAX_GPS_ID = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +46,7 @@ class MavlinkOptions:
         message: one of :data:`MESSAGES` of the firmware; empty for its default.
         max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
         max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no more.
+        gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first, 1 its second.
 
     Raises:
         OptionError: a name is unknown, or a number is out of range.
@@ -54,6 +56,7 @@ class MavlinkOptions:
     message: str = ""
     max_sigma_m: float = 10.0
     max_age_ms: float = MAX_DELAY_MS
+    gps_id: int = 0
 
     def __post_init__(self) -> None:
         check_positive(self, "max_sigma_m", "max_age_ms")
@@ -64,6 +67,10 @@ class MavlinkOptions:
             raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
         if self.max_age_ms > MAX_DELAY_MS:
             raise OptionError(f"max_age_ms: expected at most {MAX_DELAY_MS:g}, got {self.max_age_ms:g}")
+        if not 0 <= self.gps_id <= _MAX_GPS_ID:
+            raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
+        if self.gps_id and self.kind != "gps_input":
+            raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
         if self.max_sigma_m > 100.0:
             raise OptionError(
                 f"max_sigma_m: expected at most 100, where ArduPilot clamps, got {self.max_sigma_m:g}"
@@ -78,15 +85,6 @@ class MavlinkOptions:
     def needs_origin(self) -> bool:
         """Whether the message carries positions relative to the autopilot's origin."""
         return self.kind in ("vision_position_estimate", "odometry")
-
-
-@dataclass(frozen=True, slots=True)
-class GroundVelocity:
-    """Velocity over ground from two fixes, and its standard deviation per axis."""
-
-    east_mps: float
-    north_mps: float
-    sigma_mps: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,31 +110,6 @@ class FixReport:
     velocity: GroundVelocity | None
     reset_counter: int
     unix_ns: int
-
-
-class VelocityFromFixes:
-    """Velocity from the last fixes: sending the vehicle its own estimate back would be circular."""
-
-    def __init__(self) -> None:
-        self._fixes: deque[tuple[int, Fix]] = deque(maxlen=64)
-        self._resets: int | None = None
-
-    def add(self, fix: Fix, captured_ns: int, resets: int) -> GroundVelocity | None:
-        """Add a fix; returns the velocity up to it, None after a reset or without a recent earlier fix."""
-        if resets != self._resets or (self._fixes and captured_ns <= self._fixes[-1][0]):
-            self._fixes.clear()
-        self._resets = resets
-        self._fixes.append((captured_ns, fix))
-        while (captured_ns - self._fixes[0][0]) * 1e-9 > _VELOCITY_BASELINE_S[1]:
-            self._fixes.popleft()
-        before_ns, before = self._fixes[0]
-        interval_s = (captured_ns - before_ns) * 1e-9
-        if interval_s < _VELOCITY_BASELINE_S[0]:
-            return None
-        noise_mps = math.hypot(fix.sigma_m, before.sigma_m) / interval_s
-        sigma_mps = math.hypot(noise_mps, 0.5 * interval_s * _ACCELERATION_MPS2)
-        east_mps, north_mps = (fix.east_m - before.east_m), (fix.north_m - before.north_m)
-        return GroundVelocity(east_mps / interval_s, north_mps / interval_s, sigma_mps)
 
 
 def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
@@ -166,7 +139,7 @@ def fix_message(report: FixReport, options: MavlinkOptions) -> Any:
         return _vision_position_estimate(report, options.firmware)
     if options.kind == "odometry":
         return _odometry(report, options.firmware)
-    return _gps_input(report) if options.kind == "gps_input" else _global_position_sensor(report)
+    return _gps_input(report, options.gps_id) if options.kind == "gps_input" else _global_position_sensor(report)
 
 
 def heartbeat_message() -> Any:
@@ -191,6 +164,33 @@ def command_message(system_id: int, command: int, *values: float) -> Any:
     """COMMAND_LONG to the autopilot; missing parameters are 0."""
     padded = (*values, *(0.0,) * (7 - len(values)))
     return mavlink.MAVLink_command_long_message(system_id, AUTOPILOT_COMPONENT, command, 0, *padded)
+
+
+def notice_message(severity: int, text: str) -> Any:
+    """STATUSTEXT, which the autopilot passes on to the ground station."""
+    return mavlink.MAVLink_statustext_message(severity, text.encode("ascii", "replace"))
+
+
+def acknowledgement_message(command: int, *, accepted: bool) -> Any:
+    """COMMAND_ACK."""
+    result = mavlink.MAV_RESULT_ACCEPTED if accepted else mavlink.MAV_RESULT_UNSUPPORTED
+    return mavlink.MAVLink_command_ack_message(command, result)
+
+
+def no_position_message(now_ns: int) -> Any:
+    """ODOMETRY that says: the camera works, and knows no position.
+
+    ArduPilot does not arm unless something has come from its visual odometry within 0.3 s, and on the ground a
+    camera sees nothing. By its quality the message is not used for navigation.
+    """
+    nan = math.nan
+    # Older than any fix: the quickest message counts as the one without delay, and must be a fix.
+    stamp_us = (now_ns - round(MAX_DELAY_MS * 1e6)) // 1000
+    return mavlink.MAVLink_odometry_message(
+        max(stamp_us, 0), mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, *(0.0, 0.0, 0.0),
+        [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, [nan] * 21, [nan] * 21, 0, mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        -1,  # failed
+    )  # fmt: skip
 
 
 def pose_covariance(fix: Fix) -> list[float]:
@@ -283,29 +283,30 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
     ]
 
 
-def _gps_input(report: FixReport) -> Any:
+def _gps_input(report: FixReport, gps_id: int) -> Any:
     assert report.velocity is not None  # checked by withhold_reason
     week, week_ms = divmod(report.unix_ns // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
     alt_m, up_mps = report.vehicle.alt_amsl_m, report.vehicle.up_velocity_mps
+    dilution = max(_DILUTION_PER_M * report.fix.sigma_m, _MIN_DILUTION)
     ignored = 0 if alt_m is not None else mavlink.GPS_INPUT_IGNORE_FLAG_ALT
     ignored |= 0 if up_mps is not None else mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
     return mavlink.MAVLink_gps_input_message(
         report.captured_ns // 1000,
-        0,
+        gps_id,
         ignored,
         week_ms,
         week,
         3,  # a 3D fix
         *_degrees_1e7(report.fix),
         alt_m or 0.0,
-        *(1.0, 1.0),  # dilution of precision, which arming checks read; the accuracies carry the sigma
+        *(dilution, dilution),
         report.velocity.north_mps,
         report.velocity.east_mps,
         -(up_mps or 0.0),
         report.velocity.sigma_mps,
         report.fix.sigma_m,
         report.fix.sigma_m,
-        _SATELLITES,
+        round(10.0 / dilution),
     )
 
 

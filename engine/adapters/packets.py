@@ -144,7 +144,9 @@ class PacketDecoder:
             system, component, number = packet[3], packet[4], packet[5]
         else:
             system, component, number = packet[5], packet[6], int.from_bytes(packet[7:10], "little")
-        return (system, component) == (self._system_id, AUTOPILOT_COMPONENT) and number in self._message_ids
+        from_autopilot = (system, component) == (self._system_id, AUTOPILOT_COMPONENT)
+        # An operator's command comes from the ground station, on the autopilot's link.
+        return number in self._message_ids and (from_autopilot or number == mavlink.MAVLINK_MSG_ID_COMMAND_LONG)
 
     def _decode(self, packet: bytes) -> Any:
         """The message, or None where the packet is invalid or its type unknown."""

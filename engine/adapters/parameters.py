@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from engine.errors import OptionError
 
 MAX_DELAY_MS = 250.0
@@ -12,27 +14,55 @@ Parameter = tuple[str, float, str]
 """Name, value, purpose."""
 
 
-def parameter_file(firmware: str, message: str, *, delay_ms: int, max_sigma_m: float) -> str:
-    """The text of a parameter file.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterOptions:
+    """For whom a parameter file is.
 
-    Args:
+    Attributes:
         firmware: ardupilot or px4.
         message: the message that the bridge sends.
+        takeoff: "none" without GNSS, or "gnss": ArduPilot begins with its receiver and is switched over in flight.
+        gps_id: receiver that GPS_INPUT poses as.
         delay_ms: time from capture to arrival at the autopilot.
         max_sigma_m: upper bound of the sigma of the fixes that are sent.
 
     Raises:
-        OptionError: the delay is out of range.
+        OptionError: the delay is out of range, or the take-off is none that the message allows.
     """
-    if not 0 <= delay_ms <= MAX_DELAY_MS:
-        raise OptionError(f"delay_ms: expected 0 to {MAX_DELAY_MS:g}, got {delay_ms}")
-    if firmware == "ardupilot":
-        lines = _gps_input() if message == "gps_input" else _external_navigation(delay_ms)
-        text = [f"# ArduPilot 4.5 and later, {message} by scenematch bridge mavlink. Reboot after loading."]
-        for name, value, why in lines:
+
+    firmware: str
+    message: str
+    takeoff: str = "none"
+    gps_id: int = 0
+    delay_ms: int = 100
+    max_sigma_m: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.delay_ms <= MAX_DELAY_MS:
+            raise OptionError(f"delay_ms: expected 0 to {MAX_DELAY_MS:g}, got {self.delay_ms}")
+        if self.takeoff not in ("none", "gnss"):
+            raise OptionError(f"takeoff: expected none or gnss, got {self.takeoff!r}")
+        if self.takeoff == "gnss" and self.firmware != "ardupilot":
+            raise OptionError(f"takeoff: expected none for {self.firmware}, got {self.takeoff!r}")
+        if self.takeoff == "gnss" and self.message == "gps_input" and self.gps_id == 0:
+            raise OptionError("gps_id: expected 1 or more beside a receiver, got 0")
+
+
+def parameter_file(options: ParameterOptions) -> str:
+    """The text of a parameter file."""
+    if options.firmware == "ardupilot":
+        text = [f"# ArduPilot 4.5 and later, {options.message} by scenematch bridge mavlink; then reboot."]
+        for name, value, why in _ardupilot(options):
             text += [f"# {why}", f"{name},{value:g}"]
         return "\n".join(text) + "\n"
-    lines = _agp(delay_ms, max_sigma_m) if message == "global_position_sensor" else _external_vision(delay_ms)
+    return _px4_file(options)
+
+
+def _px4_file(options: ParameterOptions) -> str:
+    """As QGroundControl writes it."""
+    message, delay_ms = options.message, options.delay_ms
+    position = message == "global_position_sensor"
+    lines = _agp(delay_ms, options.max_sigma_m) if position else _external_vision(delay_ms)
     text = [f"# PX4 1.15 and later, {message} by scenematch bridge mavlink. Reboot after loading.", "#"]
     text += [f"# {name}: {why}" for name, _, why in lines]
     text += ["#", "# Vehicle-Id Component-Id Name Value Type"]
@@ -42,33 +72,59 @@ def parameter_file(firmware: str, message: str, *, delay_ms: int, max_sigma_m: f
     return "\n".join(text) + "\n"
 
 
-def _external_navigation(delay_ms: int) -> list[Parameter]:
+def _ardupilot(options: ParameterOptions) -> list[Parameter]:
+    lines = [*_EKF3]
+    vision = _gps_input(options) if options.message == "gps_input" else _external_navigation(options)
+    lines += vision
+    if options.takeoff == "gnss":
+        lines += _source_set(1, position=3, velocity=3)
+        lines += [(f"{_RC_SWITCH}_OPTION", 90, "switch of the transmitter: low set 1, the receiver; middle set 2")]
+    if options.message != "gps_input":
+        lines += _source_set(2 if options.takeoff == "gnss" else 1, position=6, velocity=0)
+    elif options.takeoff == "none":
+        lines += _source_set(1, position=3, velocity=3)
+    if options.takeoff == "none" and options.message != "gps_input":
+        lines.append(("GPS1_TYPE", 0, "no receiver; GPS_TYPE before 4.6"))
+    return [*lines, *_FAILSAFES]
+
+
+_RC_SWITCH = "RC7"
+_EKF3: list[Parameter] = [
+    ("AHRS_EKF_TYPE", 3, "EKF3"),
+    ("EK3_ENABLE", 1, "EKF3"),
+    ("EK2_ENABLE", 0, "EKF3 alone"),
+]
+_FAILSAFES: list[Parameter] = [
+    ("FS_EKF_ACTION", 1, "LAND 8 s after the last fix; without a position it drifts with the wind"),
+    ("FS_EKF_THRESH", 0.8, "variances above it for a second count as a failure, too"),
+]
+
+
+def _source_set(number: int, *, position: int, velocity: int) -> list[Parameter]:
+    """A source set of EKF3: 3 is a receiver, 6 external navigation, 1 barometer or compass."""
+    name = f"EK3_SRC{number}"
     return [
-        ("AHRS_EKF_TYPE", 3, "EKF3"),
-        ("EK3_ENABLE", 1, "EKF3"),
-        ("EK2_ENABLE", 0, "EKF3 alone"),
-        ("VISO_TYPE", 1, "vision by MAVLink"),
-        ("VISO_DELAY_MS", delay_ms, "from capture to arrival: the least age that the bridge prints; at most 250"),
-        ("VISO_POS_M_NSE", 0.2, "floor of the position's sigma"),
-        ("EK3_SRC1_POSXY", 6, "horizontal position by external navigation"),
-        ("EK3_SRC1_VELXY", 0, "no velocity: that of two fixes says no more than they do"),
-        ("EK3_SRC1_POSZ", 1, "height by the barometer: a map's height has another zero"),
-        ("EK3_SRC1_VELZ", 0, "no vertical velocity"),
-        ("EK3_SRC1_YAW", 1, "heading by the compass: the bridge sends the vehicle's own back"),
+        (f"{name}_POSXY", position, "horizontal position by the receiver" if position == 3 else "by the fixes"),
+        (f"{name}_VELXY", velocity, "velocity by the receiver" if velocity else "none: two fixes say no more"),
+        (f"{name}_POSZ", 1, "height by the barometer: a map's height has another zero"),
+        (f"{name}_VELZ", 0, "no vertical velocity"),
+        (f"{name}_YAW", 1, "heading by the compass: the bridge sends the vehicle's own back"),
     ]
 
 
-def _gps_input() -> list[Parameter]:
+def _external_navigation(options: ParameterOptions) -> list[Parameter]:
     return [
-        ("AHRS_EKF_TYPE", 3, "EKF3"),
-        ("EK3_ENABLE", 1, "EKF3"),
-        ("GPS1_TYPE", 14, "GPS_INPUT by MAVLink; GPS_TYPE before 4.6"),
-        ("GPS1_DELAY_MS", 0, "the stamps are of capture; GPS_DELAY_MS before 4.6"),
-        ("EK3_SRC1_POSXY", 3, "horizontal position by the GPS"),
-        ("EK3_SRC1_VELXY", 3, "velocity by the GPS: GPS_INPUT carries it"),
-        ("EK3_SRC1_POSZ", 1, "height by the barometer"),
-        ("EK3_SRC1_VELZ", 0, "no vertical velocity: what is sent is the vehicle's own"),
-        ("EK3_SRC1_YAW", 1, "heading by the compass"),
+        ("VISO_TYPE", 1, "vision by MAVLink"),
+        ("VISO_DELAY_MS", options.delay_ms, "from capture to arrival: the least age that the bridge prints"),
+        ("VISO_POS_M_NSE", 0.2, "floor of the position's sigma"),
+    ]
+
+
+def _gps_input(options: ParameterOptions) -> list[Parameter]:
+    name, delay_ms = f"GPS{options.gps_id + 1}", max(options.delay_ms, 1)
+    return [
+        (f"{name}_TYPE", 14, "GPS_INPUT by MAVLink; GPS_TYPE before 4.6"),
+        (f"{name}_DELAY_MS", delay_ms, "the least age that the bridge prints; 0 would mean 200"),
     ]
 
 

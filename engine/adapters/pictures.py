@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import TelemetryError
+from engine.adapters.camera_stream import capture
 from engine.formats.flight import open_flight
-from engine.formats.tables import quoted
 
 __all__ = ["CapturedImage", "capture", "replay"]
 
@@ -48,36 +47,3 @@ def replay(
         captured_ns = begin_ns + stamp_ns - first_ns
         time.sleep(max(0.0, (captured_ns - time.monotonic_ns()) * 1e-9))
         yield np.asarray(item.frame.image, np.uint8), captured_ns
-
-
-def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Iterator[CapturedImage]:
-    """Capture images from a camera or stream until it ends.
-
-    Args:
-        source: number of a camera, or a URL or pipeline that ``cv2.VideoCapture`` opens.
-        exposure_to_grab_ms: time from exposure to arrival, a property of the camera.
-
-    Yields:
-        :data:`CapturedImage` as they arrive.
-
-    Raises:
-        TelemetryError: the camera or stream cannot be opened.
-    """
-    import cv2
-
-    try:
-        camera = cv2.VideoCapture(int(source) if source.isdecimal() else source)
-        opened = camera.isOpened()
-    except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python accepts
-        opened = False
-    if not opened:
-        raise TelemetryError(f"camera_source: expected a camera or stream that opens, got {quoted(source)}")
-    camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-    try:
-        while camera.grab():
-            captured_ns = time.monotonic_ns() - round(exposure_to_grab_ms * 1e6)
-            good, image = camera.retrieve()
-            if good and image is not None:
-                yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8), captured_ns
-    finally:
-        camera.release()

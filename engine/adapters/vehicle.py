@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.values import Frame
+from engine.values import Attitude, Frame
 
 __all__ = ["NedOrigin", "VehicleState", "north_east_m"]
 
@@ -48,6 +48,8 @@ class VehicleState:
             else the height above home.
         alt_amsl_m: height above mean sea level.
         down_m: distance below the autopilot's origin.
+        holder: attitude of the body that the camera's mount is about, where that is not the vehicle but behind a
+            gimbal; None is the vehicle's own.
     """
 
     roll_deg: float | None = None
@@ -59,16 +61,17 @@ class VehicleState:
     height_agl_m: float | None = None
     alt_amsl_m: float | None = None
     down_m: float | None = None
+    holder: Attitude | None = None
 
     def frame(self, image: NDArray[np.uint8], captured_ns: int) -> Frame:
         """The frame of an image (H, W, 3) or (H, W) uint8 that was captured at this time."""
+        own = (self.heading_deg, self.roll_deg, self.pitch_deg)
+        held = self.holder
         return Frame(
             image,
             captured_ns,
             self.height_agl_m,
-            self.heading_deg,
-            self.roll_deg,
-            self.pitch_deg,
+            *(own if held is None else (held.heading_deg, held.roll_deg, held.pitch_deg)),
             self.east_velocity_mps,
             self.north_velocity_mps,
         )

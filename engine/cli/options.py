@@ -88,6 +88,10 @@ StartOption = Annotated[
 DeadlineOption = Annotated[
     float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
 ]
+BridgeDeadlineOption = Annotated[
+    float | None,
+    typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered; 250, as autopilots take."),
+]
 SecondsOption = Annotated[
     float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
 ]

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
         BridgeSettings,
         MavlinkSettings,
         run_mavlink_bridge,
-        write_parameter_file,
     )
+    from engine.runs.mavlink_parameters import write_parameter_file
     from engine.runs.progress import Progress
     from engine.runs.ros_bridge import RosSettings, run_ros_bridge
     from engine.runs.settings import TrackSettings, load_settings
@@ -89,8 +89,8 @@ _NAMES = {
     "engine.runs.inputs": "FlightFiles",
     "engine.runs.live_viewing": "LiveViewTarget",
     "engine.runs.map_audit": "AuditFiles MapAudit audit_map",
-    "engine.runs.mavlink_bridge": "BridgeFiles BridgeSettings MavlinkSettings run_mavlink_bridge "
-    "write_parameter_file",
+    "engine.runs.mavlink_bridge": "BridgeFiles BridgeSettings MavlinkSettings run_mavlink_bridge",
+    "engine.runs.mavlink_parameters": "write_parameter_file",
     "engine.runs.progress": "Progress",
     "engine.runs.ros_bridge": "RosSettings run_ros_bridge",
     "engine.runs.settings": "TrackSettings load_settings",

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from engine.adapters.delay_memory import remember_delay
 from engine.adapters.links import parse_connection
-from engine.adapters.parameters import parameter_file
 from engine.adapters.pictures import CapturedImage, capture, replay
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
+from engine.evidence import position_of
 from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
@@ -23,15 +25,18 @@ from engine.orthomap import OrthoMap
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
-from engine.runs.folders import StrPath, check_file
+from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import with_weights
+from engine.runs.supervisor import SharedPosition, become_worker, check_supervision, end_on_sigterm
+from engine.values import Prior
 
 if TYPE_CHECKING:
-    from engine.adapters.mavlink import MavlinkBridge, MavlinkStatus
+    from engine.adapters.mavlink import MavlinkBridge
     from engine.adapters.mavlink_out import MavlinkOptions
+    from engine.adapters.mavlink_status import MavlinkStatus
 
 _MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
@@ -49,7 +54,7 @@ class BridgeFiles:
         surface: surface model, a GeoTIFF of heights.
         frames: pictures that are played at their own pace, a folder or a video.
         telemetry: telemetry.csv, whose stamps set that pace.
-        camera_source: number of a camera or URL of a stream, by OpenCV.
+        camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: pace of pictures without stamps; None is 10.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
@@ -57,6 +62,7 @@ class BridgeFiles:
         map_crs: of a map that names none.
         mount: how the camera is mounted, by name; None is the calibration's.
         camera_pitch_deg: of the camera, -90 looks straight down.
+        gimbal: whether a gimbal, whose attitude the autopilot reports, turns it from there.
 
     Raises:
         OptionError: a number is out of its range, or an argument does not go with another.
@@ -75,6 +81,7 @@ class BridgeFiles:
     map_crs: str | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
+    gimbal: bool = False
 
     def __post_init__(self) -> None:
         self.camera_files()
@@ -95,8 +102,11 @@ class BridgeFiles:
         """What is said of the camera."""
         return CameraFiles(calibration=Path(self.camera), mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
 
-    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage]:
-        """Pictures as they are captured; those of a flight that is played begin when ``wait`` returns."""
+    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage | None]:
+        """Pictures as they are captured, None where a camera gives none for a while.
+
+        Those of a flight that is played begin when ``wait`` returns.
+        """
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)
             return replay(Path(self.frames), telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
@@ -119,6 +129,8 @@ class MavlinkSettings:
         set_origin: give an autopilot without an origin the map's.
         origin_alt_m: height of that origin above sea level; None is the map's ground.
         use_velocity: whether the autopilot's velocity is used between fixes.
+        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
+        gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first.
 
     Raises:
         OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
@@ -134,6 +146,8 @@ class MavlinkSettings:
     set_origin: bool = True
     origin_alt_m: float | None = None
     use_velocity: bool = True
+    check_gnss: bool = True
+    gps_id: int = 0
 
     def __post_init__(self) -> None:
         if not self.set_origin:
@@ -149,14 +163,21 @@ class MavlinkSettings:
         Raises:
             OptionError: the firmware, the message or the accuracy is none that can be.
         """
-        return _outgoing(self.firmware, self.message, self.max_sigma_m)
+        return outgoing_options(self.firmware, self.message, self.max_sigma_m, self.gps_id)
 
-    def origin(self, site: OrthoMap) -> NedOrigin | None:
-        """The map's, at the height of its ground where none is given; None where none is to be set."""
+    def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
+        """The start of the flight or else the map's middle; None where none is to be set.
+
+        Its height is that of the ground there, of the map's ground in general, or as it was given.
+        """
         if not self.set_origin:
             return None
-        alt_m = site.ground_m if self.origin_alt_m is None else self.origin_alt_m
-        return NedOrigin(site.frame.lat_deg, site.frame.lon_deg, alt_m)
+        lat_deg, lon_deg, ground_m = site.frame.lat_deg, site.frame.lon_deg, site.ground_m
+        if start is not None:
+            place_m = position_of(start, site).en_m
+            lat_deg, lon_deg = (float(v) for v in site.frame.geodetic_from_enu(*place_m))
+            ground_m = site.ground_at(site.pixel_from_enu(place_m))
+        return NedOrigin(lat_deg, lon_deg, ground_m if self.origin_alt_m is None else self.origin_alt_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +189,7 @@ class BridgeSettings:
         weights: files of the learned method.
         device: where tensors live.
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
-        deadline_ms: age by which a frame is answered.
+        deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
         seconds: ends after this time; None ends with the pictures.
 
     Raises:
@@ -180,7 +201,7 @@ class BridgeSettings:
     weights: tuple[StrPath, ...] = ()
     device: str = "auto"
     start: str | None = None
-    deadline_ms: float = 121.0
+    deadline_ms: float | None = None
     seconds: float | None = None
 
     def __post_init__(self) -> None:
@@ -194,9 +215,9 @@ class BridgeSettings:
         """What of it is the matcher's."""
         return MatcherOptions(learned=with_weights(self.method, self.weights))
 
-    def live_options(self) -> LiveOptions:
-        """The deadlines of the frames."""
-        return LiveOptions(deadline_ms=self.deadline_ms)
+    def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
+        """The deadlines of the frames, with the one that counts where none was set."""
+        return LiveOptions(deadline_ms=deadline_ms if self.deadline_ms is None else self.deadline_ms)
 
 
 def run_mavlink_bridge(
@@ -204,6 +225,7 @@ def run_mavlink_bridge(
     link: MavlinkSettings,
     settings: BridgeSettings | None = None,
     *,
+    supervise: bool = False,
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     progress: Progress = SILENT,
 ) -> MavlinkStatus:
@@ -213,6 +235,7 @@ def run_mavlink_bridge(
         files: map, camera and pictures.
         link: the autopilot.
         settings: how frames are matched; None is the defaults.
+        supervise: whether this process stays behind with what is loaded, to replace a worker that is killed.
         live_view: where the live view goes.
         progress: is shown what the bridge does.
 
@@ -241,57 +264,46 @@ def run_mavlink_bridge(
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
+    last_position = SharedPosition()
+    if supervise:
+        check_supervision(matcher.device)
+        become_worker(progress)
+        start = last_position.prior(settings.live_options().max_speed_mps) or start
 
+    end_on_sigterm()
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
-                connection, make_navigator, outgoing, start, settings.live_options(),
-                origin=link.origin(site), use_velocity=link.use_velocity, system_id=link.system_id, key=key,
-                watch=watcher,
+                connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
+                origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
+                check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
+                on_sent=last_position.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
             pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
-            _run(bridge, pictures, camera, settings.seconds, progress)
+            with suppress(KeyboardInterrupt):  # the usual end beside a camera, and no reason to lose the counts
+                _run(bridge, pictures, camera, settings.seconds, progress)
+            if files.camera_source is not None:
+                remember_delay(bridge.status.least_age_ms)
             return bridge.status
 
 
-def write_parameter_file(
-    firmware: str,
-    message: str,
-    out: StrPath,
-    *,
-    delay_ms: int = 100,
-    max_sigma_m: float = 10.0,
-    force: bool = False,
-) -> None:
-    """Write the parameters that let an autopilot fly by the bridge's fixes.
+def outgoing_options(firmware: str, message: str, max_sigma_m: float, gps_id: int) -> MavlinkOptions:
+    """What is sent.
 
-    Args:
-        firmware: "ardupilot" or "px4".
-        message: that is sent; "" is the firmware's usual one.
-        out: the file.
-        delay_ms: from capture to arrival.
-        max_sigma_m: of the fixes that are sent.
-        force: whether the file may be there already.
+    Raises:
+        OptionError: the firmware, the message or a number is none that can be.
     """
-    require("pymavlink", "mavlink")
-    out, outgoing = Path(out), _outgoing(firmware, message, max_sigma_m)
-    text = parameter_file(firmware, outgoing.kind, delay_ms=delay_ms, max_sigma_m=max_sigma_m)
-    check_file(out, force)
-    out.write_text(text, encoding="utf-8")
-
-
-def _outgoing(firmware: str, message: str, max_sigma_m: float) -> MavlinkOptions:
     from engine.adapters.mavlink_out import MavlinkOptions
 
-    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m)
+    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m, gps_id=gps_id)
 
 
 def _run(
     bridge: MavlinkBridge,
-    pictures: Iterator[CapturedImage],
+    pictures: Iterator[CapturedImage | None],
     camera: Camera,
     seconds: float | None,
     progress: Progress,
@@ -299,22 +311,28 @@ def _run(
     """Every picture to the bridge; now and then a line of what it does."""
     begin = reported = time.monotonic()
     count = 0
-    for image, captured_ns in pictures:
-        count += 1
-        try:
-            camera.check_size(image.shape)
-        except CalibrationError as error:
-            raise CalibrationError(f"picture {count}: {error}") from None
-        bridge.submit(image, captured_ns)
+    for picture in pictures:
+        if picture is not None:
+            count += 1
+            _submit(bridge, picture, camera, count)
         now = time.monotonic()
         if now - reported >= _MESSAGE_PERIOD_S:
             reported = now
-            progress.message(_status_line(bridge.status))
+            progress.message(bridge.status.line())
         if seconds is not None and now - begin >= seconds:
             return
     if count == 0:
         raise TelemetryError("frames: expected at least one picture, got none")
     _wait_for_answers(lambda: bridge.status.answered, count)
+
+
+def _submit(bridge: MavlinkBridge, picture: CapturedImage, camera: Camera, number: int) -> None:
+    image, captured_ns = picture
+    try:
+        camera.check_size(image.shape)
+    except CalibrationError as error:
+        raise CalibrationError(f"picture {number}: {error}") from None
+    bridge.submit(image, captured_ns)
 
 
 def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress) -> None:
@@ -332,12 +350,3 @@ def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
     while answered() not in (before, count) and time.monotonic() < until:
         before = answered()
         time.sleep(0.3)
-
-
-def _status_line(status: MavlinkStatus) -> str:
-    from engine.adapters.mavlink import MIN_RATE_HZ
-
-    reasons = ", ".join(f"{why} {n}" for why, n in {**status.withheld, **status.refused}.items()) or "nothing"
-    heard = "autopilot heard" if status.connected else "no autopilot"
-    slow = f" (below {MIN_RATE_HZ:g} Hz an estimator may let go)" if status.rate_hz < MIN_RATE_HZ else ""
-    return f"{heard}; sent {status.sent}, {status.rate_hz:.1f} Hz{slow}; not sent: {reasons}"

@@ -20,16 +20,17 @@ import cv2
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.quaternion import Quaternion
 
+from engine.adapters.delay_memory import remember_delay
+from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
 from engine.adapters.links import parse_connection
-from engine.adapters.mavlink import MIN_RATE_HZ, MavlinkBridge
-from engine.adapters.mavlink_in import HANDLED_MESSAGES, AutopilotClock, MavlinkTelemetry
+from engine.adapters.mavlink import CONFIRM_COMMAND, MavlinkBridge
+from engine.adapters.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     MESSAGES,
     FixReport,
-    GroundVelocity,
     MavlinkOptions,
-    VelocityFromFixes,
     command_message,
     fix_message,
     heartbeat_message,
@@ -38,10 +39,12 @@ from engine.adapters.mavlink_out import (
     timesync_message,
     withhold_reason,
 )
+from engine.adapters.mavlink_status import MIN_RATE_HZ
 from engine.adapters.packets import PacketDecoder, PacketEncoder, read_key, signing_time
-from engine.adapters.parameters import parameter_file
+from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import replay
 from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
+from engine.camera import mount_rotation
 from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
@@ -190,8 +193,6 @@ def test_attitude_is_in_radians_and_the_same_in_both_forms(message):
     if message == "vision_position_estimate":
         assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
     else:
-        from pymavlink.quaternion import Quaternion
-
         assert m.q == pytest.approx(list(Quaternion(angles).q))
 
 
@@ -214,6 +215,9 @@ def test_gps_input_carries_velocity_and_accuracies():
     assert (m.vn, m.ve, m.vd) == (-2.5, 1.5, -0.5)
     assert (m.speed_accuracy, m.horiz_accuracy) == pytest.approx((0.7, 0.5))
     assert m.ignore_flags == 0
+    assert (m.hdop, m.satellites_visible) == pytest.approx((0.5, 20))
+    poor = fix_message(sending(fix=fix(sigma_m=4.0)), MavlinkOptions(message="gps_input"))
+    assert (poor.hdop, poor.satellites_visible) == pytest.approx((4.0, 2))  # which no arming check passes
     bare = fix_message(sending(vehicle=VehicleState()), MavlinkOptions(message="gps_input"))
     assert bare.ignore_flags == mavlink.GPS_INPUT_IGNORE_FLAG_ALT | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
 
@@ -249,11 +253,23 @@ def test_options_are_refused_in_one_line(values):
 
 
 def test_velocity_is_that_of_the_last_fixes_and_forgets_at_a_reset():
-    by_fixes = VelocityFromFixes()
-    found = [by_fixes.add(fix(east_m=3.0 * t, north_m=-t), round(t * 1e9), 0) for t in np.arange(1.0, 4.0, 0.2)]
+    by_fixes, still = VelocityFromFixes(), VehicleState()
+    times = np.arange(1.0, 4.0, 0.1)
+    found = [by_fixes.add(fix(east_m=3.0 * t, north_m=-t), round(t * 1e9), 0, still) for t in times]
     assert found[0] is None
     assert (found[-1].east_mps, found[-1].north_mps) == pytest.approx((3.0, -1.0))
-    assert by_fixes.add(fix(east_m=500.0), 4_200_000_000, 1) is None
+    assert found[-1].sigma_mps < 1.0  # what EKF3 asks for before it starts by GPS_INPUT
+    assert by_fixes.add(fix(east_m=500.0), 4_200_000_000, 1, still) is None
+
+
+def test_velocity_holds_at_the_last_fix_while_the_vehicle_brakes():
+    """Its own velocity is wrong by a constant, and only its change is used."""
+    by_fixes = VelocityFromFixes()
+    for t in np.arange(0.0, 3.0, 0.1):
+        own = VehicleState(east_velocity_mps=9.0 - 2.0 * t + 0.7, north_velocity_mps=0.4)
+        found = by_fixes.add(fix(east_m=9.0 * t - t**2), round(1e9 * (1.0 + t)), 0, own)
+    assert (found.east_mps, found.north_mps) == pytest.approx((9.0 - 2.0 * t, 0.0), abs=0.05)
+    assert found.sigma_mps < 0.6
 
 
 # ------------------------------------------------------------------------------------------ what is heard
@@ -330,6 +346,28 @@ def test_clock_finds_the_offset_by_timesync_and_without():
     assert abs(by_sync.offset_ns - offset) < 1_000_000
     by_sync.accept_response(12345, 0, 10**11)  # nobody asked
     assert abs(by_sync.offset_ns - offset) < 1_000_000
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 250.0])
+@pytest.mark.parametrize("pitch_deg", [-90.0, -70.0])
+@pytest.mark.parametrize("kind", ["device", "locked", "mount"])
+def test_a_gimbal_turns_the_mount(heading_deg, pitch_deg, kind):
+    """The vehicle rolls by 10 degrees, and a stabilised camera stays where it points, down or 20 degrees ahead."""
+    telemetry, heading = MavlinkTelemetry(mount_rotation("nadir")), math.radians(heading_deg)
+    telemetry.update(mavlink.MAVLink_attitude_message(5, 0.17, 0.0, heading, 0, 0, 0), 10_000_000_000)
+    if kind == "mount":
+        message = mavlink.MAVLink_mount_orientation_message(5, 0.0, pitch_deg, 0.0)
+    else:
+        flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK if kind == "locked" else 32
+        angles = [0.0, math.radians(pitch_deg), heading if kind == "locked" else 0.0]
+        q = [float(v) for v in Quaternion(angles).q]
+        message = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, 5, flags, q, 0, 0, 0, 0)
+    telemetry.update(message, 10_000_000_000)
+    vehicle = telemetry.vehicle(10_000_000_000)
+    frame = vehicle.frame(np.zeros((2, 2), np.uint8), 1)
+    assert (frame.roll_deg, frame.pitch_deg) == pytest.approx((0.0, pitch_deg + 90.0), abs=1e-4)
+    assert math.remainder(frame.heading_deg - heading_deg, 360.0) == pytest.approx(0.0, abs=1e-4)
+    assert vehicle.roll_deg == pytest.approx(math.degrees(0.17))  # that of the messages to the autopilot
 
 
 def test_an_origin_of_zeros_is_none():
@@ -512,19 +550,53 @@ def test_loopback_is_listened_on(host):
 # ---------------------------------------------------------------------------------------------- parameters
 
 
+def parameters(**options):
+    """Values by name of a parameter file of ArduPilot."""
+    text = parameter_file(ParameterOptions(firmware="ardupilot", **options))
+    return dict(line.split(",") for line in text.splitlines() if not line.startswith("#"))
+
+
 def test_parameter_files():
-    text = parameter_file("ardupilot", "vision_position_estimate", delay_ms=120, max_sigma_m=10.0)
-    values = dict(line.split(",") for line in text.splitlines() if not line.startswith("#"))
+    values = parameters(message="vision_position_estimate", delay_ms=120)
     assert (values["VISO_TYPE"], values["VISO_DELAY_MS"], values["EK3_SRC1_POSXY"]) == ("1", "120", "6")
-    gps = parameter_file("ardupilot", "gps_input", delay_ms=0, max_sigma_m=10.0)
-    assert "GPS1_TYPE,14\n" in gps
-    px4 = parameter_file("px4", "global_position_sensor", delay_ms=120, max_sigma_m=10.0)
-    rows = [line.split("\t") for line in px4.splitlines() if not line.startswith("#")]
+    assert values["GPS1_TYPE"] == "0"
+    text = parameter_file(ParameterOptions(firmware="px4", message="global_position_sensor", delay_ms=120))
+    rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     assert all(len(row) == 5 and row[:2] == ["1", "1"] and len(row[2]) <= 16 for row in rows)
     assert ["1", "1", "EKF2_AGP0_CTRL", "1", "6"] in rows
-    assert "EKF2_EV_CTRL\t1\t6" in parameter_file("px4", "odometry", delay_ms=0, max_sigma_m=10.0)
+    assert "EKF2_EV_CTRL\t1\t6" in parameter_file(ParameterOptions(firmware="px4", message="odometry"))
     with pytest.raises(OptionError, match="250"):
-        parameter_file("ardupilot", "vision_position_estimate", delay_ms=251, max_sigma_m=10.0)
+        ParameterOptions(firmware="ardupilot", message="vision_position_estimate", delay_ms=251)
+
+
+def test_a_take_off_with_gnss_leaves_the_receiver_in_the_first_source_set_and_a_switch():
+    values = parameters(message="vision_position_estimate", takeoff="gnss")
+    assert (values["EK3_SRC1_POSXY"], values["EK3_SRC2_POSXY"], values["RC7_OPTION"]) == ("3", "6", "90")
+    assert "GPS1_TYPE" not in values
+    assert {"FS_EKF_ACTION", "FS_EKF_THRESH"} <= set(values)
+    with pytest.raises(OptionError, match="takeoff: expected none for px4"):
+        ParameterOptions(firmware="px4", message="odometry", takeoff="gnss")
+
+
+def test_gps_input_stands_beside_a_receiver_as_the_second():
+    values = parameters(message="gps_input", takeoff="gnss", gps_id=1, delay_ms=30)
+    assert (values["GPS2_TYPE"], values["GPS2_DELAY_MS"]) == ("14", "30")
+    assert parameters(message="gps_input", delay_ms=0)["GPS1_DELAY_MS"] == "1"  # 0 would mean 200
+    assert fix_message(sending(), MavlinkOptions(message="gps_input", gps_id=1)).gps_id == 1
+    with pytest.raises(OptionError, match="gps_id: expected 1 or more beside a receiver"):
+        ParameterOptions(firmware="ardupilot", message="gps_input", takeoff="gnss")
+    with pytest.raises(OptionError, match="gps_id: expected with gps_input only"):
+        MavlinkOptions(gps_id=1)
+
+
+def test_the_delay_is_what_the_last_bridge_measured(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    words = ["bridge", "mavlink-params", "--force", "--out", str(tmp_path / "x.param")]
+    assert main(words) == 0
+    assert "100 ms" in capsys.readouterr().err
+    remember_delay(33.4)
+    assert main(words) == 0
+    assert "VISO_DELAY_MS,33\n" in (tmp_path / "x.param").read_text(encoding="utf-8")
 
 
 def test_the_command_line_writes_them_and_refuses_in_one_line(tmp_path, capsys):
@@ -549,7 +621,7 @@ class Standin:
 
     BOOT_NS = 5_000_000_000
 
-    def __init__(self, port, *, origin=None, key=None, system=1):
+    def __init__(self, port, *, origin=None, key=None, system=1, local=True, receiver=None, flags=None):
         self.mav = autopilot(key, system=system)
         self.parser = mavlink.MAVLink(None)
         self.parser.robust_parsing = True
@@ -557,6 +629,7 @@ class Standin:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.connect(("127.0.0.1", port))
         self.socket.settimeout(0.02)
+        self.local, self.receiver, self.flags, self.armed = local, receiver, flags, False
         self.origin, self.got, self.silent, self.over = origin, [], False, threading.Event()
         self.thread = threading.Thread(target=self.run)
         self.begin_ns = time.monotonic_ns()
@@ -583,10 +656,19 @@ class Standin:
         while not self.over.is_set():
             ms = self.boot_ns() // 1_000_000
             if tick % 10 == 0:
-                self.send(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+                self.send(mavlink.MAVLink_heartbeat_message(2, 3, 128 if self.armed else 0, 0, 4, 3))
                 self.send(mavlink.MAVLink_timesync_message(0, self.boot_ns()))
             self.send(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.5, 0, 0, 0))
-            self.send(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -100.0, 0, 0, 0))
+            if self.local:
+                self.send(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -100.0, 0, 0, 0))
+            if self.receiver is not None:
+                fix_type, lat_1e7, lon_1e7 = self.receiver
+                more = {"h_acc": 1000}
+                self.send(
+                    mavlink.MAVLink_gps_raw_int_message(0, fix_type, lat_1e7, lon_1e7, 0, 0, 0, 0, 0, 9, **more)
+                )
+            if self.flags is not None:
+                self.send(mavlink.MAVLink_ekf_status_report_message(self.flags, 0, 0, 0, 0, 0))
             self.send(mavlink.MAVLink_global_position_int_message(ms, 1, 1, 0, 100_000, 0, 0, 0, 0))
             tick += 1
             self.listen()
@@ -743,6 +825,111 @@ def test_an_origin_that_is_there_is_not_set_again(bridge_to):
     with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 5)
         assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
+
+
+def test_without_a_position_the_height_above_home_is_sent(bridge_to):
+    """ArduPilot has no local position before the first fix, and must get that fix all the same."""
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000), local=False) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 3)
+        assert pilot.of("VISION_POSITION_ESTIMATE")[-1][0].z == pytest.approx(-100.0)
+        pilot.local = True
+
+
+def test_the_height_goes_on_where_the_local_position_ends():
+    """Home is 20 m above the origin, so that 100 m above home is 120 m above the origin."""
+    telemetry = MavlinkTelemetry()
+    for ms in range(0, 3000, 100):
+        now_ns = 10_000_000_000 + ms * 1_000_000
+        if ms < 1000:
+            telemetry.update(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -120.0, 0, 0, 0), now_ns)
+        telemetry.update(mavlink.MAVLink_global_position_int_message(ms, 1, 1, 0, 100_000, 0, 0, 0, 0), now_ns)
+    assert telemetry.vehicle(now_ns).down_m == pytest.approx(-120.0)
+
+
+@pytest.mark.parametrize(("flags", "known"), [(831, True), (831 & ~2, False), (831 | 128, False), (167, False)])
+def test_a_velocity_that_the_estimator_does_not_know_is_none(flags, known):
+    telemetry = MavlinkTelemetry()
+    telemetry.update(mavlink.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0), 10_000_000_000)
+    telemetry.update(mavlink.MAVLink_global_position_int_message(5, 1, 1, 0, 9, 0, 0, 0, 0), 10_000_000_000)
+    assert (telemetry.vehicle(10_000_000_000).east_velocity_mps is not None) == known
+
+
+def test_each_firmware_is_asked_for_what_it_has(bridge_to):
+    made = bridge_to()
+    with Standin(made.port) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("COMMAND_LONG")) >= 8)
+        asked = {
+            m.param1 for m, _ in pilot.of("COMMAND_LONG") if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        }
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE not in asked  # "No ap_message for mavlink id 141"
+    assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in asked
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE in REQUESTED_RATES_HZ["px4"]
+
+
+def test_an_autopilot_whose_receiver_may_still_get_a_fix_sets_its_origin_itself(bridge_to, monkeypatch):
+    monkeypatch.setattr("engine.adapters.mavlink._ORIGIN_TIMEOUT_NS", 300_000_000)
+    made = bridge_to(origin=ORIGIN)
+    with Standin(made.port, receiver=(1, 0, 0)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("TIMESYNC")) > 6)
+        assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
+        pilot.receiver = (0, 0, 0)  # there is none after all
+        fly(made.bridge, lambda: pilot.of("SET_GPS_GLOBAL_ORIGIN"))
+
+
+def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(bridge_to):
+    """ArduPilot's check wants a message of visual odometry in the last 0.3 s; its quality says it is no fix."""
+    made = bridge_to()
+    made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("ODOMETRY")) >= 5)
+        assert {m.quality for m, _ in pilot.of("ODOMETRY")} == {-1}
+        pilot.armed = True
+        fly(made.bridge, lambda: made.bridge.telemetry.armed)
+        before = len(pilot.of("ODOMETRY"))
+        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+        assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
+        assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_the_pilot_is_told_when_fixes_begin_and_stop(bridge_to, monkeypatch):
+    monkeypatch.setattr("engine.adapters.notices._STOPPED_S", 0.3)
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("STATUSTEXT"))
+        made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 2)
+        made.navigator.result = None
+        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 3)
+        texts = [m.text for m, _ in pilot.of("STATUSTEXT")]
+    assert texts[0] == texts[2] == "Scenematch: fixes begin"
+    assert re.fullmatch(r"Scenematch: fixes stopped, \d+ refused: no texture", texts[1])
+
+
+def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(bridge_to):
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+        made.navigator.result = fix(east_m=40.0)
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 10)
+        before = len(pilot.of("VISION_POSITION_ESTIMATE"))
+        assert any(m.text.startswith("Scenematch: map doubted, 40 m off") for m, _ in pilot.of("STATUSTEXT"))
+        station = autopilot(system=255, component=190)  # on the vehicle's link, as an autopilot passes it on
+        number = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+        pilot.socket.send(word.pack(station))
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
+        assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_the_first_fixes_are_held_against_the_receiver(bridge_to):
+    site = SimpleNamespace(frame=LocalFrame(33.64, 72.99))
+    made = bridge_to(site=site)
+    made.navigator.result = fix(east_m=40.0)
+    with Standin(made.port, origin=(336400000, 729900000, 510000), receiver=(3, 336400000, 729900000)) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
+        made.navigator.result = fix(east_m=1.0)
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
 
 
 def test_reset_counter_steps_once_per_relocalisation(bridge_to):

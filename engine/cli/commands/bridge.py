@@ -10,6 +10,7 @@ import typer
 
 from engine.cli import console
 from engine.cli.options import (
+    BridgeDeadlineOption,
     CameraOption,
     CameraPitchOption,
     DeadlineOption,
@@ -64,15 +65,22 @@ def mavlink(
         typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless given."),
     ] = None,
     camera_source: Annotated[
-        str | None, typer.Option("--camera-source", metavar="N|URL", help="A camera or stream, by OpenCV.")
+        str | None,
+        typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
     ] = None,
     exposure_to_grab_ms: Annotated[
         float | None,
         typer.Option("--exposure-to-grab-ms", metavar="MS", help="How long its pictures take to get here."),
     ] = None,
+    gimbal: Annotated[
+        bool, typer.Option("--gimbal", help="The camera hangs on a gimbal that the autopilot reports.")
+    ] = False,
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
     max_sigma_m: MaxSigmaOption = 10.0,
+    gps_id: Annotated[
+        int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
+    ] = 0,
     system_id: Annotated[
         int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
     ] = 1,
@@ -93,12 +101,19 @@ def mavlink(
     use_velocity: Annotated[
         bool, typer.Option("--velocity/--no-velocity", help="Whether the autopilot's velocity is used.")
     ] = True,
+    check_gnss: Annotated[
+        bool,
+        typer.Option("--check-gnss/--no-check-gnss", help="Hold the first fixes against its GNSS receiver."),
+    ] = True,
     method: MethodOption = "auto",
     weights: WeightsOption = None,
     start: StartOption = None,
     device: DeviceOption = "auto",
-    deadline_ms: DeadlineOption = 121.0,
+    deadline_ms: BridgeDeadlineOption = None,
     seconds: SecondsOption = None,
+    supervise: Annotated[
+        bool, typer.Option("--supervise", help="Replace a worker that is killed, with all that is loaded.")
+    ] = False,
     recording: RerunOption = None,
     viewer: RerunConnectOption = None,
     threads: ThreadsOption = 1,
@@ -117,29 +132,72 @@ def mavlink(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
         camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
         map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
-        camera_pitch_deg=camera_pitch_deg,
+        camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
     )  # fmt: skip
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
         message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
-        use_velocity=use_velocity,
+        use_velocity=use_velocity, check_gnss=check_gnss, gps_id=gps_id,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
         seconds=seconds,
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
-    status = run_mavlink_bridge(files, link, settings, live_view=live_view, progress=console.PROGRESS)
+    status = run_mavlink_bridge(
+        files, link, settings, supervise=supervise, live_view=live_view, progress=console.PROGRESS
+    )
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
+
+
+def camera_delay(
+    connect: Annotated[
+        str,
+        typer.Option("--connect", metavar="LINK", help="The autopilot, as of bridge mavlink."),
+    ],
+    camera: CameraOption,
+    camera_source: Annotated[
+        str,
+        typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
+    ],
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=5.0, metavar="S", help="How long pictures are taken.")
+    ] = 20.0,
+    listen_anywhere: Annotated[
+        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """How late a camera's pictures arrive.
+
+    Compares the turns that the pictures show with those of the autopilot's attitude, while the vehicle is tilted
+    to and fro by hand. The result is for --exposure-to-grab-ms.
+    """
+    from engine.runs.camera_delay import measure_camera_delay
+
+    found = measure_camera_delay(
+        connect, camera, camera_source, seconds=seconds, listen_anywhere=listen_anywhere, progress=console.PROGRESS
+    )
+    values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
+    console.facts(values, as_json, title=f"camera {camera_source}")
 
 
 def mavlink_params(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Parameter file, created by this run.")],
     firmware: FirmwareOption = "ardupilot",
     message: MessageOption = "",
+    takeoff: Annotated[
+        str, typer.Option("--takeoff", metavar="none|gnss", help="What ArduPilot takes off with.")
+    ] = "none",
+    gps_id: Annotated[
+        int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
+    ] = 0,
     delay_ms: Annotated[
-        int, typer.Option("--delay-ms", metavar="MS", help="From capture to arrival; the bridge prints it.")
-    ] = 100,
+        int | None,
+        typer.Option(
+            "--delay-ms", metavar="MS", help="From capture to arrival; else as the last bridge measured."
+        ),
+    ] = None,
     max_sigma_m: MaxSigmaOption = 10.0,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
 ) -> None:
@@ -147,10 +205,19 @@ def mavlink_params(
 
     Writes the file that tells ArduPilot or PX4 to fly by the bridge's fixes.
     """
-    from engine.runs.mavlink_bridge import write_parameter_file
+    from engine.runs.mavlink_parameters import write_parameter_file
 
-    write_parameter_file(firmware, message, out, delay_ms=delay_ms, max_sigma_m=max_sigma_m, force=force)
-    console.say(f"written to {out}")
+    written_ms = write_parameter_file(
+        firmware,
+        message,
+        out,
+        takeoff=takeoff,
+        gps_id=gps_id,
+        delay_ms=delay_ms,
+        max_sigma_m=max_sigma_m,
+        force=force,
+    )
+    console.say(f"written to {out}, for a delay of {written_ms} ms")
 
 
 def ros(

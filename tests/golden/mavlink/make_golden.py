@@ -62,9 +62,9 @@ PACKETS = {
     "px4-odometry": odometry(mavlink.MAV_FRAME_LOCAL_NED, PX4),
     "ardupilot-gps_input": mavlink.MAVLink_gps_input_message(
         time_usec=12345678, gps_id=0, ignore_flags=0, time_week_ms=week_ms % 604_800_000,
-        time_week=week_ms // 604_800_000, fix_type=3, lat=336410000, lon=729920000, alt=630.0, hdop=1.0, vdop=1.0,
+        time_week=week_ms // 604_800_000, fix_type=3, lat=336410000, lon=729920000, alt=630.0, hdop=0.5, vdop=0.5,
         vn=-2.5, ve=1.5, vd=-0.5, speed_accuracy=0.7, horiz_accuracy=0.5, vert_accuracy=0.5,
-        satellites_visible=10, yaw=0,
+        satellites_visible=20, yaw=0,
     ),
     "px4-global_position_sensor": mavlink.MAVLink_global_position_sensor_message(
         target_system=0, target_component=0, id=1, time_usec=12345678 + 80000, processing_time=80000,

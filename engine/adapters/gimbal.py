@@ -1,0 +1,69 @@
+"""A camera on a gimbal: the attitude of a body that would hold the camera as its calibration's mount says.
+
+The gimbal turns the mount for each frame in this way, and a camera that looks straight down, where a gimbal's own
+roll and yaw are the same turn, has a level body.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from engine.geo import attitude_from_rotation, enu_from_body
+from engine.values import Attitude
+
+Array = NDArray[np.float64]
+
+_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # mount of a camera that looks ahead
+_EARTH_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+_VEHICLE_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+_LOCKED_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK  # what older devices state instead of either
+
+
+def body_behind(enu_from_gimbal: Array, mount: Array) -> Attitude:
+    """The body that holds a camera by its mount where a gimbal points it.
+
+    Args:
+        enu_from_gimbal: (3, 3) rotation from the gimbal's forward, right and down axes.
+        mount: (3, 3) of the calibration, v_body = mount @ v_camera.
+    """
+    return Attitude(*attitude_from_rotation(enu_from_gimbal @ _FORWARD @ mount.T))
+
+
+def from_device(q: list[float], flags: int, heading_deg: float) -> Array | None:
+    """The rotation that GIMBAL_DEVICE_ATTITUDE_STATUS states; None where it states none.
+
+    Args:
+        q: w, x, y, z, of a level frame that faces north or, by the flags, where the vehicle faces.
+        flags: of the device.
+        heading_deg: of the vehicle.
+
+    Returns:
+        (3, 3) from the gimbal's axes to east, north and up.
+    """
+    if not all(map(math.isfinite, q)) or not 0.9 < math.hypot(*q) < 1.1:
+        return None
+    is_of_earth = bool(flags & _EARTH_YAW) or (bool(flags & _LOCKED_YAW) and not flags & _VEHICLE_YAW)
+    return enu_from_body(0.0, 0.0, 0.0 if is_of_earth else heading_deg) @ _rotation(q)
+
+
+def from_mount(roll_deg: float, pitch_deg: float, yaw_deg: float, heading_deg: float) -> Array | None:
+    """The rotation that MOUNT_ORIENTATION states, whose yaw is about the vehicle; None where it states none."""
+    if not all(map(math.isfinite, (roll_deg, pitch_deg, yaw_deg))):
+        return None
+    return enu_from_body(roll_deg, pitch_deg, yaw_deg + heading_deg)
+
+
+def _rotation(q: list[float]) -> Array:
+    """(3, 3) of a quaternion w, x, y, z."""
+    w, x, y, z = np.asarray(q) / math.hypot(*q)
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )

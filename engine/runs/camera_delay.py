@@ -1,0 +1,97 @@
+"""Measure how late a camera's pictures arrive, by the attitude of the autopilot that it is mounted on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from engine.adapters.links import parse_connection
+from engine.adapters.pictures import CapturedImage, capture
+from engine.camera import Camera
+from engine.errors import BackendError, TelemetryError, require
+from engine.lag import Lag, camera_lag, turn_between
+from engine.runs.folders import StrPath
+from engine.runs.progress import SILENT, Progress
+from engine.values import Frame, NoFix, Reason
+
+if TYPE_CHECKING:
+    from engine.adapters.mavlink_in import MavlinkTelemetry
+
+_SAMPLE_NS = 20_000_000  # of the attitude
+_SETTLED_NS = 200_000_000  # after which no older attitude arrives
+
+
+class _Idle:
+    """A navigator that has nothing to do: the bridge is opened for its telemetry."""
+
+    def update(self, frame: Frame, prior: object = None, budget: object = None) -> NoFix:
+        return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
+
+
+def measure_camera_delay(
+    connect: str,
+    camera: StrPath,
+    camera_source: str,
+    *,
+    seconds: float = 20.0,
+    listen_anywhere: bool = False,
+    progress: Progress = SILENT,
+) -> Lag:
+    """The time from exposure to grab, while the vehicle is tilted to and fro by hand over a textured ground.
+
+    Args:
+        connect: the autopilot, as of the bridge.
+        camera: calibration.
+        camera_source: as of the bridge.
+        seconds: how long pictures are taken.
+        listen_anywhere: allow udpin on addresses that other machines reach.
+        progress: is shown what to do.
+
+    Raises:
+        BackendError: the link cannot be opened.
+        TelemetryError: the camera does not open, or what it shows does not agree with the attitude.
+    """
+    require("pymavlink", "mavlink")
+    from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions
+
+    model = Camera.load(Path(camera))
+    connection = parse_connection(connect, listen_anywhere=listen_anywhere)
+    try:
+        bridge = MavlinkBridge(connection, lambda _: _Idle(), MavlinkOptions())  # type: ignore[arg-type,return-value]
+    except OSError as error:
+        raise BackendError(f"connect: {connect} cannot be opened: {error.strerror or error}") from None
+    progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")
+    with bridge:
+        times_s, turns_rad, attitude = _recorded(bridge.telemetry, capture(camera_source), model.focal_px, seconds)
+    if not attitude:
+        raise TelemetryError(f"connect: expected an autopilot that reports its attitude, got none on {connect}")
+    return camera_lag(np.array(times_s), np.array(turns_rad), np.array(attitude), model.mount)
+
+
+def _recorded(
+    telemetry: MavlinkTelemetry, pictures: Iterator[CapturedImage | None], focal_px: float, seconds: float
+) -> tuple[list[float], list[float], list[tuple[float, float, float, float]]]:
+    """Arrival times of pictures, the turns between them, and samples of the attitude."""
+    times_s, turns_rad, attitude, before = [], [], [], None
+    begin_ns = next_ns = time.monotonic_ns()
+    for picture in pictures:
+        now_ns = time.monotonic_ns()
+        while next_ns < now_ns - _SETTLED_NS:
+            state = telemetry.vehicle(next_ns)
+            if state.roll_deg is not None and state.pitch_deg is not None and state.heading_deg is not None:
+                attitude.append((next_ns * 1e-9, state.roll_deg, state.pitch_deg, state.heading_deg))
+            next_ns += _SAMPLE_NS
+        if picture is not None:
+            gray = np.asarray(cv2.cvtColor(picture[0], cv2.COLOR_RGB2GRAY), np.uint8)
+            if before is not None:
+                turns_rad.append(turn_between(before, gray, focal_px))
+            before = gray
+            times_s.append(picture[1] * 1e-9)
+        if (now_ns - begin_ns) * 1e-9 > seconds:
+            break
+    return times_s, turns_rad, attitude

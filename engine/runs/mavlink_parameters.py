@@ -1,0 +1,52 @@
+"""Write the parameter file of an autopilot that flies by the bridge's fixes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from engine.adapters.delay_memory import measured_delay_ms
+from engine.adapters.parameters import ParameterOptions, parameter_file
+from engine.errors import require
+from engine.runs.folders import StrPath, check_file
+from engine.runs.mavlink_bridge import outgoing_options
+
+_DEFAULT_DELAY_MS = 100
+
+
+def write_parameter_file(
+    firmware: str,
+    message: str,
+    out: StrPath,
+    *,
+    takeoff: str = "none",
+    gps_id: int = 0,
+    delay_ms: int | None = None,
+    max_sigma_m: float = 10.0,
+    force: bool = False,
+) -> int:
+    """Write the parameters that let an autopilot fly by the bridge's fixes.
+
+    Args:
+        firmware: "ardupilot" or "px4".
+        message: that is sent; "" is the firmware's usual one.
+        out: the file.
+        takeoff: "none" without GNSS, or "gnss", from which ArduPilot is switched over in flight.
+        gps_id: receiver that GPS_INPUT poses as.
+        delay_ms: from capture to arrival; None is what the last bridge with a camera measured, else 100.
+        max_sigma_m: of the fixes that are sent.
+        force: whether the file may be there already.
+
+    Returns:
+        The delay that was written.
+    """
+    require("pymavlink", "mavlink")
+    out, outgoing = Path(out), outgoing_options(firmware, message, max_sigma_m, gps_id)
+    delay_ms = (measured_delay_ms() or _DEFAULT_DELAY_MS) if delay_ms is None else delay_ms
+    options = ParameterOptions(
+        firmware=firmware, message=outgoing.kind, takeoff=takeoff, gps_id=gps_id, delay_ms=delay_ms,
+        max_sigma_m=max_sigma_m,
+    )  # fmt: skip
+    text = parameter_file(options)
+    check_file(out, force)
+    out.write_text(text, encoding="utf-8")
+    return delay_ms

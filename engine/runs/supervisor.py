@@ -1,0 +1,97 @@
+"""A supervisor: what is slow to load is loaded once, and a worker that dies is replaced by a copy of it.
+
+The parent has loaded map and matcher and does nothing but wait. Its children, copies made by ``fork``, have all of
+it from their first instruction on.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import signal
+import struct
+import threading
+import time
+from typing import Any
+
+from engine.errors import OptionError
+from engine.runs.progress import SILENT, Progress
+from engine.values import Fix, Prior
+
+_PAUSE_S, _MAX_PAUSE_S = 0.05, 5.0  # before a worker is replaced; doubled where one after the other dies at once
+_SHORT_S = 5.0
+_MAX_AGE_S = 60.0  # of a position with which a worker starts
+_POSITION = struct.Struct("=dddd")
+
+
+class SharedPosition:
+    """The last fix of a worker, in memory that it shares with those that replace it."""
+
+    def __init__(self) -> None:
+        self._memory = mmap.mmap(-1, _POSITION.size)
+
+    def keep(self, fix: Fix) -> None:
+        """Remember a fix that was just given."""
+        self._memory[:] = _POSITION.pack(fix.east_m, fix.north_m, fix.sigma_m, time.monotonic())
+
+    def prior(self, max_speed_mps: float) -> Prior | None:
+        """Where the vehicle can be by now; None where nothing was kept, or too long ago."""
+        east_m, north_m, sigma_m, time_s = _POSITION.unpack(self._memory[:])
+        age_s = time.monotonic() - time_s
+        if time_s == 0.0 or age_s > _MAX_AGE_S:
+            return None
+        return Prior(east_m=east_m, north_m=north_m, sigma_m=sigma_m + max_speed_mps * age_s)
+
+
+def check_supervision(device: Any) -> None:
+    """Refuse what cannot be supervised.
+
+    Raises:
+        OptionError: the system cannot fork, or the device belongs to the process that has opened it.
+    """
+    if not hasattr(os, "fork"):
+        raise OptionError("supervise: expected a system that forks, as Linux does")
+    if device.type != "cpu":
+        raise OptionError(f"supervise: expected the device cpu, got {device.type}, which no copy of a process has")
+
+
+def become_worker(progress: Progress = SILENT) -> None:
+    """Return in a worker, again and again: the caller stays behind to replace those that are killed.
+
+    A worker that ends by itself, well or with an error, ends the supervisor, too, with its exit code. SIGTERM is
+    passed on; SIGINT, which a terminal sends to both, is left to the worker.
+    """
+    pause_s = _PAUSE_S
+    while True:
+        begin = time.monotonic()
+        worker = os.fork()
+        if worker == 0:
+            return
+        code, is_told = _wait(worker)
+        if code >= 0 or is_told:
+            os._exit(max(code, 0))
+        pause_s = min(2.0 * pause_s, _MAX_PAUSE_S) if time.monotonic() - begin < _SHORT_S else _PAUSE_S
+        progress.message(f"the worker was ended by signal {-code}; another takes over")
+        time.sleep(pause_s)
+
+
+def _wait(worker: int) -> tuple[int, bool]:
+    """The exit code of a worker, below 0 the signal that killed it, and whether it was told to end."""
+    told = []
+
+    def pass_on(number: int, _frame: object) -> None:
+        told.append(number)
+        os.kill(worker, number)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN), signal.signal(signal.SIGTERM, pass_on)
+    try:
+        return os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]), bool(told)
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+
+
+def end_on_sigterm() -> None:
+    """Let SIGTERM end a run as Ctrl-C does, with its table; in the main thread, where signals can be handled."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
