@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import enum
 import math
-from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.anchors import Anchor, RecentAnchors
 from engine.attitude_lag import AttitudeLag
 from engine.budget import Budget
 from engine.covariance import map_sigma_of
@@ -30,7 +30,6 @@ from engine.motion import (
     DriftModel,
     OdometrySample,
     PositionEstimate,
-    VelocityEstimate,
     en_m,
     is_valid,
 )
@@ -39,9 +38,6 @@ from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
 Array = NDArray[np.float64]
-
-_VELOCITY_S = 1.0  # over which the last fixes give a velocity
-_MEMORY_S = 5.0  # over which they must agree with measured velocities
 
 
 class Matcher(Protocol):
@@ -64,25 +60,6 @@ class NavigatorState(enum.Enum):
     TRACKING = "tracking"
     COASTING = "coasting"
     LOST = "lost"
-
-
-@dataclass(frozen=True, slots=True)
-class _Anchor:
-    """Where dead reckoning starts: the last accepted fix, or the start of the flight.
-
-    Attributes:
-        position: there.
-        sample: its odometry; None before the first frame.
-        fix: None for a start.
-        support: fixes that agreed one after the other up to this one.
-        disputed: the other source contradicted it, and its log-odds count that already.
-    """
-
-    position: PositionEstimate
-    sample: OdometrySample | None
-    fix: Fix | None = None
-    support: int = 0
-    disputed: bool = False
 
 
 class Navigator:
@@ -111,9 +88,8 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._attitude_lag = AttitudeLag(o.attitude_lag_s, o.attitude_jitter_s)
-        self._velocity: VelocityEstimate | None = None  # by the last fixes
-        self._recent: deque[_Anchor] = deque()  # the fixes of the last _MEMORY_S
-        self._anchor = None if start is None else _Anchor(position_of(start, matcher.site), None)
+        self._recent = RecentAnchors(self._drift)
+        self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
         self._hypotheses = Hypotheses(self._drift, o.gate)
         self._refusals = 0  # in a row
@@ -188,7 +164,7 @@ class Navigator:
             CalibrationError: the frame is not of the camera's resolution.
         """
         late = self._odometry.is_late(frame)
-        now = self._odometry.sample(frame, self._velocity)
+        now = self._odometry.sample(frame, self._recent.velocity)
         sources = self._sources(now, prior, late=late)
         shown = frame if late else self._attitude_lag.corrected(frame)
         result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
@@ -212,12 +188,12 @@ class Navigator:
 
     # ------------------------------------------------------------------------------------------ predictions
 
-    def _reckoned(self, now: OdometrySample, anchor: _Anchor | None = None) -> PositionEstimate | None:
+    def _reckoned(self, now: OdometrySample, anchor: Anchor | None = None) -> PositionEstimate | None:
         """Dead reckoning from an anchor, or from the last one."""
         anchor = anchor or self._anchor
         if anchor is None or anchor.sample is None:
             return None if anchor is None else anchor.position
-        drift_m = self._drift.sigma_m(anchor.sample, now, self._velocity)
+        drift_m = self._drift.sigma_m(anchor.sample, now, self._recent.velocity)
         sigma_m = min(math.hypot(anchor.position.sigma_m, drift_m), MAX_SIGMA_M)
         odds = 0.0 if self._refusals >= self._options.lost_after else anchor.position.log_odds
         if now.blind_s != anchor.sample.blind_s:
@@ -336,8 +312,9 @@ class Navigator:
         From frame to frame wrong matches may drift slowly enough; over seconds, measured velocities show it.
         """
         predictions = [self._reckoned(now)]
-        if self._recent and now.blind_s == _sample(self._recent[0]).blind_s:
-            predictions.append(self._reckoned(now, self._recent[0]))
+        oldest = self._recent.oldest
+        if oldest is not None and now.blind_s == oldest.odometry.blind_s:
+            predictions.append(self._reckoned(now, oldest))
         for estimate in predictions:
             known = estimate is not None and estimate.sigma_m <= self._options.trusted_sigma_m
             if estimate is not None and known and estimate.chi_square(fix) > self._options.gate:
@@ -364,26 +341,10 @@ class Navigator:
         support = count if last is None or jump else last.support + count
         odds = min(odds, log_odds(MAX_PROBABILITY))
         position = PositionEstimate(en_m(fix), fix.relative_sigma_m, odds, on_map=True)
-        self._anchor = _Anchor(position, now, fix, support, disputed)
-        self._note_velocity(self._anchor, jump=jump)
+        self._anchor = Anchor(position, now, fix, support, disputed)
+        self._recent.append(self._anchor, jump=jump)
         self._refusals, self._frames_lost, self._lost = 0, 0, False
         self._hypotheses.clear()
-
-    def _note_velocity(self, anchor: _Anchor, *, jump: bool) -> None:
-        """The velocity by the fixes of about the last second."""
-        if jump:
-            self._recent.clear()
-        self._recent.append(anchor)
-        now_s = _sample(anchor).time_s
-        while len(self._recent) > 2 and _sample(self._recent[1]).time_s <= now_s - _MEMORY_S:
-            self._recent.popleft()
-        long_ago = (a for a in reversed(self._recent) if _sample(a).time_s <= now_s - _VELOCITY_S)
-        first = next(long_ago, self._recent[0])
-        interval_s = now_s - _sample(first).time_s
-        self._velocity = None
-        if interval_s > 0.0:
-            sigma_m = math.hypot(anchor.position.sigma_m, first.position.sigma_m)
-            self._velocity = self._drift.velocity(anchor.position.en_m - first.position.en_m, sigma_m, interval_s)
 
     def _refuse_match(self, fix: Fix, against: PositionEstimate | None, odds: float) -> NoFix:
         """The refusal of a match that is not accepted."""
@@ -407,8 +368,3 @@ class Navigator:
             self._lost = self._lost or far or self._refusals >= options.lost_after
         elif self._refusals >= options.lost_after:
             self._anchor = None
-
-
-def _sample(anchor: _Anchor) -> OdometrySample:
-    assert anchor.sample is not None  # a fix has one
-    return anchor.sample
