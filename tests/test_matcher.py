@@ -505,7 +505,7 @@ def test_an_answer_after_the_budget_is_late_in_the_papers_profile(ground, camera
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["prior", "whole map"])
 def test_a_frame_of_another_town_is_refused_in_nearly_all_tries(other_site, sim_flight, method, known):
     matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
     results = [matcher.locate(shown, HERE if known else None) for shown in sim_flight.frames[:20]]

@@ -287,6 +287,7 @@ def check_readable_or_one_line(path, frames):
 # ---------------------------------------------------------------------------------------------- command line
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bare_runs")
 def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     from engine.runs.simulation import write_flight

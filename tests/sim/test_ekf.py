@@ -238,8 +238,8 @@ def test_errors_are_as_large_as_the_covariance_says(flights):
         assert 1.0 - spread < np.sum(squares) / freedom < 1.0 + spread, part
 
 
-def test_the_covariance_stays_positive_definite_and_symmetric(flights):
-    for rows in flights:
+def test_the_covariance_stays_positive_definite_and_symmetric():
+    for rows in [fly(seed, 12.0) for seed in (210, 211)]:
         for _, P, _ in rows:
             np.testing.assert_array_equal(P, P.T)
             assert np.linalg.eigvalsh(P)[0] > 0.0
