@@ -7,17 +7,19 @@ gives in to matches that agree with each other for long enough. Together they wo
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.motion import Array, DriftModel, OdometrySample, PositionEstimate, en_m
+from engine.motion import DriftModel, OdometrySample, PositionEstimate, en_m
 from engine.navigator_options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 
 TOLERANCE_M = 5.0
 """Contradictions that are smaller are left to the estimator's own gate."""
 _IN_A_ROW = 3  # matches that contradict the track before it is in dispute, and that agree before it is not
+_MEMORY_S = 3.0  # over which fixes are the track
 _MAX_GAP_S = 1.0  # between frames over which a measured velocity is integrated
 
 
@@ -32,10 +34,11 @@ class _Place:
 class TrackGuard:
     """Follows what the autopilot was sent, and matches that contradict it.
 
-    The track is in dispute once three matches in a row lie further from it than both their uncertainties explain,
-    and more than 5 m. While it is, no match is trusted that continues those matches, however vague the track
-    becomes meanwhile: only three in a row that agree with a track still known to 50 m end the dispute, or
-    :meth:`confirm`.
+    The track is the fixes of the last 3 s, carried on by the vehicle's velocity. A match contradicts it where it
+    contradicts most of them, so that one wrong fix is no track. It is in dispute once three matches in a row lie
+    further from it than both their uncertainties explain, and more than 5 m. While it is, no match is trusted that
+    continues those matches, however vague the track becomes meanwhile: only three in a row that agree with a track
+    still known to 50 m end the dispute, or :meth:`confirm`.
 
     Args:
         start: where the flight begins; None where that is not known.
@@ -47,7 +50,7 @@ class TrackGuard:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._now = OdometrySample(0.0, np.zeros(2), 0.0)
         self._newest_ns: int | None = None
-        self._track = None if start is None else _Place(start, self._now)
+        self._track: deque[_Place] = deque([] if start is None else [_Place(start, self._now)])
         self._rival: _Place | None = None  # the newest match that contradicted the track
         self._contradictions = self._agreements = 0
         self._distance_m = 0.0
@@ -65,13 +68,14 @@ class TrackGuard:
 
     def confirm(self) -> None:
         """Take the next fix for the track, wherever it is: an operator has vouched for it."""
-        self._track, self._rival = None, None
+        self._rival = None
+        self._track.clear()
         self._contradictions = self._agreements = 0
 
     def anchor(self, position: PositionEstimate) -> None:
         """Take another source's position at the newest frame for the track, until a first fix is sent."""
         if not self.has_fix:
-            self._track = _Place(position, self._now)
+            self._track = deque([_Place(position, self._now)])
 
     def advance(self, frame: Frame, time_ns: int) -> None:
         """Carry the odometry on to the time of a frame, by the velocity that came with it."""
@@ -91,10 +95,9 @@ class TrackGuard:
         fix = _match(result)
         if fix is None:
             return False
-        contradicts = self._contradicts(self._track, fix)
-        self._distance_m = (
-            0.0 if self._track is None else float(np.hypot(*(en_m(fix) - self._at(self._track).en_m)))
-        )
+        contradicts = 2 * sum(self._contradicts(place, fix) for place in self._track) > len(self._track)
+        if self._track:
+            self._distance_m = float(np.median([self._apart_m(place, fix) for place in self._track]))
         if self.is_disputed:
             self._settle(fix, contradicts=contradicts)
         else:
@@ -105,12 +108,15 @@ class TrackGuard:
             return False
         if isinstance(result, NoFix):
             return False
-        self._track, self._rival = here, None
+        self._track.append(here)
+        while self._now.time_s - self._track[0].sample.time_s > _MEMORY_S and len(self._track) > 1:
+            self._track.popleft()
+        self._rival = None
         return True
 
     def _settle(self, fix: Fix, *, contradicts: bool) -> None:
         """End a dispute where matches return to a track that is still known, and leave its rival."""
-        known = self._track is not None and self._at(self._track).sigma_m <= self._options.trusted_sigma_m
+        known = bool(self._track) and self._at(self._track[-1]).sigma_m <= self._options.trusted_sigma_m
         returned = known and not contradicts and not self._continues_rival(fix)
         self._agreements = self._agreements + 1 if returned else 0
         if self._agreements >= _IN_A_ROW:
@@ -119,13 +125,13 @@ class TrackGuard:
     def _continues_rival(self, fix: Fix) -> bool:
         return self._rival is not None and not self._contradicts(self._rival, fix)
 
-    def _contradicts(self, place: _Place | None, fix: Fix) -> bool:
+    def _contradicts(self, place: _Place, fix: Fix) -> bool:
         """Whether a fix is further from a place than the uncertainties explain, and than is tolerated."""
-        if place is None:
-            return False
-        estimate = self._at(place)
-        apart_m: Array = en_m(fix) - estimate.en_m
-        return float(np.hypot(*apart_m)) > TOLERANCE_M and estimate.chi_square(fix) > self._options.gate
+        is_far = self._apart_m(place, fix) > TOLERANCE_M
+        return is_far and self._at(place).chi_square(fix) > self._options.gate
+
+    def _apart_m(self, place: _Place, fix: Fix) -> float:
+        return float(np.hypot(*(en_m(fix) - self._at(place).en_m)))
 
     def _at(self, place: _Place) -> PositionEstimate:
         """The position of a place, carried on by odometry to the newest frame."""

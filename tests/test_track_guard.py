@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -127,3 +129,13 @@ def test_single_wrong_matches_are_no_dispute():
     for _ in range(10):
         assert not flight.step(shifted)
         assert flight.step(true)
+
+
+def test_one_wrong_fix_is_no_track():
+    """It agrees with a vague track, and what contradicts it afterwards is the truth."""
+    flight = Flight()
+    flight.fly(5.0, true)
+    flight.guard._track.append(
+        replace(flight.guard._track[-1], estimate=PositionEstimate(np.array([0.0, 99.0]), 0.3))
+    )
+    assert all(flight.fly(5.0, true))

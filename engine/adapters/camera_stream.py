@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any, Protocol
 
 import cv2
@@ -227,7 +227,7 @@ class CameraStream:
             source.close()
 
 
-def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Iterator[tuple[Image, int] | None]:
+def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple[Image, int] | None, None, None]:
     """Capture pictures from a camera or stream, for ever.
 
     Args:

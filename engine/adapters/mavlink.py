@@ -236,14 +236,14 @@ class MavlinkBridge:
             cause = "receiver not heard yet"
         if cause is None and not self._send(fix_message(report, self._options)):
             cause = "link down"
-        if cause is None:
-            self._guard.has_fix = True
-            self._counters.add_sent(report.age_ms)
-            if self._on_sent is not None:
-                self._on_sent(fix)
-        else:
+        if cause is not None:
             self._counters.add_withheld(cause)
-        return cause
+            return cause
+        self._guard.has_fix = True
+        self._counters.add_sent(report.age_ms)
+        if self._on_sent is not None:
+            self._on_sent(fix)
+        return None
 
     def _awaits_receiver(self) -> bool:
         """Whether the first fix waits for what the autopilot says of its receiver, which is asked for."""
@@ -357,16 +357,15 @@ class MavlinkBridge:
     def _request_streams(self, now_ns: int) -> None:
         """Request the telemetry messages and the origin; set an origin where the autopilot has none."""
         for number, rate_hz in self._rates_hz.items():
-            self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
-        self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+            interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz
+            self._send(command_message(self._system_id, *interval))
+        origin = mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+        self._send(command_message(self._system_id, *origin))
         # An autopilot with a receiver sets its origin itself, in a better place, when that has a fix.
         waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if self.telemetry.has_receiver else _ORIGIN_TIMEOUT_NS
         wanted = self._origin is not None and self._options.kind != "gps_input"
         if self._origin is not None and wanted and now_ns - self._without_origin_ns > waited_ns:
             self._send(set_origin_message(self._system_id, self._origin, now_ns))
-
-    def _command(self, command: int, *values: float) -> None:
-        self._send(command_message(self._system_id, command, *values))
 
     def _is_due(self, task: str, now_ns: int, period_s: float) -> bool:
         due = now_ns - self._last_done_ns[task] >= round(period_s * 1e9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ CapturedImage = tuple[NDArray[np.uint8], int]
 
 def replay(
     frames: Path, telemetry: Path | None, *, rate_hz: float, wait: Callable[[], None] | None = None
-) -> Iterator[CapturedImage]:
+) -> Generator[CapturedImage, None, None]:
     """Replay a folder of images or a video in real time.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,8 +67,8 @@ def measure_camera_delay(
     except OSError as error:
         raise BackendError(f"connect: {connect} cannot be opened: {error.strerror or error}") from None
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")
-    with bridge:
-        times_s, turns_rad, attitude = _recorded(bridge.telemetry, capture(camera_source), model.focal_px, seconds)
+    with bridge, closing(capture(camera_source)) as pictures:
+        times_s, turns_rad, attitude = _recorded(bridge.telemetry, pictures, model.focal_px, seconds)
     if not attitude:
         raise TelemetryError(f"connect: expected an autopilot that reports its attitude, got none on {connect}")
     return camera_lag(np.array(times_s), np.array(turns_rad), np.array(attitude), model.mount)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -102,7 +102,7 @@ class BridgeFiles:
         """What is said of the camera."""
         return CameraFiles(calibration=Path(self.camera), mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
 
-    def pictures(self, wait: Callable[[], None] | None = None) -> Iterator[CapturedImage | None]:
+    def pictures(self, wait: Callable[[], None] | None = None) -> Generator[CapturedImage | None, None, None]:
         """Pictures as they are captured, None where a camera gives none for a while.
 
         Those of a flight that is played begin when ``wait`` returns.
@@ -283,7 +283,10 @@ def run_mavlink_bridge(
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
             pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
-            with suppress(KeyboardInterrupt):  # the usual end beside a camera, and no reason to lose the counts
+            with (
+                closing(pictures),
+                suppress(KeyboardInterrupt),
+            ):  # the usual end beside a camera, and no reason to lose the counts
                 _run(bridge, pictures, camera, settings.seconds, progress)
             if files.camera_source is not None:
                 remember_delay(bridge.status.least_age_ms)
