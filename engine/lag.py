@@ -30,12 +30,15 @@ class Lag:
 
 
 def turn_between(first: NDArray[np.uint8], second: NDArray[np.uint8], focal_px: float) -> float:
-    """Angle in radians by which the optical axis turned, as the shift of a picture shows it.
+    """Angle by which the optical axis turned, as the shift of a picture shows it.
 
     Args:
         first: (H, W) grey.
         second: (H, W) grey.
         focal_px: of the camera at this size.
+
+    Returns:
+        Radians.
     """
     scale = _SMALL_PX / first.shape[1]
     size = (_SMALL_PX, max(8, round(first.shape[0] * scale)))
@@ -53,6 +56,9 @@ def camera_lag(times_s: Array, turns_rad: Array, attitude: Array, mount: Array, 
         attitude: (M, 4) time in seconds, roll, pitch and heading in degrees, on the same clock.
         mount: (3, 3) of the camera on the vehicle.
         max_lag_s: largest delay that is tried.
+
+    Returns:
+        Lag: the delay of best agreement.
 
     Raises:
         TelemetryError: too few pictures, too little movement, or pictures and attitude do not agree.

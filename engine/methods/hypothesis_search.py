@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 
 _MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
+_MAX_COARSE_PX = 4_000_000  # of the map, likewise
 _MIN_TEMPLATE_PX = 20
 _CANDIDATES = 8
 _SEMIFINALISTS = 4
@@ -69,8 +70,9 @@ def _coarse_level(correlator: Correlator, first: Aligned, window: Window) -> tup
     while True:
         h, w = (n >> (level - first.level) for n in first.template.shape)
         turns, shares = _grid(correlator.options, math.hypot(h, w) / 2.0)
-        places = len(turns) * len(shares) * window.area_px / 4**level
-        if places <= _MAX_COARSE_PLACES or level + 1 == levels or min(h, w) >> 1 < _MIN_TEMPLATE_PX:
+        area_px = window.area_px / 4**level
+        few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= _MAX_COARSE_PLACES
+        if few or level + 1 == levels or min(h, w) >> 1 < _MIN_TEMPLATE_PX:
             return level, _hypotheses(correlator.query.telemetry, turns, shares)
         level += 1
 

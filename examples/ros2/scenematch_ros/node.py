@@ -2,12 +2,10 @@
 
 import sys
 
+from engine import EngineError, OptionError, set_threads
 from engine.adapters.ros import RosTopics
 from engine.adapters.ros2 import Node
-from engine.device import set_threads
-from engine.errors import EngineError, OptionError
-from engine.runs.mavlink_bridge import BridgeSettings
-from engine.runs.ros_bridge import RosSettings, run_ros_bridge
+from engine.runs import BridgeSettings, RosSettings, run_ros_bridge
 
 FILES = ("map", "surface", "camera", "start", "origin", "mount")
 """Parameters of text; an empty one is not given."""
@@ -35,7 +33,7 @@ def settings_of(node):
     matching = BridgeSettings(
         method=node.parameter("method", "auto"),
         device=node.parameter("device", "auto"),
-        deadline_ms=node.parameter("deadline_ms", BridgeSettings().deadline_ms),
+        deadline_ms=node.parameter("deadline_ms", BridgeSettings().live_options().deadline_ms),
         start=text["start"],
     )
     return ros, matching
