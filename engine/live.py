@@ -92,7 +92,7 @@ class Live:
         deliver: takes each answer, one at a time, from one of the engine's threads.
         start: where the flight begins.
         options: settings.
-        clock_ns: on which frames are captured and grow old, such as a simulator's.
+        clock_ns: on which frames are captured and grow old, such as a simulator's; None is ``time.monotonic_ns``.
 
     Convention:
         Python cannot stop a thread: one that hangs is left behind, and nothing of it is used any more. A hang that
@@ -105,10 +105,10 @@ class Live:
         deliver: Callable[[Answer], None],
         start: Prior | None = None,
         options: LiveOptions | None = None,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        clock_ns: Callable[[], int] | None = None,
     ) -> None:
         self._make_navigator, self._deliver = make_navigator, deliver
-        self._options, self._clock_ns = options or LiveOptions(), clock_ns
+        self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
         self._last: tuple[Fix, int] | None = None
         self._changed = threading.Condition()
         self._delivering = threading.Lock()

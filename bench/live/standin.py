@@ -294,6 +294,8 @@ class Standin:
         for message in self._parser.parse_buffer(data) or []:
             kind = message.get_type()
             self.heard[kind] += 1
+            if kind == "ODOMETRY" and message.quality < 0:
+                continue  # the camera works, and there is no position
             if kind in ("VISION_POSITION_ESTIMATE", "ODOMETRY", "GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
                 self._on_fix(message, self.now_ns)
             elif kind == "TIMESYNC" and message.tc1 == 0:
