@@ -132,16 +132,22 @@ def _improbable_peak(features: PeakFeatures, confidence: float, rule: PeakRule) 
     return Reason.AMBIGUOUS, _improbable(confidence, rule.min_confidence, figures, chi_square_text)
 
 
-def judge_pose(features: PoseFeatures, confidence: float, min_confidence: float) -> Refusal | None:
+def judge_pose(
+    features: PoseFeatures, confidence: float, null_log10_nfa: float, min_confidence: float
+) -> Refusal | None:
     """The reason to refuse a pose by matched features, or None where it is accepted.
 
     Args:
         features: of the confidence model.
         confidence: that the model gives them.
+        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches, infinite where it was not asked.
         min_confidence: that is asked for.
     """
     if confidence >= min_confidence:
-        return None
+        if null_log10_nfa > features.log10_nfa:
+            return None
+        figures = f"log10 of false alarms {null_log10_nfa:.1f} against {features.log10_nfa:.1f}"
+        return Reason.AMBIGUOUS, f"the mirrored frame fits the map as well ({figures})"
     figures = f"log10 of false alarms {features.log10_nfa:.1f}"
     off = features.prior_chi_square
     return Reason.BAD_POSE, _improbable(

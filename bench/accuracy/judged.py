@@ -143,7 +143,7 @@ class Bench:
         query = _query(matcher, frame, prior)
         sift = _part(matcher, "sift", Sift)
         found = sift.find(query, options)
-        fixed = isinstance(found, PoseCandidate) and found.confidence >= options.min_confidence
+        fixed = isinstance(found, PoseCandidate) and isinstance(sift.judge(query, found), Fix)
         if isinstance(found, NoFix):
             found = sift.find(query, replace(options, pose=LOOSE, min_confidence=0.0))
         if isinstance(found, NoFix):

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.acceptance import judge_pose
 from engine.confidence import PoseFeatures, prior_agreement, probability
 from engine.covariance import AssumedErrors
 from engine.geo import attitude_from_rotation
@@ -39,16 +40,24 @@ class PoseCandidate:
     Attributes:
         fix: what it means, with its confidence.
         features: of the confidence model.
+        null_log10_nfa: log10 of the false alarms of the null hypothesis, the same frame mirrored, which shows no
+            place on Earth; infinite where that gave no pose or was not asked.
     """
 
     fix: Fix
     features: PoseFeatures
+    null_log10_nfa: float = math.inf
 
     @property
     def confidence(self) -> float:
         """Probability that the place is right."""
         assert self.fix.confidence is not None  # each pose has one
         return self.fix.confidence
+
+    @property
+    def is_beyond_chance(self) -> bool:
+        """Whether the null hypothesis does not reach as much."""
+        return self.null_log10_nfa > self.features.log10_nfa
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +91,30 @@ class FeatureMatcher:
                 break
             found = matcher._find_with(hypothesis)
             if isinstance(found, PoseCandidate) and not self.is_doubtful(found):
-                return found
+                return matcher._null_tested(found, hypothesis)
             if isinstance(found, NoFix) and found.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
                 return first or found
             first = first or found
         assert first is not None  # the telemetry's own hypothesis is always tried
         return first
+
+    def judge(self, found: PoseCandidate) -> Fix | NoFix:
+        """The fix where its pose is accepted, else a refusal."""
+        fix, least = found.fix, self.options.min_confidence
+        refusal = judge_pose(found.features, found.confidence, found.null_log10_nfa, least)
+        if refusal is None:
+            return fix
+        refused = self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
+        # What chance reaches as well is no evidence, however probable it looks.
+        return replace(refused, candidates=(fix,)) if found.is_beyond_chance else refused
+
+    def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
+        """The candidate with what its mirrored frame reaches by the same telemetry, unless it is nearly certain."""
+        if found.confidence >= self.options.null_test_below:
+            return found
+        mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
+        null = replace(self, query=mirrored)._find_with(hypothesis)
+        return found if isinstance(null, NoFix) else replace(found, null_log10_nfa=null.features.log10_nfa)
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
         """What is tried in turn: the telemetry, the same at the frame's full resolution, and doubts of it."""

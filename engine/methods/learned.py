@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import torch
 
-from engine.acceptance import judge_pose
 from engine.indexes.keypoints import KeypointMap
 from engine.learned import KeypointMatcher, load_matcher
 from engine.methods.explanation import Explanation, explain_features
@@ -18,7 +17,7 @@ from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import map_px_per_pixel
 from engine.orthomap import OrthoMap
-from engine.values import NoFix, Result, Window
+from engine.values import Fix, NoFix, Result, Window
 
 METHOD = "learned"
 _REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
@@ -63,12 +62,8 @@ class Learned(Method):
         with query.scheduler.costed(METHOD, works[share]):
             matcher = self._feature_matcher(query, share)
             found = matcher.find()
-        if isinstance(found, NoFix):
-            return found
-        refusal = judge_pose(found.features, found.confidence, self.options.min_confidence)
-        if refusal is not None:
-            return query.refuse(*refusal, METHOD, score=found.fix.score, window=found.fix.window)
-        return replace(found.fix, stage="coarse") if share < 1.0 else found.fix
+        result = found if isinstance(found, NoFix) else matcher.judge(found)
+        return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

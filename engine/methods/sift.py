@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import torch
 
-from engine.acceptance import judge_pose
 from engine.align import MAX_PICTURE_PX, SIDE_STEP_PX
 from engine.features import prepare_plans
 from engine.indexes.landmarks import LandmarkMap
@@ -92,11 +91,7 @@ class Sift(Method):
 
     def judge(self, query: Query, found: PoseCandidate) -> Result:
         """The fix where its pose is accepted, else a refusal."""
-        refusal = judge_pose(found.features, found.confidence, self.options.min_confidence)
-        if refusal is None:
-            return found.fix
-        refused = query.refuse(*refusal, METHOD, score=found.fix.score, window=found.fix.window)
-        return replace(refused, candidates=(found.fix,))
+        return FeatureMatcher(query, self.landmarks, self.options).judge(found)
 
     def _work_px(self, query: Query) -> dict[float, float]:
         """Pixels of the reduced frame, to which the cost is proportional, by the share of the usual scale."""
