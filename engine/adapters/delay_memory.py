@@ -6,6 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
+from engine.adapters.parameters import MAX_DELAY_MS
+
 
 def remember_delay(least_age_ms: float | None) -> None:
     """Keep the least age of a fix; None, of a bridge that sent none, leaves what was kept."""
@@ -19,7 +21,7 @@ def remember_delay(least_age_ms: float | None) -> None:
 def measured_delay_ms() -> int | None:
     """The delay that was kept, or None."""
     try:
-        return min(int(_file().read_text(encoding="ascii")), 250)
+        return min(int(_file().read_text(encoding="ascii")), round(MAX_DELAY_MS))
     except (OSError, ValueError):
         return None
 

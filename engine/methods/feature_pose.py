@@ -109,7 +109,7 @@ class FeatureMatcher:
         return replace(refused, candidates=(fix,)) if found.is_beyond_chance else refused
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
-        """The candidate with what its mirrored frame reaches by the same telemetry, unless it is nearly certain."""
+        """The candidate, unless nearly certain with what its frame reaches mirrored, by the same telemetry."""
         if found.confidence >= self.options.null_test_below:
             return found
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
