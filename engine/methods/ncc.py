@@ -25,7 +25,7 @@ from engine.methods import hypothesis_search
 from engine.methods.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.methods.explanation import Explanation, explain_correlation
 from engine.methods.method import Method
-from engine.methods.oblique import is_oblique
+from engine.methods.oblique import is_ground_below, is_oblique
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
@@ -192,13 +192,14 @@ class Ncc(Method):
     def _over_its_ground(
         self, correlator: Correlator, aligned: Aligned, window: Window, peak: Peak | None
     ) -> tuple[Peak | None, Aligned]:
-        """The peak of an oblique frame that is drawn once more, over the ground where it was found."""
-        attitude = aligned.pose.grid_attitude
-        if peak is None or attitude is None or not is_oblique(correlator.query, attitude):
+        """The peak of an oblique frame, drawn once more if it was found over other ground than at the prior."""
+        query, pose = correlator.query, aligned.pose
+        if peak is None or pose.grid_attitude is None or not is_oblique(query, pose.grid_attitude):
             return peak, aligned
-        again = correlator.align(aligned.pose, aligned.level, correlator.nadir_px(peak, aligned))
-        second = None if isinstance(again, NoFix) else correlator.search(again, window)
-        return (peak, aligned) if second is None or isinstance(again, NoFix) else (second, again)
+        nadir_px = correlator.nadir_px(peak, aligned)
+        again = None if is_ground_below(query, nadir_px) else correlator.align(pose, aligned.level, nadir_px)
+        second = correlator.search(again, window) if isinstance(again, Aligned) else None
+        return (peak, aligned) if second is None or not isinstance(again, Aligned) else (second, again)
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where its peak is accepted, else a refusal."""

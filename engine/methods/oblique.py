@@ -20,6 +20,7 @@ OBLIQUE_DEG = 25.0
 """Angle of the optical axis off the vertical beyond which the ground is no plane to a frame."""
 FIELD_DEG = 60.0
 """Ground farther off the vertical is left out: walls hide it, and an error of height or tilt moves it most."""
+_SAME_GROUND_SHARE = 0.02  # of the height; relief of places that are nearer looks alike
 _MIN_SIDE_PX = 8
 _CELLS = 96  # along the longer side, by which the rectangle is found
 
@@ -27,6 +28,15 @@ _CELLS = 96  # along the longer side, by which the rectangle is found
 def is_oblique(query: Query, attitude: Attitude) -> bool:
     """Whether a frame looks far from the vertical."""
     return -float(query.camera.enu_from_camera(attitude)[2, 2]) < math.cos(math.radians(OBLIQUE_DEG))
+
+
+def is_ground_below(query: Query, nadir_px: Array) -> bool:
+    """Whether the ground about a place (2,) is that about the prior, as far as it matters from this height."""
+    height_m = query.telemetry.height_agl_m
+    if query.prior_px is None or height_m is None:
+        return False
+    off_m = float(np.linalg.norm(nadir_px - query.prior_px)) * query.site.gsd_m_per_px
+    return off_m < _SAME_GROUND_SHARE * height_m
 
 
 def oblique_patch(
@@ -92,14 +102,16 @@ def largest_rectangle(valid: Mask) -> Window:
     rows, columns = (n // step for n in valid.shape)
     blocks = valid[: rows * step, : columns * step].reshape(rows, step, columns, step)
     cells: Mask = np.asarray(blocks.all(axis=(1, 3)))
-    run, best = np.zeros(columns, np.int64), (0, 0, 0, 0, 0)
+    runs = np.zeros((rows, columns), np.int32)  # valid cells in a row that end in each, upwards
     for row in range(rows):
-        run = np.where(cells[row], run + 1, 0)
-        stack: list[tuple[int, int]] = []  # where a height began, and the height; rising
-        for column, tall in enumerate([*run.tolist(), 0]):
-            start = column
-            while stack and stack[-1][1] >= tall:
-                start, high = stack.pop()
-                best = max(best, (high * (column - start), start, row - high + 1, column - start, high))
-            stack.append((start, tall))
-    return Window(*(n * step for n in best[1:]))
+        runs[row] = np.where(cells[row], (runs[row - 1] if row else 0) + 1, 0)
+    best, best_area, lowest = Window(0, 0, 0, 0), 0, runs
+    for width in range(1, columns + 1):  # lowest: of the runs of so many columns from each on
+        if width > 1:
+            lowest = np.minimum(lowest[:, :-1], runs[:, width - 1 :])
+        row, column = divmod(int(lowest.argmax()), lowest.shape[1])
+        high = int(lowest[row, column])
+        if high * width > best_area:
+            best_area = high * width
+            best = Window(*(n * step for n in (column, row - high + 1, width, high)))
+    return best
