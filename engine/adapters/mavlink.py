@@ -34,6 +34,7 @@ from engine.adapters.mavlink_out import (
     heartbeat_message,
     no_position_message,
     notice_message,
+    repeated_receiver_message,
     set_origin_message,
     timesync_message,
     withhold_reason,
@@ -200,8 +201,17 @@ class MavlinkBridge:
             self._tell(self._notices.sent(now_s))
             return
         self._notices.not_sent(cause)
-        if self._options.needs_origin and self._options.firmware == "ardupilot" and not self.telemetry.armed:
-            self._send(no_position_message(time.monotonic_ns()))
+        if self._options.firmware == "ardupilot" and not self.telemetry.armed:
+            self._keep_ready_to_arm()
+
+    def _keep_ready_to_arm(self) -> None:
+        """Send what ArduPilot asks for before it arms: word of its camera, or a fix of every receiver."""
+        now_ns, gnss, gps_id = time.monotonic_ns(), self.telemetry.gnss, self._options.gps_id
+        if self._options.needs_origin:
+            self._send(no_position_message(now_ns))
+        elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
+            vehicle, unix_ns = self.telemetry.vehicle(now_ns), self.telemetry.unix_ns(gnss.time_ns)
+            self._send(repeated_receiver_message(gnss, vehicle, gps_id, unix_ns))
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track that the autopilot was sent, or its GNSS before there is one."""
@@ -265,9 +275,6 @@ class MavlinkBridge:
 
     def _compose(self, fix: Fix, captured_ns: int) -> FixReport:
         resets = self._resets_before + (0 if self._navigator is None else _resets(self._navigator))
-        unix_offset_ns = self.telemetry.unix_offset_ns()
-        if unix_offset_ns is None:
-            unix_offset_ns = time.time_ns() - time.monotonic_ns()
         origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
         if origin is None and self._origin is not None and vehicle.down_m is not None:
             # Before it has a position an autopilot reports a height above sea level of 0.
@@ -280,7 +287,7 @@ class MavlinkBridge:
             origin,
             self._velocity.add(fix, captured_ns, resets, vehicle),
             resets % 256,
-            captured_ns + unix_offset_ns,
+            self.telemetry.unix_ns(captured_ns),
         )
 
     def _read(self) -> None:

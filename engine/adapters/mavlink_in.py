@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -176,9 +177,10 @@ class MavlinkTelemetry:
         with self._lock:
             self._clock.add_request(now_ns)
 
-    def unix_offset_ns(self) -> int | None:
-        """The autopilot's UTC in nanoseconds since 1970 minus the local clock; None where it has no date."""
-        return self._unix_offset_ns
+    def unix_ns(self, time_ns: int) -> int:
+        """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, where it has none, this machine's."""
+        offset_ns = self._unix_offset_ns
+        return time_ns + (time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns)
 
     def vehicle(self, time_ns: int) -> VehicleState:
         """The vehicle state at a local time; what is not known is None."""

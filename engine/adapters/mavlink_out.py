@@ -13,7 +13,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.fix_velocity import GroundVelocity
-from engine.adapters.mavlink_in import MAV_AUTOPILOTS
+from engine.adapters.mavlink_in import MAV_AUTOPILOTS, GnssFix
 from engine.adapters.packets import AUTOPILOT_COMPONENT
 from engine.adapters.parameters import MAX_DELAY_MS
 from engine.adapters.vehicle import ANGLE_VARIANCE, NedOrigin, VehicleState, north_east_m
@@ -35,6 +35,7 @@ _GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
 # accuracy: a metre of sigma is a dilution of 1 and 10 satellites.
 _DILUTION_PER_M, _MIN_DILUTION = 1.0, 0.5
 _MAX_GPS_ID = 3
+_NO_VELOCITY = mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -285,27 +286,47 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
 
 def _gps_input(report: FixReport, gps_id: int) -> Any:
     assert report.velocity is not None  # checked by withhold_reason
-    week, week_ms = divmod(report.unix_ns // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
-    alt_m, up_mps = report.vehicle.alt_amsl_m, report.vehicle.up_velocity_mps
-    dilution = max(_DILUTION_PER_M * report.fix.sigma_m, _MIN_DILUTION)
+    times_ns = (report.captured_ns, report.unix_ns)
+    return _receiver(gps_id, times_ns, report.fix, report.vehicle, report.velocity)
+
+
+def repeated_receiver_message(gnss: GnssFix, vehicle: VehicleState, gps_id: int, unix_ns: int) -> Any:
+    """GPS_INPUT that repeats the position of the autopilot's own receiver.
+
+    ArduPilot does not arm unless each receiver has a fix, and on the ground a camera sees nothing.
+    """
+    return _receiver(gps_id, (gnss.time_ns, unix_ns), gnss, vehicle, None)
+
+
+def _receiver(
+    gps_id: int,
+    times_ns: tuple[int, int],
+    place: Fix | GnssFix,
+    vehicle: VehicleState,
+    velocity: GroundVelocity | None,
+) -> Any:
+    """GPS_INPUT of a place at a time, on the monotonic clock and since 1970."""
+    week, week_ms = divmod(times_ns[1] // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
+    alt_m, up_mps, sigma_m = vehicle.alt_amsl_m, vehicle.up_velocity_mps, place.sigma_m
+    dilution = max(_DILUTION_PER_M * sigma_m, _MIN_DILUTION)
     ignored = 0 if alt_m is not None else mavlink.GPS_INPUT_IGNORE_FLAG_ALT
     ignored |= 0 if up_mps is not None else mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
+    ignored |= 0 if velocity is not None else _NO_VELOCITY
     return mavlink.MAVLink_gps_input_message(
-        report.captured_ns // 1000,
+        times_ns[0] // 1000,
         gps_id,
         ignored,
         week_ms,
         week,
         3,  # a 3D fix
-        *_degrees_1e7(report.fix),
+        *_degrees_1e7(place),
         alt_m or 0.0,
         *(dilution, dilution),
-        report.velocity.north_mps,
-        report.velocity.east_mps,
+        *((0.0, 0.0) if velocity is None else (velocity.north_mps, velocity.east_mps)),
         -(up_mps or 0.0),
-        report.velocity.sigma_mps,
-        report.fix.sigma_m,
-        report.fix.sigma_m,
+        0.0 if velocity is None else velocity.sigma_mps,
+        sigma_m,
+        sigma_m,
         round(10.0 / dilution),
     )
 
@@ -329,5 +350,5 @@ def _global_position_sensor(report: FixReport) -> Any:
     )
 
 
-def _degrees_1e7(fix: Fix) -> tuple[int, int]:
+def _degrees_1e7(fix: Fix | GnssFix) -> tuple[int, int]:
     return round(fix.lat_deg * 1e7), round(math.remainder(fix.lon_deg, 360.0) * 1e7)

@@ -314,12 +314,12 @@ def test_a_rangefinder_without_a_stamp_counts_from_its_arrival():
     assert heard(level, mavlink.MAVLink_rangefinder_message(0.0, 0.0)).height_agl_m is None
 
 
-def test_the_date_is_the_autopilots_and_none_where_it_has_none():
+def test_the_date_is_the_autopilots_or_where_it_has_none_this_machines():
     telemetry, unix_us = MavlinkTelemetry(), 1_700_000_000_000_000
     telemetry.update(mavlink.MAVLink_system_time_message(0, 5000), 10_000_000_000)  # no date before a GPS fix
-    assert telemetry.unix_offset_ns() is None
+    assert telemetry.unix_ns(time.monotonic_ns()) == pytest.approx(time.time_ns(), abs=1e8)  # this machine's
     telemetry.update(mavlink.MAVLink_system_time_message(unix_us, 6000), 11_000_000_000)
-    assert telemetry.unix_offset_ns() == unix_us * 1000 - 11_000_000_000
+    assert telemetry.unix_ns(12_000_000_000) == unix_us * 1000 + 1_000_000_000
 
 
 def test_series_go_the_shorter_way_round_and_grow_stale():
@@ -581,6 +581,7 @@ def test_a_take_off_with_gnss_leaves_the_receiver_in_the_first_source_set_and_a_
 def test_gps_input_stands_beside_a_receiver_as_the_second():
     values = parameters(message="gps_input", takeoff="gnss", gps_id=1, delay_ms=30)
     assert (values["GPS2_TYPE"], values["GPS2_DELAY_MS"]) == ("14", "30")
+    assert values["GPS_AUTO_SWITCH"] == "4"  # by the most satellites it would change over on the ground
     assert parameters(message="gps_input", delay_ms=0)["GPS1_DELAY_MS"] == "1"  # 0 would mean 200
     assert fix_message(sending(), MavlinkOptions(message="gps_input", gps_id=1)).gps_id == 1
     with pytest.raises(OptionError, match="gps_id: expected 1 or more beside a receiver"):
@@ -890,6 +891,22 @@ def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(bridge
         fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
         assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
         assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_a_second_receiver_repeats_the_first_until_the_vehicle_is_armed(bridge_to):
+    """ArduPilot's check wants a fix of every receiver, and on the ground a camera sees nothing."""
+    made = bridge_to(MavlinkOptions(message="gps_input", gps_id=1))
+    made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+    with Standin(made.port, receiver=(3, 336400000, 729900000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("GPS_INPUT")) >= 5)
+        repeated = pilot.of("GPS_INPUT")[-1][0]
+        assert (repeated.gps_id, repeated.fix_type, repeated.lat, repeated.lon) == (1, 3, 336400000, 729900000)
+        assert repeated.ignore_flags & mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
+        pilot.armed = True
+        fly(made.bridge, lambda: made.bridge.telemetry.armed)
+        before = len(pilot.of("GPS_INPUT"))
+        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+        assert len(pilot.of("GPS_INPUT")) <= before + 2  # in flight it has a fix where the camera has one
 
 
 def test_the_pilot_is_told_when_fixes_begin_and_stop(bridge_to, monkeypatch):
