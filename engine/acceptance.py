@@ -5,6 +5,7 @@ The rules are documented in ``docs/integrity.md``; their thresholds were fitted 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,15 +134,15 @@ def _improbable_peak(features: PeakFeatures, confidence: float, rule: PeakRule) 
 
 
 def judge_pose(
-    features: PoseFeatures, confidence: float, null_log10_nfa: float, min_confidence: float
+    features: PoseFeatures, confidence: float, min_confidence: float, null_log10_nfa: float = math.inf
 ) -> Refusal | None:
     """The reason to refuse a pose by matched features, or None where it is accepted.
 
     Args:
         features: of the confidence model.
         confidence: that the model gives them.
-        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches, infinite where it was not asked.
         min_confidence: that is asked for.
+        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches, infinite where it was not asked.
     """
     if confidence >= min_confidence:
         if null_log10_nfa > features.log10_nfa:

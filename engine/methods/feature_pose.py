@@ -101,7 +101,7 @@ class FeatureMatcher:
     def judge(self, found: PoseCandidate) -> Fix | NoFix:
         """The fix where its pose is accepted, else a refusal."""
         fix, least = found.fix, self.options.min_confidence
-        refusal = judge_pose(found.features, found.confidence, found.null_log10_nfa, least)
+        refusal = judge_pose(found.features, found.confidence, least, found.null_log10_nfa)
         if refusal is None:
             return fix
         refused = self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)

@@ -53,10 +53,10 @@ def test_a_frame_that_is_its_own_mirror_image_is_refused(symmetrical, camera):
 
 def test_the_null_hypothesis_needs_to_reach_only_as_much():
     features = PoseFeatures(-20.0, 0.5, 0.5, 0.2)
-    assert judge_pose(features, 0.999, math.inf, 0.995) is None
-    assert judge_pose(features, 0.999, -19.9, 0.995) is None
-    assert judge_pose(features, 0.999, -20.0, 0.995)[0] is Reason.AMBIGUOUS
-    assert judge_pose(features, 0.99, math.inf, 0.995)[0] is Reason.BAD_POSE
+    assert judge_pose(features, 0.999, 0.995) is None
+    assert judge_pose(features, 0.999, 0.995, -19.9) is None
+    assert judge_pose(features, 0.999, 0.995, -20.0)[0] is Reason.AMBIGUOUS
+    assert judge_pose(features, 0.99, 0.995)[0] is Reason.BAD_POSE
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.1, math.nan])
