@@ -45,6 +45,7 @@ def flight(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("towns_drawn_once")
 @pytest.mark.parametrize(
     "page",

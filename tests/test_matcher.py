@@ -280,6 +280,7 @@ def with_sift(ground, camera, **options):
     return SceneMatcher(ground.site, camera, "sift", "cpu", MatcherOptions(sift=SiftOptions(**options)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading", [True, False], ids=["heading", "no heading"])
 @pytest.mark.parametrize("factor", [0.5, 0.7, 1.0, 1.4, 2.0, None])
 def test_sift_is_as_good_with_a_height_that_is_wrong_or_unknown(matchers, ground, camera, heading, factor):

@@ -201,6 +201,7 @@ SLOW = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ground", "with_prior"),
     [

@@ -105,6 +105,7 @@ def test_a_place_in_a_town_is_found_from_nothing(town, error_m, method):
     assert flight.errors(method, error_m, (100, 300, 500), sigma_m=None).max() <= WRONG_M
 
 
+@pytest.mark.slow
 def test_a_campus_is_matched_against_a_satellite_picture_of_another_day(campus, error_m):
     """Its truth is of the ground in mid-frame and good to a metre, its telemetry rounded to 5 m and 2 degrees."""
     errors = campus.errors("ncc", error_m, range(0, len(campus.flight), 10), middle=True)

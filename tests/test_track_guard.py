@@ -75,6 +75,7 @@ def test_the_first_fix_after_a_covered_camera_is_trusted(cover_s):
     assert flight.step(true, velocity=cover_s <= 7.0)
 
 
+@pytest.mark.slow
 def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_with_itself():
     flight = Flight()
     flight.fly(5.0, true)

@@ -515,6 +515,7 @@ def test_minutes_of_the_hour_in_which_everything_goes_wrong():
     assert flown["unplaced"] == 0
 
 
+@pytest.mark.slow
 def test_random_and_mutated_packets_harm_nothing():
     from bench.live.fuzz_mavlink import fuzz
 

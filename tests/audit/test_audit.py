@@ -298,6 +298,7 @@ def command(map_file, out, *more):
     return ["map", "audit", str(map_file), f"--height-agl={HEIGHT_M:g}", f"--out={out}", *map(str, more)]
 
 
+@pytest.mark.slow
 def test_the_command_writes_raster_picture_and_summary(map_file, route_file, found, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(command(map_file, out, f"--route={route_file}", "--json")) == 0

@@ -459,6 +459,7 @@ def test_a_ulog_that_leads_its_parser_in_circles_is_refused(tmp_path):
     assert "its definitions are damaged" in refusal(open_log, save(tmp_path / "a.ulg", data))
 
 
+@pytest.mark.slow
 def test_mutated_files_are_read_or_refused():
     from bench.live.fuzz_logs import fuzz
 

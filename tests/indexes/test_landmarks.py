@@ -205,6 +205,7 @@ def spoiled(path, how):
         np.savez(path, **arrays)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how",
     ["cut short", "a bit turned", "something else", "empty", "of another map", "pickled", "not finite",

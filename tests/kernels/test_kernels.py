@@ -86,6 +86,7 @@ def test_kernels_agree_with_the_reference(name, dtype, zero_mean, batch, hypothe
     assert torch.equal(templates, before[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KERNELS)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -134,6 +134,7 @@ def check_match(device, size, model):
         assert_same(match_template(search, template, exclusion_px=5.0), expected)
 
 
+@pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_the_peak_is_that_of_plain_torch(on, shape):

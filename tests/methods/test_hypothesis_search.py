@@ -74,6 +74,7 @@ def aligned_heights(monkeypatch):
     return heights
 
 
+@pytest.mark.slow
 @KNOWN
 @pytest.mark.parametrize(("turn_deg", "share"), OFF)
 def test_a_wrong_heading_and_height_are_put_right(
@@ -88,6 +89,7 @@ def test_a_wrong_heading_and_height_are_put_right(
         assert aligned_heights[-1] == pytest.approx(truth.height_agl_m, rel=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
 def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site, flight, error_m, known):
     bank = matcher(heading_search_deg=180.0)
@@ -114,6 +116,7 @@ def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matche
     assert unrefined.attitude is None
 
 
+@pytest.mark.slow
 @KNOWN
 def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
     bank = matcher(other_site, heading_search_deg=5.0, height_search_share=0.05)

@@ -39,6 +39,7 @@ def picture(path):
         return np.asarray(opened)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bare_runs")
 def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
     (tmp_path / "few.toml").write_text('method = "sift"\n[sift]\nmax_keypoints = 120\n', encoding="utf-8")

@@ -231,6 +231,7 @@ def test_only_plots_with_something_to_show_are_drawn(tmp_path):
     assert draw_figures(tmp_path, [], None) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1])
 def test_short_tracks_and_missing_stamps_are_drawn(tmp_path, count):
     rows, truth = flight()

@@ -135,6 +135,7 @@ def test_the_public_names_are_sorted_and_there():
         engine.runs.nothing  # noqa: B018
 
 
+@pytest.mark.slow
 def test_the_library_imports_nothing_optional_and_no_command_line():
     loaded = "print(*[name for name in sys.modules if name.partition('.')[0] in wanted or 'engine.cli' in name])"
     script = (

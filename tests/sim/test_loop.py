@@ -175,6 +175,7 @@ def test_without_an_engine_the_flight_is_handed_over_before_nothing_is_known():
     assert flown.record[-2].estimate.sigma_m < 20.0
 
 
+@pytest.mark.slow
 def test_a_shifted_map_is_never_followed():
     flown = fly(58.0, Fault(kind="shifted", start_s=20.0, duration_s=math.inf))
     shift_ns = START_NS + 20_000_000_000
