@@ -53,7 +53,7 @@ def test_files_that_are_named_are_there():
         assert (STACK / "scripts" / kind).stat().st_mode & 0o111
     installed = (STACK / "CMakeLists.txt").read_text(encoding="utf-8")
     for name in STACK.iterdir():
-        assert name.name in installed or name.name in ("CMakeLists.txt", "package.xml", "scripts")
+        assert name.name in installed or name.name in ("CMakeLists.txt", "package.xml", "scripts", "__pycache__")
     for script in (STACK / "scripts").iterdir():
         assert f"scripts/{script.name}" in installed
 
