@@ -26,6 +26,7 @@ from engine.adapters.mavlink_in import (
     MavlinkTelemetry,
 )
 from engine.adapters.mavlink_out import (
+    LONGEST_DELAY_NS,
     FixReport,
     MavlinkOptions,
     acknowledgement_message,
@@ -210,8 +211,11 @@ class MavlinkBridge:
         if self._options.needs_origin:
             self._send(no_position_message(now_ns))
         elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
-            vehicle, unix_ns = self.telemetry.vehicle(now_ns), self.telemetry.unix_ns(gnss.time_ns)
-            self._send(repeated_receiver_message(gnss, vehicle, gps_id, unix_ns))
+            stamp_ns = max(now_ns - LONGEST_DELAY_NS, 0)
+            unix_ns = self.telemetry.unix_ns(stamp_ns)
+            self._send(
+                repeated_receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, (stamp_ns, unix_ns))
+            )
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track that the autopilot was sent, or its GNSS before there is one."""

@@ -27,6 +27,9 @@ MESSAGES = {
 }
 """Messages that each firmware accepts; the first is the default."""
 
+LONGEST_DELAY_NS = round(MAX_DELAY_MS * 1e6)
+"""Age of what is sent on the ground: ArduPilot takes the quickest message for undelayed, which must be a fix."""
+
 SENSOR_ID = 1
 """Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
@@ -185,8 +188,7 @@ def no_position_message(now_ns: int) -> Any:
     camera sees nothing. By its quality the message is not used for navigation.
     """
     nan = math.nan
-    # Older than any fix: the quickest message counts as the one without delay, and must be a fix.
-    stamp_us = (now_ns - round(MAX_DELAY_MS * 1e6)) // 1000
+    stamp_us = (now_ns - LONGEST_DELAY_NS) // 1000
     return mavlink.MAVLink_odometry_message(
         max(stamp_us, 0), mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, *(0.0, 0.0, 0.0),
         [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, [nan] * 21, [nan] * 21, 0, mavlink.MAV_ESTIMATOR_TYPE_VISION,
@@ -290,12 +292,18 @@ def _gps_input(report: FixReport, gps_id: int) -> Any:
     return _receiver(gps_id, times_ns, report.fix, report.vehicle, report.velocity)
 
 
-def repeated_receiver_message(gnss: GnssFix, vehicle: VehicleState, gps_id: int, unix_ns: int) -> Any:
-    """GPS_INPUT that repeats the position of the autopilot's own receiver.
+def repeated_receiver_message(gnss: GnssFix, vehicle: VehicleState, gps_id: int, times_ns: tuple[int, int]) -> Any:
+    """GPS_INPUT that repeats the position of the autopilot's own receiver, for a vehicle that stands still.
 
     ArduPilot does not arm unless each receiver has a fix, and on the ground a camera sees nothing.
+
+    Args:
+        gnss: the receiver's position.
+        vehicle: its height.
+        gps_id: receiver that the message poses as.
+        times_ns: its stamps, on the monotonic clock and since 1970: older than any fix.
     """
-    return _receiver(gps_id, (gnss.time_ns, unix_ns), gnss, vehicle, None)
+    return _receiver(gps_id, times_ns, gnss, vehicle, None)
 
 
 def _receiver(

@@ -106,7 +106,7 @@ def largest_rectangle(valid: Mask) -> Window:
     for row in range(rows):
         runs[row] = np.where(cells[row], (runs[row - 1] if row else 0) + 1, 0)
     best, best_area, lowest = Window(0, 0, 0, 0), 0, runs
-    for width in range(1, columns + 1):  # lowest: of the runs of so many columns from each on
+    for width in range(1, columns + 1 if rows else 1):  # lowest: of the runs of so many columns from each on
         if width > 1:
             lowest = np.minimum(lowest[:, :-1], runs[:, width - 1 :])
         row, column = divmod(int(lowest.argmax()), lowest.shape[1])

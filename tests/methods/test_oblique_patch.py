@@ -30,3 +30,4 @@ def test_a_large_one_is_found_within_a_cell():
     assert valid[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px].all()
     assert box.area_px > 0.95 * 301 * 464
     assert largest_rectangle(np.zeros((50, 50), bool)).area_px == 0
+    assert largest_rectangle(np.ones((1, 200), bool)).area_px == 0  # lower than a cell
