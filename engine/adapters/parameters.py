@@ -78,10 +78,11 @@ def _ardupilot(options: ParameterOptions) -> list[Parameter]:
     lines += vision
     if options.takeoff == "gnss":
         lines += _source_set(1, position=3, velocity=3)
-    if options.takeoff == "gnss" and options.message != "gps_input":
-        lines += [(f"{_RC_SWITCH}_OPTION", 90, "switch of the transmitter: low set 1, the receiver; middle set 2")]
-    if options.takeoff == "gnss" and options.message == "gps_input":
-        lines += [("GPS_AUTO_SWITCH", 4, "the first receiver as long as it has a fix, then the fixes")]
+        if options.message == "gps_input":
+            lines.append(("GPS_AUTO_SWITCH", 4, "the first receiver as long as it has a fix, then the fixes"))
+        else:
+            why = "switch of the transmitter: low set 1, the receiver; middle set 2"
+            lines.append((f"{_RC_SWITCH}_OPTION", 90, why))
     if options.message != "gps_input":
         lines += _source_set(2 if options.takeoff == "gnss" else 1, position=6, velocity=0)
     elif options.takeoff == "none":

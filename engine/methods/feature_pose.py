@@ -54,11 +54,6 @@ class PoseCandidate:
         assert self.fix.confidence is not None  # each pose has one
         return self.fix.confidence
 
-    @property
-    def is_beyond_chance(self) -> bool:
-        """Whether the null hypothesis does not reach as much."""
-        return self.null_log10_nfa > self.features.log10_nfa
-
 
 @dataclass(frozen=True, slots=True)
 class FeatureMatcher:
@@ -104,9 +99,7 @@ class FeatureMatcher:
         refusal = judge_pose(found.features, found.confidence, least, found.null_log10_nfa)
         if refusal is None:
             return fix
-        refused = self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
-        # What chance reaches as well is no evidence, however probable it looks.
-        return replace(refused, candidates=(fix,)) if found.is_beyond_chance else refused
+        return self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
         """The candidate, unless nearly certain with what its frame reaches mirrored, by the same telemetry."""

@@ -17,7 +17,7 @@ from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.views import map_px_per_pixel
 from engine.orthomap import OrthoMap
-from engine.values import NoFix, Result, Window
+from engine.values import Fix, NoFix, Result, Window
 
 METHOD = "learned"
 _REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
@@ -63,9 +63,7 @@ class Learned(Method):
             matcher = self._feature_matcher(query, share)
             found = matcher.find()
         result = found if isinstance(found, NoFix) else matcher.judge(found)
-        if isinstance(result, NoFix):  # refused poses were not tried as evidence over frames
-            return replace(result, candidates=())
-        return replace(result, stage="coarse") if share < 1.0 else result
+        return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

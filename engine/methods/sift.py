@@ -16,7 +16,7 @@ from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
 from engine.orthomap import OrthoMap
-from engine.values import Fix, NoFix, Result, Window
+from engine.values import Fix, NoFix, Reason, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
 
@@ -90,8 +90,12 @@ class Sift(Method):
         return FeatureMatcher(query, self.landmarks, options or self.options).find()
 
     def judge(self, query: Query, found: PoseCandidate) -> Result:
-        """The fix where its pose is accepted, else a refusal."""
-        return FeatureMatcher(query, self.landmarks, self.options).judge(found)
+        """The fix where its pose is accepted, else a refusal; an improbable pose comes with it as evidence."""
+        result = FeatureMatcher(query, self.landmarks, self.options).judge(found)
+        # What the null hypothesis reaches as well (ambiguous) is no evidence, however probable it looks.
+        if isinstance(result, NoFix) and result.reason is Reason.BAD_POSE:
+            return replace(result, candidates=(found.fix,))
+        return result
 
     def _work_px(self, query: Query) -> dict[float, float]:
         """Pixels of the reduced frame, to which the cost is proportional, by the share of the usual scale."""
