@@ -262,6 +262,21 @@ def test_a_wrong_attitude_is_outvoted():
         assert pose.inliers[~s.wrong].mean() > 0.95
 
 
+@pytest.mark.parametrize("sigma_deg", [0.4, 4.0])
+@pytest.mark.parametrize("off_deg", [-35.0, -20.0, -8.0, 8.0, 20.0, 35.0])
+def test_about_a_wrong_attitude_the_pose_is_right_or_there_is_none(sigma_deg, off_deg):
+    """About a wrong tilt a part of the matches agree still, at a place as far off."""
+    rng, found = np.random.default_rng(5), 0
+    for _ in range(10):
+        s = scene(rng, noise_px=0.5, relief_m=20.0)
+        turn = cv2.Rodrigues(np.deg2rad([off_deg, 0.0, 0.0]))[0]
+        pose = solve_pose(s.points_m, s.points_px, K, prior=AttitudePrior(turn @ s.rotation, sigma_deg))
+        if pose is not None:
+            found += 1
+            assert np.linalg.norm(pose.center_m - s.center_m) < 3.0
+    assert found >= (0 if sigma_deg < 1.0 else 9)
+
+
 def test_covariance_is_symmetric_and_positive():
     pose = solved(scene(np.random.default_rng(10), noise_px=0.5))
     np.testing.assert_allclose(pose.covariance, pose.covariance.T, rtol=1e-6, atol=1e-15)
