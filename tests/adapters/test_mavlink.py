@@ -565,6 +565,7 @@ def test_parameter_files():
     rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     assert all(len(row) == 5 and row[:2] == ["1", "1"] and len(row[2]) <= 16 for row in rows)
     assert ["1", "1", "EKF2_AGP0_CTRL", "1", "6"] in rows
+    assert ["1", "1", "EKF2_AGP0_DELAY", "120", "9"] in rows
     assert "EKF2_EV_CTRL\t1\t6" in parameter_file(ParameterOptions(firmware="px4", message="odometry"))
     with pytest.raises(OptionError, match="250"):
         ParameterOptions(firmware="ardupilot", message="vision_position_estimate", delay_ms=251)
