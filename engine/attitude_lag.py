@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.attitude_bias import Bias
 from engine.geo import wrap_heading_deg
 from engine.values import Fix, Frame
 
@@ -64,13 +65,20 @@ class AttitudeLag:
             heading_lag_deg=float(abs(self._rates_dps[2])) * self.sigma_s,
         )
 
-    def note(self, fix: Fix) -> None:
-        """Learn from a fix of the newest frame; one without a height did not measure its attitude."""
+    def note(self, fix: Fix, bias: Bias | None = None) -> None:
+        """Learn from a fix of the newest frame; one without a height did not measure its attitude.
+
+        Args:
+            fix: of the newest frame.
+            bias: what else the attitude is off by.
+        """
         rates = self._rates_dps[:2]
         square = float(rates @ rates)
         if fix.attitude is None or fix.up_m is None or self._angles_deg is None or square < _MIN_RATE_DPS**2:
             return
         measured = np.array([fix.attitude.roll_deg, fix.attitude.pitch_deg])
+        if bias is not None:
+            measured = measured - (bias.roll_deg, bias.pitch_deg)
         noise_s2 = _DIFFERENCE_DEG**2 / square + self._jitter_s2
         gain = self._variance_s2 / (self._variance_s2 + noise_s2)
         lag_s = float(rates @ (measured - self._angles_deg[:2])) / square

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.anchors import Anchor, RecentAnchors
+from engine.attitude_bias import AttitudeBias, Bias
 from engine.attitude_lag import AttitudeLag
 from engine.budget import Budget
 from engine.covariance import map_sigma_of
@@ -88,6 +89,7 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._attitude_lag = AttitudeLag(o.attitude_lag_s, o.attitude_jitter_s)
+        self._attitude_bias = AttitudeBias(o.tilt_bias_deg, o.heading_bias_deg)
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
@@ -149,6 +151,11 @@ class Navigator:
         """How late the frames' attitude is, as far as fixes measured it."""
         return self._attitude_lag.mean_s
 
+    @property
+    def attitude_bias(self) -> Bias | None:
+        """By how much the frames' attitude is off; None before a fix measured it."""
+        return self._attitude_bias.bias
+
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
 
@@ -166,7 +173,7 @@ class Navigator:
         late = self._odometry.is_late(frame)
         now = self._odometry.sample(frame, self._recent.velocity)
         sources = self._sources(now, prior, late=late)
-        shown = frame if late else self._attitude_lag.corrected(frame)
+        shown = frame if late else self._attitude_bias.corrected(self._attitude_lag.corrected(frame))
         result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
@@ -179,7 +186,8 @@ class Navigator:
             result = self._add_doubted(result, now, sources, frame.height_agl_m)
         if not late:
             if isinstance(result, Fix):
-                self._attitude_lag.note(result)
+                self._attitude_lag.note(result, self._attitude_bias.bias)
+                self._attitude_bias.note(result)
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
                 self._refusals += 1  # a lack of time is no evidence about the position

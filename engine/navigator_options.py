@@ -31,6 +31,8 @@ class NavigatorOptions:
         late_s: how much older than the newest frame a frame may be.
         attitude_lag_s: standard deviation of how late the telemetry's attitude is, while no picture measured it.
         attitude_jitter_s: of a single frame's lag about its mean.
+        tilt_bias_deg: standard deviation of a lasting error of roll and of pitch while no picture measured it.
+        heading_bias_deg: of the heading.
         healthy_s: age of the last fix up to which the navigator calls itself healthy.
     """
 
@@ -49,6 +51,8 @@ class NavigatorOptions:
     late_s: float = 2.0
     attitude_lag_s: float = 0.1
     attitude_jitter_s: float = 0.03
+    tilt_bias_deg: float = 1.0
+    heading_bias_deg: float = 5.0
     healthy_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -64,5 +68,12 @@ class NavigatorOptions:
         return math.log(self.min_confidence / (1.0 - self.min_confidence))
 
 
-ACCEPT_ALL = NavigatorOptions(gate=1e12, min_confidence=1e-12, attitude_lag_s=1e-9, attitude_jitter_s=1e-9)
+ACCEPT_ALL = NavigatorOptions(
+    gate=1e12,
+    min_confidence=1e-12,
+    attitude_lag_s=1e-9,
+    attitude_jitter_s=1e-9,
+    tilt_bias_deg=1e-9,
+    heading_bias_deg=1e-9,
+)
 """Every match is accepted, as by the paper's recipe: the baseline."""

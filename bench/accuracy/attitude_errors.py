@@ -1,9 +1,11 @@
-"""Flights whose attitude comes late: what the fixes lose, and whether their covariances say so.
+"""Flights whose attitude is late or wrong: what the fixes lose, and whether their covariances say so.
 
-    python -m bench.accuracy.attitude_lag FOLDER [--method ncc] [--step 2] [--flat] [--lags 0,0.05,0.1,0.15,0-0.15]
+    python -m bench.accuracy.attitude_errors FOLDER [--method ncc] [--step 2] [--flat] [--errors off:1/0/3]
 
-FOLDER is a flight folder with truth.csv. The attitude is delayed by a lag in seconds, or,
-where two numbers are given, by one drawn anew for every frame. ``--flat`` leaves the surface model out.
+FOLDER is a flight folder with truth.csv. Errors are ``right`` for none, ``late:`` with a lag in seconds, or with
+two as ``0-0.15`` for one drawn anew for every frame, ``off:`` with what is added to roll, pitch and heading in
+degrees, ``radians``, ``swapped`` for roll and pitch in each other's place, and ``signs`` for both negative.
+``--flat`` leaves the surface model out.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from engine.values import Truth
 
 Array = NDArray[np.float64]
 MAP_SIGMA_M = 0.3  # of these worlds, so that the covariances are not the map's
-HEADER = "lag s | answered | RMS m | largest m | NEES | beyond 4 sigma | learnt lag s"
+HEADER = "error | answered | RMS m | largest m | NEES | beyond 4 sigma | learnt lag s | learnt bias deg"
 
 
 def delayed(frames: list[Frame], lag: str) -> list[Frame]:
@@ -41,6 +43,28 @@ def delayed(frames: list[Frame], lag: str) -> list[Frame]:
     ]
 
 
+def spoiled(frames: list[Frame], error: str) -> list[Frame]:
+    """The frames with an error of their attitude, as the module names it."""
+    kind, _, size = error.partition(":")
+    if kind == "late":
+        return delayed(frames, size)
+    angles = np.array([(f.roll_deg, f.pitch_deg, f.heading_deg) for f in frames], np.float64)
+    if kind == "off":
+        angles += [float(part) for part in size.split("/")]
+    elif kind == "radians":
+        angles = np.radians(angles)
+    elif kind == "swapped":
+        angles = angles[:, [1, 0, 2]]
+    elif kind == "signs":
+        angles *= [-1.0, -1.0, 1.0]
+    elif kind != "right":
+        raise SystemExit(f"--errors: expected right, late:, off:, radians, swapped or signs, got {error!r}")
+    return [
+        replace(frame, roll_deg=float(roll), pitch_deg=float(pitch), heading_deg=float(heading % 360.0))
+        for frame, (roll, pitch, heading) in zip(frames, angles, strict=True)
+    ]
+
+
 def fly(matcher: SceneMatcher, frames: list[Frame], truth: dict[int, Truth]) -> str:
     """The figures of one flight; the covariance counts without the map's own error."""
     first = truth[frames[0].timestamp_ns or 0]
@@ -54,21 +78,24 @@ def fly(matcher: SceneMatcher, frames: list[Frame], truth: dict[int, Truth]) -> 
             off = np.array([result.east_m - east, result.north_m - north])
             errors.append(math.hypot(*off))
             chi_squares.append(off @ np.linalg.solve(result.relative_covariance_m2, off))
-    error, chi = np.array(errors), np.array(chi_squares)
+    if not errors:
+        return f"0 of {len(frames)}"
+    error, chi, bias = np.array(errors), np.array(chi_squares), navigator.attitude_bias
+    learnt = "" if bias is None else f"{bias.roll_deg:.1f}, {bias.pitch_deg:.1f}, {bias.heading_deg:.1f}"
     return (
-        f"{len(error) / len(frames):.3f} | {np.sqrt(np.mean(error**2)):.2f} | {error.max():.2f} | "
-        f"{chi.mean() / 2:.2f} | {(chi > 16.0).sum()} | {navigator.attitude_lag_s:.3f}"
+        f"{len(error)} of {len(frames)} | {np.sqrt(np.mean(error**2)):.2f} | {error.max():.2f} | "
+        f"{chi.mean() / 2:.2f} | {(chi > 16.0).sum()} | {navigator.attitude_lag_s:.2f} | {learnt}"
     )
 
 
 def main() -> None:
-    """Print one row a lag."""
+    """Print one row an error."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--method", default="ncc")
     parser.add_argument("--step", type=int, default=2)
     parser.add_argument("--flat", action="store_true")
-    parser.add_argument("--lags", default="0,0.05,0.1,0.15,0-0.15")
+    parser.add_argument("--errors", default="right,late:0.1,late:0.15,late:0-0.15,off:1.4/0.5/3,swapped,signs")
     wanted = parser.parse_args()
     set_threads(1)
     surface = None if wanted.flat else wanted.folder / "dsm.tif"
@@ -79,8 +106,8 @@ def main() -> None:
     frames = [item.frame for index, item in enumerate(flown) if index % wanted.step == 0]
     truth = {row.timestamp_ns: row for row in read_truth(wanted.folder / "truth.csv")}
     print(HEADER)
-    for lag in wanted.lags.split(","):
-        print(f"{lag} | {fly(matcher, delayed(frames, lag), truth)}", flush=True)
+    for error in wanted.errors.split(","):
+        print(f"{error} | {fly(matcher, spoiled(frames, error), truth)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,121 @@
+"""The attitude's bias: by how much roll, pitch and heading are off for seconds on end.
+
+Without a receiver's velocity an estimator lets roll and pitch drift by a degree or two and the heading by five,
+and a mount is never quite level. The bias is estimated by attitudes that pictures measured, and taken off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import wrap_heading_deg
+from engine.values import Fix, Frame
+
+Array = NDArray[np.float64]
+
+_DIFFERENCE_DEG = 0.6  # standard deviation of telemetry against picture without any bias
+_WALK_DEG = np.array([0.2, 0.2, 0.5])  # by which the bias changes in a second, one standard deviation
+_SCATTER_SHARE = 0.2  # of each new difference in their mean square
+_MAX_SIGMAS = 3.0  # of one difference: what is beyond counts as so much
+_LEAST_DEG = np.array([0.8, 0.8, 2.0])  # twice the assumed errors: less is what every frame's matching allows for
+_MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
+
+
+@dataclass(frozen=True, slots=True)
+class Bias:
+    """By how much an attitude is off: what is to be added to it.
+
+    Attributes:
+        roll_deg, pitch_deg, heading_deg: to be added to the telemetry's.
+        sigma_deg: standard deviations of the three.
+    """
+
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float
+    sigma_deg: tuple[float, float, float]
+
+
+class AttitudeBias:
+    """How far off the attitude of a vehicle's telemetry is.
+
+    Args:
+        tilt_deg: standard deviation of the bias of roll and of pitch while no picture measured it.
+        heading_deg: of the heading's.
+    """
+
+    def __init__(self, tilt_deg: float, heading_deg: float) -> None:
+        self._first_deg2 = np.array([tilt_deg, tilt_deg, heading_deg]) ** 2
+        self._mean_deg, self._variance_deg2 = np.zeros(3), self._first_deg2.copy()
+        self._scatter_deg2 = np.zeros(3)  # mean square of the newest differences
+        self._time_s: float | None = None
+        self._frame: Frame | None = None  # the newest, as it came; None where its attitude is not known
+        self._measured = False
+
+    @property
+    def bias(self) -> Bias | None:
+        """What is known of it; None before a picture measured it."""
+        if not self._measured:
+            return None
+        roll, pitch, heading = self._mean_deg.tolist()
+        return Bias(roll, pitch, heading, tuple(np.sqrt(self._variance_deg2).tolist()))
+
+    def corrected(self, frame: Frame) -> Frame:
+        """The next frame without the bias, as far as that is known; how well it is known widens its errors."""
+        self._frame = None
+        if frame.timestamp_ns is not None:
+            time_s = frame.timestamp_ns * 1e-9
+            elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
+            self._variance_deg2 = np.minimum(self._variance_deg2 + _WALK_DEG**2 * elapsed_s, self._first_deg2)
+            self._time_s = time_s
+        if frame.roll_deg is None or frame.pitch_deg is None or frame.heading_deg is None:
+            return frame
+        self._frame = frame
+        if np.any(off := np.abs(self._mean_deg) > _LEAST_DEG):
+            roll, pitch, heading = (self._mean_deg * off).tolist()
+            frame = replace(
+                frame,
+                roll_deg=frame.roll_deg + roll,
+                pitch_deg=max(-90.0, min(frame.pitch_deg + pitch, 90.0)),
+                heading_deg=wrap_heading_deg(frame.heading_deg + heading),
+            )
+        if self._measured:
+            beyond = np.maximum(self._scatter_deg2 - _DIFFERENCE_DEG**2, 0.0)
+            roll, pitch, heading = np.sqrt(self._variance_deg2 + beyond).tolist()
+            tilt_lag, heading_lag = frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0
+            frame = replace(
+                frame,
+                tilt_lag_deg=math.hypot(tilt_lag, max(roll, pitch)),
+                heading_lag_deg=math.hypot(heading_lag, heading),
+            )
+        return frame
+
+    def note(self, fix: Fix) -> None:
+        """Learn from a fix of the newest frame; one without a height did not measure its attitude."""
+        frame, seen = self._frame, fix.attitude
+        if seen is None or fix.up_m is None or frame is None or abs(seen.pitch_deg) > _MAX_PITCH_DEG:
+            return
+        assert frame.roll_deg is not None
+        assert frame.pitch_deg is not None
+        assert frame.heading_deg is not None
+        pairs = (
+            (seen.roll_deg, frame.roll_deg),
+            (seen.pitch_deg, frame.pitch_deg),
+            (seen.heading_deg, frame.heading_deg),
+        )
+        off = np.array([math.remainder(measured - known, 360.0) for measured, known in pairs])
+        lag_deg = np.array([frame.tilt_lag_deg or 0.0, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0])
+        noise_deg2 = _DIFFERENCE_DEG**2 + lag_deg**2
+        total_deg2 = self._variance_deg2 + noise_deg2
+        most = _MAX_SIGMAS * np.sqrt(total_deg2)
+        gain = self._variance_deg2 / total_deg2
+        off = np.clip(off - self._mean_deg, -most, most)
+        self._mean_deg = self._mean_deg + gain * off
+        self._variance_deg2 = self._variance_deg2 * (1.0 - gain)
+        if self._measured:
+            self._scatter_deg2 += _SCATTER_SHARE * (off**2 - self._scatter_deg2)
+        self._measured = True
