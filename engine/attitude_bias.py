@@ -17,8 +17,17 @@ from engine.values import Fix, Frame
 
 Array = NDArray[np.float64]
 
-_DIFFERENCE_DEG = 0.6  # standard deviation of telemetry against picture without any bias
+# Standard deviation of telemetry against picture without any bias: refined, and by features alone.
+_REFINED_DEG, _FEATURES_DEG = 0.6, 2.0
 _WALK_DEG = np.array([0.2, 0.2, 0.5])  # by which the bias changes in a second, one standard deviation
+_SCATTER_SHARE = 0.2  # of each new difference in their mean square
+_MAX_SIGMAS = 3.0  # of one difference: what is beyond counts as so much
+_ASSUMED_DEG = (
+    0.4,
+    1.0,
+)  # of a tilt and of a heading whose error the frame does not state, one standard deviation
+_LEAST_SIGMAS = 2.0  # less is what every frame's matching allows for
+_LEAST_FIXES = 3  # before which nothing is taken off: one of them may be wrong
 _SCATTER_SHARE = 0.2  # of each new difference in their mean square
 _MAX_SIGMAS = 3.0  # of one difference: what is beyond counts as so much
 _LEAST_DEG = np.array([0.8, 0.8, 2.0])  # twice the assumed errors: less is what every frame's matching allows for
@@ -51,48 +60,44 @@ class AttitudeBias:
     def __init__(self, tilt_deg: float, heading_deg: float) -> None:
         self._first_deg2 = np.array([tilt_deg, tilt_deg, heading_deg]) ** 2
         self._mean_deg, self._variance_deg2 = np.zeros(3), self._first_deg2.copy()
-        self._scatter_deg2 = np.zeros(3)  # mean square of the newest differences
+        self._scatter_deg2 = np.zeros(3)  # mean square of the newest differences beyond what is expected of them
         self._time_s: float | None = None
-        self._frame: Frame | None = None  # the newest, as it came; None where its attitude is not known
-        self._measured = False
+        self._frame: Frame | None = None  # the newest; None where its attitude is not known
+        self._fixes = 0  # that measured it
 
     @property
     def bias(self) -> Bias | None:
         """What is known of it; None before a picture measured it."""
-        if not self._measured:
+        if not self._fixes:
             return None
         roll, pitch, heading = self._mean_deg.tolist()
         return Bias(roll, pitch, heading, tuple(np.sqrt(self._variance_deg2).tolist()))
 
+    def follow(self, frame: Frame, time_s: float) -> None:
+        """The newest frame, and its time on any one clock."""
+        elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
+        self._variance_deg2 = np.minimum(self._variance_deg2 + _WALK_DEG**2 * elapsed_s, self._first_deg2)
+        self._time_s = time_s
+        self._frame = None if None in (frame.roll_deg, frame.pitch_deg, frame.heading_deg) else frame
+
     def corrected(self, frame: Frame) -> Frame:
-        """The next frame without the bias, as far as that is known; how well it is known widens its errors."""
-        self._frame = None
-        if frame.timestamp_ns is not None:
-            time_s = frame.timestamp_ns * 1e-9
-            elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
-            self._variance_deg2 = np.minimum(self._variance_deg2 + _WALK_DEG**2 * elapsed_s, self._first_deg2)
-            self._time_s = time_s
+        """The newest frame, or a late one, without the bias; how well that is known widens its errors."""
         if frame.roll_deg is None or frame.pitch_deg is None or frame.heading_deg is None:
             return frame
-        self._frame = frame
-        if np.any(off := np.abs(self._mean_deg) > _LEAST_DEG):
-            roll, pitch, heading = (self._mean_deg * off).tolist()
-            frame = replace(
-                frame,
-                roll_deg=frame.roll_deg + roll,
-                pitch_deg=max(-90.0, min(frame.pitch_deg + pitch, 90.0)),
-                heading_deg=wrap_heading_deg(frame.heading_deg + heading),
-            )
-        if self._measured:
-            beyond = np.maximum(self._scatter_deg2 - _DIFFERENCE_DEG**2, 0.0)
-            roll, pitch, heading = np.sqrt(self._variance_deg2 + beyond).tolist()
-            tilt_lag, heading_lag = frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0
-            frame = replace(
-                frame,
-                tilt_lag_deg=math.hypot(tilt_lag, max(roll, pitch)),
-                heading_lag_deg=math.hypot(heading_lag, heading),
-            )
-        return frame
+        if self._fixes < _LEAST_FIXES:
+            return frame
+        tilt_deg, heading_deg = frame.tilt_sigma_deg or _ASSUMED_DEG[0], frame.heading_sigma_deg or _ASSUMED_DEG[1]
+        off = np.abs(self._mean_deg) > _LEAST_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
+        roll, pitch, heading = (self._mean_deg * off).tolist()
+        wider = np.sqrt(self._variance_deg2 * off + self._scatter_deg2)
+        return replace(
+            frame,
+            roll_deg=frame.roll_deg + roll,
+            pitch_deg=max(-90.0, min(frame.pitch_deg + pitch, 90.0)),
+            heading_deg=wrap_heading_deg(frame.heading_deg + heading) if heading else frame.heading_deg,
+            tilt_lag_deg=math.hypot(frame.tilt_lag_deg or 0.0, float(wider[:2].max())),
+            heading_lag_deg=math.hypot(frame.heading_lag_deg or 0.0, float(wider[2])),
+        )
 
     def note(self, fix: Fix) -> None:
         """Learn from a fix of the newest frame; one without a height did not measure its attitude."""
@@ -109,13 +114,15 @@ class AttitudeBias:
         )
         off = np.array([math.remainder(measured - known, 360.0) for measured, known in pairs])
         lag_deg = np.array([frame.tilt_lag_deg or 0.0, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0])
-        noise_deg2 = _DIFFERENCE_DEG**2 + lag_deg**2
+        difference_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
+        noise_deg2 = difference_deg**2 + lag_deg**2
         total_deg2 = self._variance_deg2 + noise_deg2
         most = _MAX_SIGMAS * np.sqrt(total_deg2)
         gain = self._variance_deg2 / total_deg2
         off = np.clip(off - self._mean_deg, -most, most)
         self._mean_deg = self._mean_deg + gain * off
         self._variance_deg2 = self._variance_deg2 * (1.0 - gain)
-        if self._measured:
-            self._scatter_deg2 += _SCATTER_SHARE * (off**2 - self._scatter_deg2)
-        self._measured = True
+        if self._fixes:
+            beyond_deg2 = np.clip(off**2 - total_deg2, 0.0, self._first_deg2)
+            self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
+        self._fixes += 1

@@ -89,7 +89,7 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._attitude_lag = AttitudeLag(o.attitude_lag_s, o.attitude_jitter_s)
-        self._attitude_bias = AttitudeBias(o.tilt_bias_deg, o.heading_bias_deg)
+        self._attitude_bias = self._unknown_bias()
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
@@ -173,7 +173,10 @@ class Navigator:
         late = self._odometry.is_late(frame)
         now = self._odometry.sample(frame, self._recent.velocity)
         sources = self._sources(now, prior, late=late)
-        shown = frame if late else self._attitude_bias.corrected(self._attitude_lag.corrected(frame))
+        shown = frame if late else self._attitude_lag.corrected(frame)
+        if not late:
+            self._attitude_bias.follow(shown, now.time_s)
+        shown = self._attitude_bias.corrected(shown)
         result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
@@ -187,12 +190,16 @@ class Navigator:
         if not late:
             if isinstance(result, Fix):
                 self._attitude_lag.note(result, self._attitude_bias.bias)
-                self._attitude_bias.note(result)
+                if self._matcher.site.has_surface:  # else a slope of the ground passes for a tilt
+                    self._attitude_bias.note(result)
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
                 self._refusals += 1  # a lack of time is no evidence about the position
             self._note_loss(now)
         return result
+
+    def _unknown_bias(self) -> AttitudeBias:
+        return AttitudeBias(self._options.tilt_bias_deg, self._options.heading_bias_deg)
 
     # ------------------------------------------------------------------------------------------ predictions
 
@@ -346,6 +353,8 @@ class Navigator:
             return  # a late one
         jump = jump or self._lost
         self._resets += known and jump
+        if jump:  # what was learnt, was learnt where the vehicle was not
+            self._attitude_bias = self._unknown_bias()
         support = count if last is None or jump else last.support + count
         odds = min(odds, log_odds(MAX_PROBABILITY))
         position = PositionEstimate(en_m(fix), fix.relative_sigma_m, odds, on_map=True)
@@ -369,6 +378,8 @@ class Navigator:
         anchor, options = self._anchor, self._options
         if anchor is None or self._fixed:
             return
+        if self._refusals == options.lost_after:  # a wrong bias, or one that is no more, would keep them refused
+            self._attitude_bias = self._unknown_bias()
         estimate = self._reckoned(now)
         far = estimate is not None and estimate.sigma_m > options.lost_sigma_m
         if anchor.fix is not None:

@@ -48,6 +48,8 @@ _FREE_REACH = 4.0  # factor on the tolerance from which a pose without the prior
 # By how many times the inliers it must have more. Under right attitudes 134 frames of four flights had up to 1.07
 # times as many and one 1.16, under angles in radians, swapped or of the wrong sign each wrong pose but one 1.09.
 _CONTESTED = 1.1
+# And by how much the two must differ: features over a surface model of another year measured tilts wrong by 2.3.
+_CONTESTED_TILT_DEG, _CONTESTED_TURN_DEG = 3.0, 10.0
 _IDENTITY = np.eye(3)
 
 
@@ -319,7 +321,9 @@ def _without_wrong_prior(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     close = None if near is None else gauss_newton(free, near.rotation, near.center, slack=_START_SLACK)
     if close is None or np.count_nonzero(close.inliers) < _CONTESTED * np.count_nonzero(fit.inliers):
         return problem, fit
-    return free, close
+    x, y, z = np.degrees(turn_from_attitude(problem, close.rotation)).tolist()
+    is_other = math.hypot(x, y) > _CONTESTED_TILT_DEG or abs(z) > _CONTESTED_TURN_DEG
+    return (free, close) if is_other else (problem, fit)
 
 
 def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:

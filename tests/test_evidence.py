@@ -37,7 +37,7 @@ def fix_at(east_m, north_m, confidence=None, sigma_m=1.0):
 class Script:
     """A matcher over a map of 1 km that answers from a list of (east, north, confidence) and keeps the priors."""
 
-    site = SimpleNamespace(is_searchable=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
+    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
 
     def __init__(self, *answers):
         self.answers, self.priors = list(answers), []

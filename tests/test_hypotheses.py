@@ -26,7 +26,7 @@ def fix_at(east_m, north_m, confidence):
 class Doubting:
     """A matcher that refuses every frame; (east, north, confidence) of its next list are the candidates."""
 
-    site = SimpleNamespace(is_searchable=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
+    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
 
     def __init__(self, frames):
         self.frames = list(frames)

@@ -31,7 +31,7 @@ def fix_at(east_m, north_m, sigma_m=0.5, map_sigma_m=3.0):
 class Script:
     """A matcher that answers with places on a map that states nothing of its accuracy."""
 
-    site = SimpleNamespace(is_searchable=True, gsd_m_per_px=1.0, georeference_sigma_m=None)
+    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=None)
 
     def __init__(self, *places):
         self.places, self.priors = list(places), []

@@ -58,7 +58,9 @@ class Script:
     """A matcher that answers from a list: a place, None for a refusal, or its reason. It keeps what is asked."""
 
     def __init__(self, *answers, site=None, sigma_m=1.0, up_m=None):
-        self.site = site or SimpleNamespace(is_searchable=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
+        self.site = site or SimpleNamespace(
+            is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0
+        )
         self.answers, self.sigma_m, self.up_m = list(answers), sigma_m, up_m
         self.frames, self.priors, self.budgets = [], [], []
 
@@ -364,7 +366,7 @@ def test_lost_over_a_map_too_large_to_search_it_looks_where_dead_reckoning_leads
     script = Script(
         (10.0, 20.0),
         *[None] * 9,
-        site=SimpleNamespace(is_searchable=False, gsd_m_per_px=1.0, georeference_sigma_m=0.0),
+        site=SimpleNamespace(is_searchable=False, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0),
     )
     options = NavigatorOptions(lost_after=4, search_every=2, lost_sigma_m=3.0)
     navigator = Navigator(script, START, options=options)
