@@ -126,9 +126,10 @@ def _external_navigation(options: ParameterOptions) -> list[Parameter]:
 
 def _gps_input(options: ParameterOptions) -> list[Parameter]:
     name, delay_ms = f"GPS{options.gps_id + 1}", max(options.delay_ms, 1)
+    older = str(options.gps_id + 1) if options.gps_id else ""
     return [
-        (f"{name}_TYPE", 14, "GPS_INPUT by MAVLink; GPS_TYPE before 4.6"),
-        (f"{name}_DELAY_MS", delay_ms, "the least age that the bridge prints; 0 would mean 200"),
+        (f"{name}_TYPE", 14, f"GPS_INPUT by MAVLink; GPS_TYPE{older} before 4.6"),
+        (f"{name}_DELAY_MS", delay_ms, f"the least age; 0 would mean 200; GPS_DELAY_MS{older} before 4.6"),
     ]
 
 
