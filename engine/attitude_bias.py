@@ -22,21 +22,16 @@ _REFINED_DEG, _FEATURES_DEG = 0.6, 2.0
 _WALK_DEG = np.array([0.2, 0.2, 0.5])  # by which the bias changes in a second, one standard deviation
 _SCATTER_SHARE = 0.2  # of each new difference in their mean square
 _MAX_SIGMAS = 3.0  # of one difference: what is beyond counts as so much
-_ASSUMED_DEG = (
-    0.4,
-    1.0,
-)  # of a tilt and of a heading whose error the frame does not state, one standard deviation
+# Of a tilt and of a heading whose error the frame does not state, one standard deviation.
+_ASSUMED_TILT_DEG, _ASSUMED_HEADING_DEG = 0.4, 1.0
 _LEAST_SIGMAS = 2.0  # less is what every frame's matching allows for
 _LEAST_FIXES = 3  # before which nothing is taken off: one of them may be wrong
-_SCATTER_SHARE = 0.2  # of each new difference in their mean square
-_MAX_SIGMAS = 3.0  # of one difference: what is beyond counts as so much
-_LEAST_DEG = np.array([0.8, 0.8, 2.0])  # twice the assumed errors: less is what every frame's matching allows for
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 
 
 @dataclass(frozen=True, slots=True)
 class Bias:
-    """By how much an attitude is off: what is to be added to it.
+    """What is to be added to an attitude that is off, as far as it is known.
 
     Attributes:
         roll_deg, pitch_deg, heading_deg: to be added to the telemetry's.
@@ -62,7 +57,8 @@ class AttitudeBias:
         self._mean_deg, self._variance_deg2 = np.zeros(3), self._first_deg2.copy()
         self._scatter_deg2 = np.zeros(3)  # mean square of the newest differences beyond what is expected of them
         self._time_s: float | None = None
-        self._frame: Frame | None = None  # the newest; None where its attitude is not known
+        self._angles_deg: Array | None = None  # of the newest frame
+        self._lag_deg = np.zeros(3)  # by how much they may have changed since they were measured
         self._fixes = 0  # that measured it
 
     @property
@@ -78,7 +74,10 @@ class AttitudeBias:
         elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
         self._variance_deg2 = np.minimum(self._variance_deg2 + _WALK_DEG**2 * elapsed_s, self._first_deg2)
         self._time_s = time_s
-        self._frame = None if None in (frame.roll_deg, frame.pitch_deg, frame.heading_deg) else frame
+        known = (frame.roll_deg, frame.pitch_deg, frame.heading_deg)
+        self._angles_deg = None if None in known else np.array(known, np.float64)
+        tilt_lag_deg = frame.tilt_lag_deg or 0.0
+        self._lag_deg = np.array([tilt_lag_deg, tilt_lag_deg, frame.heading_lag_deg or 0.0])
 
     def corrected(self, frame: Frame) -> Frame:
         """The newest frame, or a late one, without the bias; how well that is known widens its errors."""
@@ -86,7 +85,8 @@ class AttitudeBias:
             return frame
         if self._fixes < _LEAST_FIXES:
             return frame
-        tilt_deg, heading_deg = frame.tilt_sigma_deg or _ASSUMED_DEG[0], frame.heading_sigma_deg or _ASSUMED_DEG[1]
+        tilt_deg = frame.tilt_sigma_deg or _ASSUMED_TILT_DEG
+        heading_deg = frame.heading_sigma_deg or _ASSUMED_HEADING_DEG
         off = np.abs(self._mean_deg) > _LEAST_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
         roll, pitch, heading = (self._mean_deg * off).tolist()
         wider = np.sqrt(self._variance_deg2 * off + self._scatter_deg2)
@@ -101,21 +101,13 @@ class AttitudeBias:
 
     def note(self, fix: Fix) -> None:
         """Learn from a fix of the newest frame; one without a height did not measure its attitude."""
-        frame, seen = self._frame, fix.attitude
-        if seen is None or fix.up_m is None or frame is None or abs(seen.pitch_deg) > _MAX_PITCH_DEG:
+        known_deg, seen = self._angles_deg, fix.attitude
+        if seen is None or fix.up_m is None or known_deg is None or abs(seen.pitch_deg) > _MAX_PITCH_DEG:
             return
-        assert frame.roll_deg is not None
-        assert frame.pitch_deg is not None
-        assert frame.heading_deg is not None
-        pairs = (
-            (seen.roll_deg, frame.roll_deg),
-            (seen.pitch_deg, frame.pitch_deg),
-            (seen.heading_deg, frame.heading_deg),
-        )
-        off = np.array([math.remainder(measured - known, 360.0) for measured, known in pairs])
-        lag_deg = np.array([frame.tilt_lag_deg or 0.0, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0])
+        apart = np.array([seen.roll_deg, seen.pitch_deg, seen.heading_deg]) - known_deg
+        off = np.array([math.remainder(angle, 360.0) for angle in apart.tolist()])
         difference_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
-        noise_deg2 = difference_deg**2 + lag_deg**2
+        noise_deg2 = difference_deg**2 + self._lag_deg**2
         total_deg2 = self._variance_deg2 + noise_deg2
         most = _MAX_SIGMAS * np.sqrt(total_deg2)
         gain = self._variance_deg2 / total_deg2

@@ -173,8 +173,9 @@ class Navigator:
         late = self._odometry.is_late(frame)
         now = self._odometry.sample(frame, self._recent.velocity)
         sources = self._sources(now, prior, late=late)
-        shown = frame if late else self._attitude_lag.corrected(frame)
+        shown = frame
         if not late:
+            shown = self._attitude_lag.corrected(frame)
             self._attitude_bias.follow(shown, now.time_s)
         shown = self._attitude_bias.corrected(shown)
         result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)

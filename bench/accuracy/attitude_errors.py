@@ -29,27 +29,23 @@ MAP_SIGMA_M = 0.3  # of these worlds, so that the covariances are not the map's
 HEADER = "error | answered | RMS m | largest m | NEES | beyond 4 sigma | learnt lag s | learnt bias deg"
 
 
-def delayed(frames: list[Frame], lag: str) -> list[Frame]:
-    """The frames with the attitude of some time ago: "0.1", or "0-0.15" for a lag of its own for every frame."""
+def delayed(frames: list[Frame], angles: Array, lag: str) -> Array:
+    """The angles (N, 3) of some time ago: "0.1", or "0-0.15" for a lag of its own for every frame."""
     low, _, high = lag.partition("-")
     drawn_s = np.random.default_rng(3).uniform(float(low), float(high or low), len(frames))
     time_s = np.array([(frame.timestamp_ns or 0) * 1e-9 for frame in frames])
-    angles = np.array([(f.roll_deg, f.pitch_deg, f.heading_deg) for f in frames], np.float64)
-    angles[:, 2] = np.degrees(np.unwrap(np.radians(angles[:, 2])))
-    late = np.stack([np.interp(time_s - drawn_s, time_s, column) for column in angles.T], axis=1)
-    return [
-        replace(frame, roll_deg=float(roll), pitch_deg=float(pitch), heading_deg=float(heading % 360.0))
-        for frame, (roll, pitch, heading) in zip(frames, late, strict=True)
-    ]
+    heading = np.degrees(np.unwrap(np.radians(angles[:, 2])))
+    columns = (*angles.T[:2], heading)
+    return np.stack([np.interp(time_s - drawn_s, time_s, column) for column in columns], axis=1)
 
 
 def spoiled(frames: list[Frame], error: str) -> list[Frame]:
     """The frames with an error of their attitude, as the module names it."""
     kind, _, size = error.partition(":")
-    if kind == "late":
-        return delayed(frames, size)
     angles = np.array([(f.roll_deg, f.pitch_deg, f.heading_deg) for f in frames], np.float64)
-    if kind == "off":
+    if kind == "late":
+        angles = delayed(frames, angles, size)
+    elif kind == "off":
         angles += [float(part) for part in size.split("/")]
     elif kind == "radians":
         angles = np.radians(angles)

@@ -26,7 +26,6 @@ from engine.adapters.mavlink_in import (
     MavlinkTelemetry,
 )
 from engine.adapters.mavlink_out import (
-    LONGEST_DELAY_NS,
     FixReport,
     MavlinkOptions,
     acknowledgement_message,
@@ -37,6 +36,7 @@ from engine.adapters.mavlink_out import (
     notice_message,
     repeated_receiver_message,
     set_origin_message,
+    stamp_on_ground_ns,
     timesync_message,
     withhold_reason,
 )
@@ -211,7 +211,7 @@ class MavlinkBridge:
         if self._options.needs_origin:
             self._send(no_position_message(now_ns))
         elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
-            stamp_ns = max(now_ns - LONGEST_DELAY_NS, 0)
+            stamp_ns = stamp_on_ground_ns(now_ns)
             unix_ns = self.telemetry.unix_ns(stamp_ns)
             self._send(
                 repeated_receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, (stamp_ns, unix_ns))

@@ -27,9 +27,6 @@ MESSAGES = {
 }
 """Messages that each firmware accepts; the first is the default."""
 
-LONGEST_DELAY_NS = round(MAX_DELAY_MS * 1e6)
-"""Age of what is sent on the ground: ArduPilot takes the quickest message for undelayed, which must be a fix."""
-
 SENSOR_ID = 1
 """Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
@@ -181,16 +178,23 @@ def acknowledgement_message(command: int, *, accepted: bool) -> Any:
     return mavlink.MAVLink_command_ack_message(command, result)
 
 
+def stamp_on_ground_ns(now_ns: int) -> int:
+    """Stamp of what is sent before take-off, older than any fix.
+
+    ArduPilot takes the quickest message for undelayed, which must be a fix.
+    """
+    return max(now_ns - round(MAX_DELAY_MS * 1e6), 0)
+
+
 def no_position_message(now_ns: int) -> Any:
     """ODOMETRY that says: the camera works, and knows no position.
 
     ArduPilot does not arm unless something has come from its visual odometry within 0.3 s, and on the ground a
     camera sees nothing. By its quality the message is not used for navigation.
     """
-    nan = math.nan
-    stamp_us = (now_ns - LONGEST_DELAY_NS) // 1000
+    nan, stamp_us = math.nan, stamp_on_ground_ns(now_ns) // 1000
     return mavlink.MAVLink_odometry_message(
-        max(stamp_us, 0), mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, *(0.0, 0.0, 0.0),
+        stamp_us, mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, *(0.0, 0.0, 0.0),
         [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, [nan] * 21, [nan] * 21, 0, mavlink.MAV_ESTIMATOR_TYPE_VISION,
         -1,  # failed
     )  # fmt: skip
