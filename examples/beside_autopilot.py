@@ -1,12 +1,15 @@
 """Beside an autopilot: beside_autopilot.py FIRMWARE LINK LAT LON [CAMERA], where a flight folder's files lie."""
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from engine import Camera, Navigator, OrthoMap, Prior, SceneMatcher, set_threads
 from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions, NedOrigin, parse_connection
 from engine.adapters.pictures import capture, replay
 
+if not 5 <= len(sys.argv) <= 6:
+    sys.exit(__doc__)
 firmware, link, lat, lon, *cameras = sys.argv[1:]  # ardupilot, udpin:127.0.0.1:14550, where it takes off, 0
 set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
@@ -18,9 +21,11 @@ options = MavlinkOptions(firmware=firmware)
 bridge = MavlinkBridge(
     parse_connection(link), lambda prior: Navigator(matcher, prior), options, start, origin=origin, site=site
 )
-with bridge:  # a camera, or without one the flight folder's pictures at their own pace
-    pictures = capture(cameras[0]) if cameras else replay(Path("frames"), Path("telemetry.csv"), rate_hz=5.0)
-    for picture in pictures:
-        if picture is not None:  # a camera had none for a while
-            bridge.submit(*picture)
+# A camera, or without one the flight folder's pictures at their own pace.
+pictures = capture(cameras[0]) if cameras else replay(Path("frames"), Path("telemetry.csv"), rate_hz=5.0)
+with bridge:
+    with suppress(KeyboardInterrupt):  # the usual end beside a camera
+        for picture in pictures:
+            if picture is not None:  # a camera had none for a while
+                bridge.submit(*picture)
     print(bridge.status)

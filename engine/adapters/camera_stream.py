@@ -160,6 +160,7 @@ class CameraStream:
         self._last: Image | None = None
         self._arrived_s = time.monotonic()
         self._number = 0  # of the present reader; an older one that still blocks is not listened to
+        self._has_read = False
         self._start(self._open())
 
     def next(self, timeout_s: float) -> tuple[Image, int] | None:
@@ -180,7 +181,15 @@ class CameraStream:
         self._thread.join(_CLOSE_S)
 
     def reopen(self, cause: str) -> None:
-        """Abandon the present reader and open the source again."""
+        """Abandon the present reader and open the source again.
+
+        Raises:
+            TelemetryError: the source ended without ever having given a picture.
+        """
+        if not self._has_read and not self._thread.is_alive():
+            raise TelemetryError(
+                f"camera_source: expected pictures, got none: {quoted(self._name)} ended before the first"
+            )
         _log.warning("camera %s: %s; opened again", quoted(self._name), cause)
         self._number += 1
         self._source.interrupt()
@@ -219,7 +228,7 @@ class CameraStream:
             while self._number == number and (picture := source.read()) is not None:
                 with self._changed:
                     if self._number == number:
-                        self._newest, self._arrived_s = picture, time.monotonic()
+                        self._newest, self._arrived_s, self._has_read = picture, time.monotonic(), True
                         self._changed.notify_all()
         except (cv2.error, OSError, ValueError) as error:
             _log.warning("camera %s: %s", quoted(self._name), error)
@@ -239,7 +248,7 @@ def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple
         last is none: a camera that hangs repeats its last one.
 
     Raises:
-        TelemetryError: the camera or stream cannot be opened at first.
+        TelemetryError: the camera or stream cannot be opened at first, or ends before its first picture.
     """
     stream = CameraStream(source)
     try:

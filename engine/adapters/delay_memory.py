@@ -26,6 +26,11 @@ def measured_delay_ms() -> int | None:
         return None
 
 
-def _file() -> Path:
+def cache_folder() -> Path:
+    """Where what one run leaves for the next is kept."""
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(folder) / "scenematch" / "mavlink-delay-ms"
+    return Path(folder) / "scenematch"
+
+
+def _file() -> Path:
+    return cache_folder() / "mavlink-delay-ms"

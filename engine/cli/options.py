@@ -70,6 +70,15 @@ SettingsOption = Annotated[
 FirmwareOption = Annotated[
     str, typer.Option("--firmware", metavar="ardupilot|px4", help="What the autopilot runs.")
 ]
+SystemIdOption = Annotated[
+    int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
+]
+KeyOption = Annotated[
+    Path | None, typer.Option("--key", metavar="FILE", help="Secret of MAVLink's signing; unsigned is ignored.")
+]
+ListenAnywhereOption = Annotated[
+    bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
+]
 MessageOption = Annotated[
     str,
     typer.Option(

@@ -6,16 +6,16 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from engine.adapters.links import parse_connection
 from engine.adapters.pictures import CapturedImage, capture
-from engine.camera import Camera
 from engine.errors import BackendError, TelemetryError, require
 from engine.lag import Lag, camera_lag, turn_between
+from engine.runs.cameras import CameraFiles
 from engine.runs.folders import StrPath
 from engine.runs.progress import SILENT, Progress
 from engine.values import Frame, NoFix, Reason
@@ -40,6 +40,10 @@ def measure_camera_delay(
     camera_source: str,
     *,
     seconds: float = 20.0,
+    mount: str | None = None,
+    firmware: str = "ardupilot",
+    system_id: int = 1,
+    key: StrPath | None = None,
     listen_anywhere: bool = False,
     progress: Progress = SILENT,
 ) -> Lag:
@@ -50,6 +54,10 @@ def measure_camera_delay(
         camera: calibration.
         camera_source: as of the bridge.
         seconds: how long pictures are taken.
+        mount: how the camera is mounted, by name; None is the calibration's.
+        firmware: of the autopilot, "ardupilot" or "px4".
+        system_id: of the vehicle; others are not heard.
+        key: secret of MAVLink's signing; with it unsigned packets are ignored.
         listen_anywhere: allow udpin on addresses that other machines reach.
         progress: is shown what to do.
 
@@ -59,11 +67,14 @@ def measure_camera_delay(
     """
     require("pymavlink", "mavlink")
     from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions
+    from engine.adapters.packets import read_key
 
-    model = Camera.load(Path(camera))
+    model = CameraFiles(calibration=Path(camera), mount=mount).load(None)
+    options, secret = MavlinkOptions(firmware=firmware), None if key is None else read_key(Path(key))
     connection = parse_connection(connect, listen_anywhere=listen_anywhere)
     try:
-        bridge = MavlinkBridge(connection, lambda _: _Idle(), MavlinkOptions())  # type: ignore[arg-type,return-value]
+        idle: Any = _Idle()
+        bridge = MavlinkBridge(connection, lambda _: idle, options, system_id=system_id, key=secret)
     except OSError as error:
         raise BackendError(f"connect: {connect} cannot be opened: {error.strerror or error}") from None
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")

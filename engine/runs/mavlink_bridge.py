@@ -27,10 +27,11 @@ from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
+from engine.runs.last_fix import LastFix, last_fix_file
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import with_weights
-from engine.runs.supervisor import SharedPosition, become_worker, check_supervision, end_on_sigterm
+from engine.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
 
 if TYPE_CHECKING:
@@ -264,11 +265,13 @@ def run_mavlink_bridge(
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
-    last_position = SharedPosition()
+    # A camera's bridge may start in the air; a flight that is played begins where it began.
+    resumes = files.camera_source is not None
+    last_fix = LastFix(last_fix_file(link.connect, Path(files.map).absolute()) if resumes else None)
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
-        start = last_position.prior(settings.live_options().max_speed_mps) or start
+    start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
 
     end_on_sigterm()
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
@@ -277,7 +280,7 @@ def run_mavlink_bridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
                 check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
-                on_sent=last_position.keep, gimbal_mount=camera.mount if files.gimbal else None,
+                on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -291,6 +294,18 @@ def run_mavlink_bridge(
             if files.camera_source is not None:
                 remember_delay(bridge.status.least_age_ms)
             return bridge.status
+
+
+def _resumed(last: Prior | None, start: Prior | None, site: OrthoMap, progress: Progress) -> Prior | None:
+    """Where the bridge before this one, or the worker, sent its last fix, unless that is too long ago."""
+    if last is None:
+        return start
+    try:
+        check_position("last fix", last, site, OptionError)
+    except OptionError:  # the file of the map is another one now
+        return start
+    progress.message(f"goes on from the last fix, which has grown uncertain by {last.sigma_m:.0f} m")
+    return last
 
 
 def outgoing_options(firmware: str, message: str, max_sigma_m: float, gps_id: int) -> MavlinkOptions:

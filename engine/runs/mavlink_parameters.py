@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from engine.adapters.delay_memory import measured_delay_ms
@@ -11,6 +12,19 @@ from engine.runs.folders import StrPath, check_file
 from engine.runs.mavlink_bridge import outgoing_options
 
 _DEFAULT_DELAY_MS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenParameters:
+    """What a parameter file was written for.
+
+    Attributes:
+        delay_ms: from capture to arrival.
+        delay_source: "given", "measured by the last bridge", or "assumed; not measured yet".
+    """
+
+    delay_ms: int
+    delay_source: str
 
 
 def write_parameter_file(
@@ -23,7 +37,7 @@ def write_parameter_file(
     delay_ms: int | None = None,
     max_sigma_m: float = 10.0,
     force: bool = False,
-) -> int:
+) -> WrittenParameters:
     """Write the parameters that let an autopilot fly by the bridge's fixes.
 
     Args:
@@ -37,16 +51,25 @@ def write_parameter_file(
         force: whether the file may be there already.
 
     Returns:
-        The delay that was written.
+        The delay that was written, and where it came from.
     """
     require("pymavlink", "mavlink")
     out, outgoing = Path(out), outgoing_options(firmware, message, max_sigma_m, gps_id)
-    delay_ms = (measured_delay_ms() or _DEFAULT_DELAY_MS) if delay_ms is None else delay_ms
+    written = _delay(delay_ms)
     options = ParameterOptions(
-        firmware=firmware, message=outgoing.kind, takeoff=takeoff, gps_id=gps_id, delay_ms=delay_ms,
+        firmware=firmware, message=outgoing.kind, takeoff=takeoff, gps_id=gps_id, delay_ms=written.delay_ms,
         max_sigma_m=max_sigma_m,
     )  # fmt: skip
     text = parameter_file(options)
     check_file(out, force)
     out.write_text(text, encoding="utf-8")
-    return delay_ms
+    return written
+
+
+def _delay(given_ms: int | None) -> WrittenParameters:
+    if given_ms is not None:
+        return WrittenParameters(given_ms, "given")
+    measured_ms = measured_delay_ms()
+    if measured_ms:
+        return WrittenParameters(measured_ms, "measured by the last bridge")
+    return WrittenParameters(_DEFAULT_DELAY_MS, "assumed; not measured yet")

@@ -6,41 +6,17 @@ it from their first instruction on.
 
 from __future__ import annotations
 
-import mmap
 import os
 import signal
-import struct
 import threading
 import time
 from typing import Any
 
 from engine.errors import OptionError
 from engine.runs.progress import SILENT, Progress
-from engine.values import Fix, Prior
 
 _PAUSE_S, _MAX_PAUSE_S = 0.05, 5.0  # before a worker is replaced; doubled where one after the other dies at once
 _SHORT_S = 5.0
-_MAX_AGE_S = 60.0  # of a position with which a worker starts
-_POSITION = struct.Struct("=dddd")
-
-
-class SharedPosition:
-    """The last fix of a worker, in memory that it shares with those that replace it."""
-
-    def __init__(self) -> None:
-        self._memory = mmap.mmap(-1, _POSITION.size)
-
-    def keep(self, fix: Fix) -> None:
-        """Remember a fix that was just given."""
-        self._memory[:] = _POSITION.pack(fix.east_m, fix.north_m, fix.sigma_m, time.monotonic())
-
-    def prior(self, max_speed_mps: float) -> Prior | None:
-        """Where the vehicle can be by now; None where nothing was kept, or too long ago."""
-        east_m, north_m, sigma_m, time_s = _POSITION.unpack(self._memory[:])
-        age_s = time.monotonic() - time_s
-        if time_s == 0.0 or age_s > _MAX_AGE_S:
-            return None
-        return Prior(east_m=east_m, north_m=north_m, sigma_m=sigma_m + max_speed_mps * age_s)
 
 
 def check_supervision(device: Any) -> None:

@@ -12,19 +12,20 @@ from types import SimpleNamespace
 import pytest
 
 from engine.errors import OptionError
-from engine.runs.supervisor import SharedPosition, check_supervision
+from engine.runs.supervisor import check_supervision
 from tests.support.paths import ROOT
 
 SCRIPT = """
 import os, sys, time
 from types import SimpleNamespace
-from engine.runs.supervisor import SharedPosition, become_worker, end_on_sigterm
-shared = SharedPosition()
+from engine.runs.last_fix import LastFix
+from engine.runs.supervisor import become_worker, end_on_sigterm
+shared = LastFix()
 become_worker()
 end_on_sigterm()
 prior = shared.prior(15.0)
-print(os.getpid(), "none" if prior is None else round(prior.east_m), time.monotonic(), flush=True)
-shared.keep(SimpleNamespace(east_m=123.0, north_m=4.0, sigma_m=0.5))
+print(os.getpid(), "none" if prior is None else round(prior.lat_deg), time.monotonic(), flush=True)
+shared.keep(SimpleNamespace(lat_deg=48.0, lon_deg=16.0, sigma_m=0.5))
 try:
     time.sleep(30.0)
 except KeyboardInterrupt:
@@ -49,7 +50,7 @@ def test_a_worker_that_is_killed_is_replaced_at_once_and_starts_at_the_last_fix(
     os.kill(int(pid), signal.SIGKILL)
     other, position, begun_s = supervisor.stdout.readline().split()
     assert other != pid
-    assert position == "123"
+    assert position == "48"
     assert float(begun_s) - killed_s < 1.0
     supervisor.kill()
     os.kill(int(other), signal.SIGKILL)
@@ -61,16 +62,6 @@ def test_sigterm_ends_both_with_the_workers_exit_code(supervisor):
     supervisor.send_signal(signal.SIGTERM)
     assert supervisor.stdout.readline() == "table\n"
     assert supervisor.wait(5.0) == 3
-
-
-def test_a_position_grows_uncertain_while_nobody_watches():
-    shared = SharedPosition()
-    assert shared.prior(15.0) is None
-    shared.keep(SimpleNamespace(east_m=1.0, north_m=2.0, sigma_m=0.5))
-    time.sleep(0.1)
-    prior = shared.prior(15.0)
-    assert (prior.east_m, prior.north_m) == (1.0, 2.0)
-    assert 2.0 <= prior.sigma_m < 10.0
 
 
 def test_a_gpu_cannot_be_supervised():

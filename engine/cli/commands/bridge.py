@@ -17,6 +17,8 @@ from engine.cli.options import (
     DeviceOption,
     FirmwareOption,
     JsonOption,
+    KeyOption,
+    ListenAnywhereOption,
     MapBoundsOption,
     MapCrsOption,
     MapOption,
@@ -30,6 +32,7 @@ from engine.cli.options import (
     SecondsOption,
     StartOption,
     SurfaceOption,
+    SystemIdOption,
     ThreadsOption,
     WeightsOption,
     use_threads,
@@ -81,16 +84,9 @@ def mavlink(
     gps_id: Annotated[
         int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
     ] = 0,
-    system_id: Annotated[
-        int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
-    ] = 1,
-    key: Annotated[
-        Path | None,
-        typer.Option("--key", metavar="FILE", help="Secret of MAVLink's signing; unsigned is ignored."),
-    ] = None,
-    listen_anywhere: Annotated[
-        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
-    ] = False,
+    system_id: SystemIdOption = 1,
+    key: KeyOption = None,
+    listen_anywhere: ListenAnywhereOption = False,
     set_origin: Annotated[
         bool, typer.Option("--set-origin/--no-set-origin", help="Give an autopilot without an origin the map's.")
     ] = True,
@@ -163,9 +159,11 @@ def camera_delay(
     seconds: Annotated[
         float, typer.Option("--seconds", min=5.0, metavar="S", help="How long pictures are taken.")
     ] = 20.0,
-    listen_anywhere: Annotated[
-        bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
-    ] = False,
+    mount: MountOption = None,
+    firmware: FirmwareOption = "ardupilot",
+    system_id: SystemIdOption = 1,
+    key: KeyOption = None,
+    listen_anywhere: ListenAnywhereOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """How late a camera's pictures arrive.
@@ -176,8 +174,9 @@ def camera_delay(
     from engine.runs.camera_delay import measure_camera_delay
 
     found = measure_camera_delay(
-        connect, camera, camera_source, seconds=seconds, listen_anywhere=listen_anywhere, progress=console.PROGRESS
-    )
+        connect, camera, camera_source, seconds=seconds, mount=mount, firmware=firmware, system_id=system_id,
+        key=key, listen_anywhere=listen_anywhere, progress=console.PROGRESS,
+    )  # fmt: skip
     values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
     console.facts(values, as_json, title=f"camera {camera_source}")
 
@@ -207,7 +206,7 @@ def mavlink_params(
     """
     from engine.runs.mavlink_parameters import write_parameter_file
 
-    written_ms = write_parameter_file(
+    written = write_parameter_file(
         firmware,
         message,
         out,
@@ -217,7 +216,7 @@ def mavlink_params(
         max_sigma_m=max_sigma_m,
         force=force,
     )
-    console.say(f"written to {out}, for a delay of {written_ms} ms")
+    console.say(f"written to {out}, for a delay of {written.delay_ms} ms ({written.delay_source})")
 
 
 def ros(
