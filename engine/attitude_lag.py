@@ -22,6 +22,7 @@ _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the rates are unknown
 _MIN_RATE_DPS = 2.0  # of roll and pitch, below which a picture says nothing of the lag
 _DIFFERENCE_DEG = 0.6  # standard deviation of telemetry against picture without any lag
 _WALK_S = 0.01  # by which the lag changes in a second
+_MAX_LAG_DEG = 180.0  # stamps of another unit make rates of any size
 _MAX_SIGMAS = 3.0  # of the lag before it was measured: what is beyond is no lag
 
 
@@ -61,8 +62,8 @@ class AttitudeLag:
             roll_deg=roll,
             pitch_deg=max(-90.0, min(pitch, 90.0)),
             heading_deg=wrap_heading_deg(heading),
-            tilt_lag_deg=float(np.abs(self._rates_dps[:2]).max()) * self.sigma_s,
-            heading_lag_deg=float(abs(self._rates_dps[2])) * self.sigma_s,
+            tilt_lag_deg=min(float(np.abs(self._rates_dps[:2]).max()) * self.sigma_s, _MAX_LAG_DEG),
+            heading_lag_deg=min(float(abs(self._rates_dps[2])) * self.sigma_s, _MAX_LAG_DEG),
         )
 
     def note(self, fix: Fix, bias: Bias | None = None) -> None:

@@ -124,3 +124,12 @@ def test_bad_lags_are_named():
         NavigatorOptions(attitude_lag_s=-1.0)
     with pytest.raises(TelemetryError, match="tilt_lag_deg: expected 0 degrees or more, got nan"):
         Frame(IMAGE, tilt_lag_deg=math.nan)
+
+
+def test_stamps_of_another_unit_leave_a_lag_that_a_frame_can_state():
+    lag = AttitudeLag(0.1, 0.03)
+    lag.corrected(frame_at(0.0))
+    turned = lag.corrected(frame_at(0.2, timestamp_ns=200))  # milliseconds that pass for nanoseconds
+    assert turned.tilt_lag_deg <= 180.0
+    assert turned.heading_lag_deg <= 180.0
+    with_frame_accuracy(turned, AssumedErrors())  # was refused: more than a million degrees

@@ -72,13 +72,16 @@ class Auto(Method):
             return replace(first if second.reason is Reason.LATE else second, candidates=both)
         if isinstance(second, NoFix):
             return self.ncc.refine(query, first)
+        # A wrong attitude displaces the peak; refinement, which measures it, leads back.
+        refined = self.ncc.refine(query, first)
+        if isinstance(refined, Fix) and refined.stage == "refined":
+            first = refined
         apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
         if not are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2):
             if float(np.hypot(*apart_m)) < self.ncc.options.rule.exclusion_m:
                 return _vaguer(second, apart_m)
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
-        refined = self.ncc.refine(query, first)
         fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
         # Both compare one picture with one map under one prior, so their odds are not multiplied.
         stated = [fix.confidence for fix in fixes if fix.confidence is not None]

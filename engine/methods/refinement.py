@@ -34,6 +34,8 @@ _MIN_CORRELATION = 0.2
 # of the frames of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; under
 # right ones each was confirmed.
 _UNCONFIRMED_TILT_DEG = 1.5
+# Standard deviations of an attitude that the picture does not confirm.
+_DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
 _LAST_STEP, _LAST_STEP_COARSE = 0.2, 0.5  # in standard deviations: a coarser level only has to come near
 
@@ -46,34 +48,29 @@ class Refinement:
         query: the frame, with height and heading.
         samples: of the map.
         options: of the correlation.
+        knows_tilt: whether a roll and pitch that came with the frame count.
     """
 
     query: Query
     samples: SampleMap
     options: NccOptions
+    knows_tilt: bool = True
 
     def refine(self, fix: Fix) -> Fix | NoFix:
         """The fix with all of its pose refined, or a less certain one where refinement does not confirm it.
 
-        Without a known roll and pitch the picture must determine them over a surface model, or the fix is refused:
-        its error is unknown then. Over ground that is taken for flat the fix stays as it was.
+        Where the picture does not confirm the telemetry's attitude, that is doubted: the pose is refined once more
+        as if roll and pitch were hardly known. Without a known roll and pitch the picture must determine them over
+        a surface model, or the fix is refused: its error is unknown then. Over ground that is taken for flat the
+        fix stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
-        errors = query.errors(self.options.errors)
-        prior = self._prior(fix)
         with query.scheduler.stage("dense"):
-            fit = self._through_levels(prior, _COARSER) if has_tilt else None
-            fit = fit or self._through_levels(prior, _MUCH_COARSER)
-            pose_covariance = None if fit is None else covariance_of(fit, prior)
-        if fit is not None and pose_covariance is not None:
-            covariance = pose_covariance[:3, :3].copy()
-            height_m = fit.pose.center_m[2] - query.site.ground_m
-            covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
-            if not query.site.has_surface:  # a slope of the ground was taken for a tilt
-                covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
-            moved = (fit.pose.center_m - prior.pose.center_m)[:2]
-            if are_consistent(moved, fix.relative_covariance_m2 + covariance[:2, :2]):
-                return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3))
+            refined = self._refined(fix)
+            if refined is None and has_tilt and query.site.has_surface:
+                refined = self._doubting()._refined(fix)
+        if refined is not None:
+            return refined
         if not query.site.has_surface:
             return fix
         if has_tilt:
@@ -83,11 +80,46 @@ class Refinement:
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
+    def _doubting(self) -> Refinement:
+        """The same, of a frame whose attitude is hardly known."""
+        frame = replace(
+            self.query.frame,
+            tilt_sigma_deg=_DOUBTED_TILT_DEG,
+            heading_sigma_deg=max(self.query.frame.heading_sigma_deg or 0.0, _DOUBTED_HEADING_DEG),
+        )
+        return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
+
+    def _refined(self, fix: Fix) -> Fix | None:
+        """The fix with its pose refined, None where that fails or leads elsewhere."""
+        query, prior = self.query, self._prior(fix)
+        errors = query.errors(self.options.errors)
+        fit = self._through_levels(prior, _COARSER) if self._knows_tilt else None
+        fit = fit or self._through_levels(prior, _MUCH_COARSER)
+        pose_covariance = None if fit is None else covariance_of(fit, prior)
+        if fit is None or pose_covariance is None:
+            return None
+        covariance = pose_covariance[:3, :3].copy()
+        height_m = fit.pose.center_m[2] - query.site.ground_m
+        covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
+        if not query.site.has_surface:  # a slope of the ground was taken for a tilt
+            covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
+        moved = (fit.pose.center_m - prior.pose.center_m)[:2]
+        allowed_m2 = fix.relative_covariance_m2 + covariance[:2, :2]
+        if not self.knows_tilt:  # by which the peak was displaced
+            allowed_m2 += (height_m * math.radians(errors.tilt_deg)) ** 2 * np.eye(2)
+        if not are_consistent(moved, allowed_m2):
+            return None
+        return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3))
+
+    @property
+    def _knows_tilt(self) -> bool:
+        return self.knows_tilt and self.query.telemetry.has_tilt
+
     def _through_levels(self, prior: GaussianPrior, coarser: int) -> DenseFit | None:
         """Refine on levels coarser than the frame's first, where a few pixels reach farther, then on its own."""
         query, site, height_m = self.query, self.query.site, self.query.telemetry.height_agl_m
         assert height_m is not None  # a fix by correlation had one
-        own, has_tilt = query.level_of(height_m), query.telemetry.has_tilt
+        own, has_tilt = query.level_of(height_m), self._knows_tilt
         min_correlation = _MIN_CORRELATION if has_tilt else _MIN_CORRELATION_WITHOUT_TILT
         pose, fit = prior.pose, None
         for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
