@@ -20,6 +20,7 @@ import numpy as np
 from bench.inputs.faults import Fault, Told, faults, load
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.device import set_threads
+from engine.diagnosis import diagnose
 from engine.formats.truth import interpolate_truth
 
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
@@ -87,6 +88,18 @@ def cell(told: Told, fault: Fault, flight: str, method: str) -> Cell:
     return fly(spoiled, stamps, flight, fault.name, method)
 
 
+def diagnosed(told: Told, fault: Fault) -> str:
+    """What a diagnosis says of it."""
+    spoiled = fault.spoil(told)
+    first = interpolate_truth(told.truth, told.frames[0].timestamp_ns or 0)
+    assert first is not None
+    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
+    found = diagnose(spoiled.frames, spoiled.site(), spoiled.camera, start=start)
+    named = bool(set(fault.causes) & {finding.cause for finding in found.findings[:1]})
+    verdict = "right" if named else "silent" if not found.findings else "WRONG" if fault.causes else "FALSE ALARM"
+    return f"{verdict}: seen {found.seen}: " + "; ".join(f"{f.cause}: {f.text}" for f in found.findings)
+
+
 def _row(found: Cell) -> str:
     def shown(value: float | None) -> str:
         return "-" if value is None else f"{value:.2f}"
@@ -102,12 +115,13 @@ def main() -> None:
     """Print a row a cell."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+")
-    parser.add_argument("--methods", nargs="+", default=["ncc", "sift", "auto"])
+    parser.add_argument("--methods", nargs="*", default=["ncc", "sift", "auto"])
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--map", default="map.tif")
     parser.add_argument("--only", default="")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--diagnose", action="store_true")
     wanted = parser.parse_args()
     set_threads(1)
     begin, cells = time.monotonic(), []
@@ -116,6 +130,8 @@ def main() -> None:
         for fault in faults():
             if wanted.only not in fault.name:
                 continue
+            if wanted.diagnose:
+                print(f"{folder.name:18s} {fault.name:38s} {diagnosed(told, fault)}", flush=True)
             for method in wanted.methods:
                 cells.append(cell(told, fault, folder.name, method))
                 print(_row(cells[-1]), flush=True)

@@ -36,6 +36,7 @@ from engine.motion import (
 )
 from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
+from engine.repeats import Repeats
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
 Array = NDArray[np.float64]
@@ -90,6 +91,7 @@ class Navigator:
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._attitude_lag = AttitudeLag(o.attitude_lag_s, o.attitude_jitter_s)
         self._attitude_bias = self._unknown_bias()
+        self._repeats = Repeats()
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
@@ -172,6 +174,12 @@ class Navigator:
         """
         late = self._odometry.is_late(frame)
         now = self._odometry.sample(frame, self._recent.velocity)
+        repeated = None if late else self._repeats.refusal(frame, now)
+        if repeated is not None:
+            self._odometry.append(frame, now)
+            self._fixed = False
+            self._note_loss(now)
+            return repeated
         sources = self._sources(now, prior, late=late)
         shown = frame
         if not late:

@@ -35,6 +35,7 @@ class Told:
         affine: (2, 3) from pixels to ``crs``.
         crs: of the map.
         truth: what is true, whatever is told.
+        georeference_sigma_m: accuracy that the map states.
     """
 
     frames: list[Frame]
@@ -44,12 +45,14 @@ class Told:
     affine: Array
     crs: Any
     truth: list[Truth]
+    georeference_sigma_m: float | None = 0.5
 
     def site(self) -> OrthoMap:
-        """The map as it is told, good to 0.5 m as far as it says."""
+        """The map as it is told."""
         return OrthoMap.from_arrays(
-            self.gray, self.affine, self.crs, surface_m=self.surface_m, georeference_sigma_m=0.5
-        )
+            self.gray, self.affine, self.crs, surface_m=self.surface_m,
+            georeference_sigma_m=self.georeference_sigma_m,
+        )  # fmt: skip
 
 
 def load(folder: Path, map_name: str = "map.tif", step: int = 1, count: int | None = None) -> Told:
@@ -100,7 +103,12 @@ def _each(change: Callable[[Frame], Frame]) -> Callable[[Told], Told]:
 
 
 def _height(change: Callable[[float], float]) -> Callable[[Told], Told]:
-    return _each(lambda f: f if f.height_agl_m is None else replace(f, height_agl_m=max(change(f.height_agl_m), 1.0)))
+    def one(frame: Frame) -> Frame:
+        if frame.height_agl_m is None:
+            return frame
+        return replace(frame, height_agl_m=max(change(frame.height_agl_m), 1.0))
+
+    return _each(one)
 
 
 def _late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callable[[Told], Told]:
@@ -277,53 +285,81 @@ class Fault:
     spoil: Callable[[Told], Told]
 
 
+def _added(*offsets_deg: float) -> Callable[[Told], Told]:
+    return _angles(lambda angles: angles + np.array(offsets_deg))
+
+
+def _times(*factors: float) -> Callable[[Told], Told]:
+    return _angles(lambda angles: angles * np.array(factors))
+
+
+def _quarter_turned(image: Array) -> Array:
+    """A picture that is not square cannot be turned by 90 degrees within its calibration."""
+    return np.rot90(image) if image.shape[0] == image.shape[1] else image[::-1, ::-1]
+
+
+_RADIANS = float(np.pi / 180.0)
+_TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
+    "angles in radians:": ("radians", {
+        "all": _angles(np.radians), "heading": _times(1, 1, _RADIANS), "tilt": _times(_RADIANS, _RADIANS, 1)}),
+    "angles converted twice": ("degrees", {"": _angles(np.degrees)}),
+    "roll and pitch swapped": ("swapped", {"": _angles(lambda a: a[:, [1, 0, 2]])}),
+    "sign turned:": ("sign", {"both": _times(-1, -1, 1), "roll": _times(-1, 1, 1), "pitch": _times(1, -1, 1)}),
+    "heading off by": ("heading", {"3": _added(0, 0, 3), "8": _added(0, 0, 8), "20": _added(0, 0, 20)}),
+    "heading counted": ("heading_convention", {
+        "counter-clockwise": _times(1, 1, -1), "from east": _angles(lambda a: a * [1, 1, -1] + [0, 0, 90])}),
+    "roll and pitch off by": ("tilt mount", {"2": _added(2, 2, 0), "5": _added(5, -5, 0)}),
+    "height off by": ("height", {
+        "10 m": _height(lambda h: h + 10), "20 m": _height(lambda h: h + 20), "-20 m": _height(lambda h: h - 20)}),
+    "height above sea level, ground at": ("height", {
+        "50 m": _height(lambda h: h + 50), "200 m": _height(lambda h: h + 200)}),
+    "height in feet": ("height height_feet", {"": _height(lambda h: h * FEET)}),
+    "telemetry late by": ("clock", {"0.1 s": _late(0.1), "0.5 s": _late(0.5), "2 s": _late(2.0)}),
+    "attitude alone late by": ("clock", {"0.1 s": _late(0.1, rest=False), "0.3 s": _late(0.3, rest=False)}),
+    "velocity": ("velocity", {
+        "swapped": _velocity(lambda e, n: (n, e)), "in km/h": _velocity(lambda e, n: (3.6 * e, 3.6 * n)),
+        "reversed": _velocity(lambda e, n: (-e, -n))}),
+    "stamps in": ("stamps", {"milliseconds": _stamps(1e-6), "microseconds": _stamps(1e-3)}),
+    "frame rate times": ("stamps velocity", {"1.5": _stamps(1 / 1.5), "0.5": _stamps(2.0)}),
+}  # fmt: skip
+_CAMERA: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
+    "focal length off by": ("focal height", {
+        "-20 %": _lens(0.8), "-5 %": _lens(0.95), "5 %": _lens(1.05), "20 %": _lens(1.2)}),
+    "principal point off by": ("mount tilt", {"10 px": _lens(principal_px=10), "30 px": _lens(principal_px=30)}),
+    "distortion missing, k1": ("focal height", {"-0.05": _distorted(-0.05), "-0.2": _distorted(-0.2)}),
+    "mount turned by": ("mount heading", {"90": _mounted(90), "180": _mounted(180), "3": _mounted(3)}),
+    "mount tilted by": ("mount tilt", {"3": _mounted(tilt_deg=3), "10": _mounted(tilt_deg=10)}),
+    "pictures mirrored": ("mirrored", {
+        "left to right": _pictures(lambda i: i[:, ::-1]), "top to bottom": _pictures(lambda i: i[::-1])}),
+    "pictures turned by EXIF": ("mount", {
+        "90": _pictures(_quarter_turned), "180": _pictures(lambda i: i[::-1, ::-1])}),
+    "rolling shutter": ("", {"20 ms": _rolling(20), "60 ms": _rolling(60)}),
+    "pictures frozen": ("frozen", {"5 of 15 s": _frozen(15, 5), "2 of 6 s": _frozen(6, 2)}),
+    "one picture of": ("", {"3": _kept(3), "10": _kept(10)}),
+}  # fmt: skip
+_MAP: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
+    "map shifted by": ("map", {"5 m": _ground((3, 4)), "8 m": _ground((8, 0)), "40 m": _ground((-32, 24))}),
+    "map scaled by": ("height focal", {"2 %": _ground(scale=1.02), "10 %": _ground(scale=1.1)}),
+    "map turned by": ("heading", {"2": _ground(turn_deg=2), "5": _ground(turn_deg=5)}),
+    "surface shifted by": ("surface", {
+        "10 m": _ground((6, 8), surface="only"), "30 m": _ground((-18, 24), surface="only")}),
+    "surface": ("surface height", {
+        "inverted": _heights(lambda z: 2 * np.float32(np.nanpercentile(z, 20)) - z),
+        "in feet": _heights(lambda z: z * np.float32(FEET))}),
+}  # fmt: skip
+
+
 def faults() -> list[Fault]:
-    """All of them, by what they are of."""
-    rows: list[Fault] = [Fault("none", (), lambda told: told)]
-
-    def add(name: str, causes: str, **sizes: Callable[[Told], Told]) -> None:
-        for size, spoil in sizes.items():
-            label = size.strip("_").replace("_", " ")
-            rows.append(Fault(f"{name}{' ' + label if label else ''}", tuple(causes.split()), spoil))
-
-    add("angles in radians:", "radians", all=_angles(np.radians), heading=_angles(lambda a: a * [1, 1, np.pi / 180]),
-        tilt=_angles(lambda a: a * [np.pi / 180, np.pi / 180, 1]))
-    add("angles in degrees taken for radians", "degrees", _=_angles(lambda a: np.degrees(a)))
-    add("roll and pitch swapped", "swapped", _=_angles(lambda a: a[:, [1, 0, 2]]))
-    add("sign turned:", "sign", both=_angles(lambda a: a * [-1, -1, 1]), roll=_angles(lambda a: a * [-1, 1, 1]),
-        pitch=_angles(lambda a: a * [1, -1, 1]))
-    add("heading", "heading", off_3=_angles(lambda a: a + [0, 0, 3.0]), off_8=_angles(lambda a: a + [0, 0, 8.0]),
-        off_20=_angles(lambda a: a + [0, 0, 20.0]))
-    add("heading", "heading_convention", counter_clockwise=_angles(lambda a: a * [1, 1, -1]),
-        from_east=_angles(lambda a: a * [1, 1, -1] + [0, 0, 90.0]))
-    add("roll and pitch off", "tilt mount", by_2=_angles(lambda a: a + [2.0, 2.0, 0]),
-        by_5=_angles(lambda a: a + [5.0, -5.0, 0]))
-    add("height", "height", plus_10=_height(lambda h: h + 10), plus_20=_height(lambda h: h + 20),
-        minus_20=_height(lambda h: h - 20))
-    add("height above sea level", "height", plus_50=_height(lambda h: h + 50), plus_200=_height(lambda h: h + 200))
-    add("height in feet", "height height_feet", _=_height(lambda h: h * FEET))
-    add("telemetry late by", "clock", _0_1_s=_late(0.1), _0_5_s=_late(0.5), _2_s=_late(2.0))
-    add("attitude alone late by", "clock", _0_1_s=_late(0.1, rest=False), _0_3_s=_late(0.3, rest=False))
-    add("velocity", "velocity", swapped=_velocity(lambda e, n: (n, e)), in_kmh=_velocity(lambda e, n: (3.6 * e, 3.6 * n)),
-        reversed=_velocity(lambda e, n: (-e, -n)))
-    add("stamps in", "stamps", milliseconds=_stamps(1e-6), microseconds=_stamps(1e-3))
-    add("frame rate times", "stamps velocity", _1_5=_stamps(1 / 1.5), _0_5=_stamps(2.0))
-    add("focal length", "focal height", _20_percent_short=_lens(0.8), _5_percent_short=_lens(0.95),
-        _5_percent_long=_lens(1.05), _20_percent_long=_lens(1.2))
-    add("principal point off by", "mount tilt", _10_px=_lens(principal_px=10.0), _30_px=_lens(principal_px=30.0))
-    add("distortion missing, k1", "focal height", _minus_0_05=_distorted(-0.05), _minus_0_2=_distorted(-0.2))
-    add("mount turned by", "mount heading", _90=_mounted(90.0), _180=_mounted(180.0), _3=_mounted(3.0))
-    add("mount tilted by", "mount tilt", _3=_mounted(tilt_deg=3.0), _10=_mounted(tilt_deg=10.0))
-    add("pictures", "mirrored", mirrored=_pictures(lambda i: i[:, ::-1]), upside_down_mirrored=_pictures(lambda i: i[::-1]))
-    add("pictures turned by EXIF", "mount", _90=_pictures(lambda i: np.rot90(i) if i.shape[0] == i.shape[1] else i[::-1, ::-1]),
-        _180=_pictures(lambda i: i[::-1, ::-1]))
-    add("rolling shutter", "", _20_ms=_rolling(20.0), _60_ms=_rolling(60.0))
-    add("pictures frozen", "frozen", _5_of_15_s=_frozen(15.0, 5.0), _2_of_6_s=_frozen(6.0, 2.0))
-    add("every picture kept", "", of_3=_kept(3), of_10=_kept(10))
-    add("map and surface shifted by", "map", _5_m=_ground((3.0, 4.0)), _8_m=_ground((8.0, 0.0)), _40_m=_ground((-32.0, 24.0)))
-    add("map scaled by", "map_scale height focal", _2_percent=_ground(scale=1.02), _10_percent=_ground(scale=1.1))
-    add("map turned by", "heading map_turn", _2=_ground(turn_deg=2.0), _5=_ground(turn_deg=5.0))
-    add("surface shifted by", "surface", _10_m=_ground((6.0, 8.0), surface="only"), _30_m=_ground((-18.0, 24.0), surface="only"))
-    add("surface", "surface height", inverted=_heights(lambda z: 2 * np.float32(np.nanpercentile(z, 20)) - z),
-        in_feet=_heights(lambda z: z * np.float32(FEET)))
+    """All of them, by what they are of; a map that is wrong does not say how good it is."""
+    rows = [Fault("none", (), lambda told: told)]
+    for table, stated in ((_TELEMETRY, True), (_CAMERA, True), (_MAP, False)):
+        for name, (causes, sizes) in table.items():
+            for size, spoil in sizes.items():
+                rows.append(Fault(f"{name} {size}".strip(), tuple(causes.split()), _with_accuracy(spoil, stated)))
     return rows
+
+
+def _with_accuracy(spoil: Callable[[Told], Told], stated: bool) -> Callable[[Told], Told]:
+    if stated:
+        return spoil
+    return lambda told: replace(spoil(told), georeference_sigma_m=None)

@@ -13,6 +13,7 @@ from engine.cli.commands import (
     bag,
     bridge,
     campaign,
+    check,
     compare,
     dataset,
     demo,
@@ -39,6 +40,7 @@ bridge_app = typer.Typer(help="Live, beside an autopilot.")
 
 # In the order of the help.
 app.command(cls=Command)(demo.demo)
+app.command(cls=Command)(check.check)
 app.command(cls=Command)(track.track)
 app.command(cls=Command)(compare.compare)
 app.command(cls=Command)(campaign.campaign)

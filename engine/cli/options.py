@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from engine.formats.corrections import Corrections
 
 MapOption = Annotated[Path, typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.")]
 SurfaceOption = Annotated[
@@ -61,6 +64,26 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace the results 
 JsonOption = Annotated[bool, typer.Option("--json", help="Results as JSON on standard output.")]
 ThreadsOption = Annotated[
     int, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.", show_default=True)
+]
+
+AnglesOption = Annotated[
+    str, typer.Option("--angles", metavar="degrees|radians", help="Unit of the telemetry's angles.")
+]
+ColumnOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--column", metavar="NAME=[-][F*]NAME[+C]", help="A column made of another: roll_deg=-pitch_deg; repeated."
+    ),
+]
+HeadingOffsetOption = Annotated[
+    float, typer.Option("--heading-offset-deg", metavar="DEG", help="Added to the heading: the declination.")
+]
+HeightOffsetOption = Annotated[
+    float, typer.Option("--height-offset-m", metavar="M", help="Added to the height above ground.")
+]
+TelemetryOffsetOption = Annotated[
+    float,
+    typer.Option("--telemetry-offset-s", metavar="S", help="Added to the telemetry's times, not the pictures'."),
 ]
 
 SettingsOption = Annotated[
@@ -131,3 +154,17 @@ def use_threads(count: int) -> None:
     from engine.device import set_threads
 
     set_threads(count)
+
+
+def corrections(
+    angles: str, columns: list[str] | None, heading_offset_deg: float, height_offset_m: float, offset_s: float
+) -> Corrections:
+    """What is done to the telemetry, by the options above."""
+    from engine.formats.corrections import Corrections
+    from engine.runs.arguments import renamed_in_errors
+
+    with renamed_in_errors(columns="column", offset_s="telemetry_offset_s"):
+        return Corrections(
+            angles=angles, columns=tuple(columns or ()), heading_offset_deg=heading_offset_deg,
+            height_offset_m=height_offset_m, offset_s=offset_s,
+        )  # fmt: skip

@@ -43,6 +43,7 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     if summary["deadlines_missed"]:
         pairs.append(("deadlines missed", str(summary["deadlines_missed"])))
     pairs += [(f"refused: {reason}", str(count)) for reason, count in summary["reasons"].items()]
+    pairs += list((summary["settings"].get("diagnosis") or {}).items())
     console.print_pairs(title, pairs)
     console.say(f"written to {out}")
 

@@ -211,10 +211,11 @@ class FeatureMatcher:
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
         if not query.telemetry.has_tilt:  # features of a coarse picture err together, as a tilt would
             covariance *= max(1.0, NOMINAL_SCALE / options.scale) ** 2
+        doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
         return query.fix(
             self.method,
             nadir,
-            covariance,
+            covariance + np.diag([doubt_m**2, doubt_m**2, 0.0]),
             score=share,
             window=window,
             east_north_m=stats.center_m[:2],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,6 +21,9 @@ from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, 
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
+
+_AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
+_ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,31 @@ class Query:
         known, mount = self.telemetry, self.camera.mount
         enu_from_camera = enu_from_body(known.roll_deg or 0.0, known.pitch_deg or 0.0, grid_heading_deg) @ mount
         return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
+
+    def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
+        """By how much a position may be off where the height that it was measured at is not the telemetry's.
+
+        A focal length that is wrong by a share scales the height and what the optical axis is off the vertical. The
+        telemetry's height may be the wrong one, too: the picture does not tell.
+
+        Args:
+            nadir_px: (2,) of the camera.
+            up_m: of the camera.
+            camera_down: (3,) optical axis in east, north, up.
+            errors: of the telemetry.
+
+        Returns:
+            One standard deviation per axis, 0 where the two heights agree to two of theirs.
+        """
+        told_m = self.telemetry.height_agl_m
+        if told_m is None:
+            return 0.0
+        measured_m = up_m - float(self.site.ground_at(nadir_px))
+        off_m = abs(measured_m - told_m)
+        if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
+            return 0.0
+        aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3)
+        return off_m * (aside + _ASIDE)
 
     # --------------------------------------------------------------------------------------------- answers
 

@@ -103,6 +103,9 @@ class Refinement:
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
         if not query.site.has_surface:  # a slope of the ground was taken for a tilt
             covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
+        nadir_px = query.site.pixel_from_enu(fit.pose.center_m[:2])
+        doubt_m = query.scale_doubt_m(nadir_px, float(fit.pose.center_m[2]), fit.pose.rotation[2], errors)
+        covariance[:2, :2] += doubt_m**2 * np.eye(2)
         moved = (fit.pose.center_m - prior.pose.center_m)[:2]
         allowed_m2 = fix.relative_covariance_m2 + covariance[:2, :2]
         if not self.knows_tilt:  # by which the peak was displaced

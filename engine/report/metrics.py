@@ -149,8 +149,8 @@ def summarise(
     Returns:
         ``frames``, ``fixes``, ``availability``, ``status``, ``reasons``, ``method``, ``methods``,
         ``latency_ms`` and ``deadlines_missed``; with truth also ``frames_without_truth``, ``scored_fixes``,
-        ``rms_m``, ``median_m``, ``r95_m``, ``max_m``, ``wrong_over_10m``, ``false_fixes``, ``nees_mean``,
-        ``height_rms_m`` and ``height_bias_m``.
+        ``rms_m``, ``median_m``, ``r95_m``, ``max_m``, ``wrong_over_10m``, ``false_fixes``,
+        ``beyond_3_sigma``, ``nees_mean``, ``height_rms_m`` and ``height_bias_m``.
     """
     fixes = sum(row.fixed for row in rows)
     methods = Counter(row.method for row in rows if row.fixed and row.method is not None)
@@ -201,6 +201,7 @@ def _accuracy(errors: TrackErrors) -> dict[str, Any]:
         "max_m": float(distance.max()) if has_scores else None,
         "wrong_over_10m": int(wrong.sum()),
         "false_fixes": int(false.sum()),
+        "beyond_3_sigma": int((stated > FALSE_SIGMAS**2).sum()),
         "nees_mean": float(stated.mean()) if stated.size else None,
     }
 

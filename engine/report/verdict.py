@@ -27,6 +27,9 @@ MEANINGS = {
 }
 """One sentence for each reason; ``docs/integrity.md`` has the rules behind them."""
 
+# Of honest fixes 1 % lie beyond three sigmas, and the mean NEES is 2.
+_BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -57,12 +60,12 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
     if not frames:
         return Verdict("bad", "The track has no frames.", late)
     if not fixes:
-        return Verdict(
-            "bad", f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}.", late
-        )
+        text = f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}."
+        return Verdict("bad", _with_diagnosis(text, summary), late)
     if not summary.get("scored_fixes"):
         stated = "" if sigma_m is None else f"; half of them state a sigma below {metres(sigma_m)}"
-        return Verdict("open", f"{fixed}{stated}. Without truth their accuracy is unknown.", late)
+        text = f"{fixed}{stated}. Without truth their accuracy is unknown, and whether the map is where it says."
+        return Verdict("open", _with_diagnosis(text, summary), late)
     spread = f"half of the fixes within {metres(summary['median_m'])} of the truth, the worst "
     spread += f"{metres(summary['max_m'])} off"
     if summary["scored_fixes"] < fixes:
@@ -70,13 +73,25 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
     if summary["false_fixes"]:
         false = _count(summary["false_fixes"], "fix is", "fixes are")
         text = f"{false} false: more than {WRONG_M:g} m off and beyond three of their own sigmas"
-        return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
+        return Verdict("bad", _with_diagnosis(f"{text}; {fixed}, {spread}.", summary), late)
+    beyond, nees = summary["beyond_3_sigma"], summary["nees_mean"]
+    if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or (nees is not None and nees > _MOST_NEES):
+        text = f"{beyond} of {summary['scored_fixes']} fixes are off by more than three of their own sigmas"
+        text += f" (mean NEES {nees:.0f}, 2 is expected): something is off by more than it states"
+        return Verdict("bad", _with_diagnosis(f"{text}; {fixed}, {spread}.", summary), late)
     if summary["wrong_over_10m"]:
         wrong = _count(summary["wrong_over_10m"], "of them is", "of them are")
         text = f"{fixed}; {wrong} more than {WRONG_M:g} m off, though within what the stated sigma allows"
-        return Verdict("mixed", f"{text}; {spread}.", late)
+        return Verdict("mixed", _with_diagnosis(f"{text}; {spread}.", summary), late)
     grade = "good" if fixes >= 0.9 * frames and not summary["deadlines_missed"] else "mixed"
-    return Verdict(grade, f"{fixed}, none of them wrong; {spread}.", late)
+    return Verdict(grade, _with_diagnosis(f"{fixed}, none of them wrong; {spread}.", summary), late)
+
+
+def _with_diagnosis(text: str, summary: Mapping[str, Any]) -> str:
+    """The text after what a diagnosis of the inputs found, where there was one."""
+    found = summary.get("settings", {}).get("diagnosis") or {}
+    said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in found.values()]
+    return " ".join([*said, text])
 
 
 def _latency(summary: Mapping[str, Any], budget_ms: float | None) -> str:

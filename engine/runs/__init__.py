@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from engine.runs.comparison import compare, parse_runs
     from engine.runs.dataset_import import PhotographOptions, check_flight, import_dataset, import_photographs
     from engine.runs.demo import run_demo
+    from engine.formats.corrections import Corrections
+    from engine.runs.checking import diagnose_flight
     from engine.runs.evaluation import evaluate
     from engine.runs.inputs import FlightFiles
     from engine.runs.live_viewing import LiveViewTarget
@@ -46,6 +48,7 @@ __all__ = [
     "BridgeFiles",
     "BridgeSettings",
     "ClosedLoopSettings",
+    "Corrections",
     "FlightFiles",
     "ImportOptions",
     "LiveViewTarget",
@@ -60,6 +63,7 @@ __all__ = [
     "check_flight",
     "compare",
     "convert_to_bag",
+    "diagnose_flight",
     "evaluate",
     "export_track",
     "fly_closed_loop",
@@ -78,9 +82,11 @@ __all__ = [
 ]
 
 _NAMES = {
+    "engine.formats.corrections": "Corrections",
     "engine.formats.datasets.sequence": "ImportOptions",
     "engine.runs.bag_conversion": "convert_to_bag",
     "engine.runs.campaign": "run_campaign",
+    "engine.runs.checking": "diagnose_flight",
     "engine.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
     "engine.runs.comparison": "compare parse_runs",
     "engine.runs.dataset_import": "PhotographOptions check_flight import_dataset import_photographs",

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from engine.errors import EngineError, TelemetryError
+from engine.formats.corrections import Corrections
 from engine.formats.logs.readers import open_truth
 from engine.formats.settings import nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
@@ -89,4 +90,5 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         hfov_deg=record.hfov_deg,
         mount=record.mount,
         camera_pitch_deg=record.camera_pitch_deg,
+        corrections=Corrections.from_facts(record.corrections),
     )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from engine.camera import Camera
 from engine.errors import MapError, OptionError, TelemetryError
+from engine.formats.corrections import Corrections
 from engine.formats.flight import Flight, open_flight, subtitles_beside
 from engine.formats.frames import VIDEO_SUFFIXES
 from engine.formats.logs.readers import LogClock, is_log, open_truth
@@ -57,6 +58,7 @@ class FlightFiles:
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: how the camera is mounted, a key of :data:`engine.camera.MOUNTS`; None is the calibration's.
         camera_pitch_deg: of the camera against the vehicle's horizontal, -90 looks straight down.
+        corrections: of telemetry that is wrong in a known way.
 
     Raises:
         OptionError: a file does not go with another.
@@ -77,6 +79,7 @@ class FlightFiles:
     hfov_deg: float | None
     mount: str | None
     camera_pitch_deg: float | None
+    corrections: Corrections
 
     def __init__(
         self,
@@ -96,6 +99,7 @@ class FlightFiles:
         hfov_deg: float | None = None,
         mount: str | None = None,
         camera_pitch_deg: float | None = None,
+        corrections: Corrections | None = None,
     ) -> None:
         with renamed_in_errors(offset_s="log_offset_s"):
             LogClock(offset_s=log_offset_s)
@@ -120,7 +124,7 @@ class FlightFiles:
         object.__setattr__(self, "image_topic", image_topic)
         values = {
             "map_sigma_m": map_sigma_m, "map_bounds": map_bounds, "map_crs": map_crs, "hfov_deg": hfov_deg,
-            "mount": mount, "camera_pitch_deg": camera_pitch_deg,
+            "mount": mount, "camera_pitch_deg": camera_pitch_deg, "corrections": corrections or Corrections(),
         }  # fmt: skip
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -167,8 +171,11 @@ class FlightFiles:
         )
 
     def open_flight(self) -> Flight:
-        """The frames with what is known of each."""
-        return open_flight(self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic)
+        """The frames with what is known of each, corrected."""
+        flight = open_flight(self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic)
+        if self.corrections.changes_nothing:
+            return flight
+        return replace(flight, rows=self.corrections.applied(flight.rows))
 
     def find_truth(self) -> Path | None:
         """The truth that was named, else ``truth.csv`` beside the telemetry where there is one."""

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from engine.errors import TelemetryError
+from engine.errors import EngineError, TelemetryError
+from engine.formats.corrections import Corrections
 
 _TEXTS = ("map", "method", "profile")
 _TEXTS_OR_NONE = (
@@ -39,6 +40,7 @@ class RunRecord:
         hfov_deg: horizontal field of view.
         mount: of the camera, by name.
         camera_pitch_deg: of the camera.
+        corrections: of the telemetry, by name; None without any.
         heights: frames by the source of their height, where the telemetry is a log or the photographs' own.
         method: "ncc", "sift", "auto" or "learned".
         profile: "engine" or "paper".
@@ -50,6 +52,7 @@ class RunRecord:
         ground_m: height of the ground on the map.
         ground_amsl_m: the same above the sea, by the telemetry.
         attitude: what the fixes said of the telemetry's attitude.
+        diagnosis: where few frames were fixed, what of the inputs does not fit, sentences by cause.
         more: what else stands in the file, by name.
 
     Raises:
@@ -71,6 +74,7 @@ class RunRecord:
     hfov_deg: float | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
+    corrections: Mapping[str, Any] | None = None
     heights: Mapping[str, int] = field(default_factory=dict)
     method: str
     profile: str
@@ -82,6 +86,7 @@ class RunRecord:
     ground_m: float
     ground_amsl_m: float | None
     attitude: Mapping[str, Any] | None = None
+    diagnosis: Mapping[str, str] | None = None
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -93,6 +98,9 @@ class RunRecord:
         self._check(("heights",), "counts by source", lambda value: _is_table(value, int))
         self._check(("changed",), "settings by name", lambda value: _is_table(value, object))
         self._check(("attitude",), "a table or null", lambda value: value is None or _is_table(value, object))
+        self._check(("diagnosis",), "sentences or null", lambda value: value is None or _is_table(value, str))
+
+        self._check(("corrections",), "corrections of the telemetry or null", _are_corrections)
 
     def _check(self, names: tuple[str, ...], expected: str, holds: Callable[[object], bool]) -> None:
         for name in names:
@@ -125,6 +133,16 @@ def read_record(path: Path) -> RunRecord:
         raise TelemetryError(f"{wrong}; settings, {error}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise TelemetryError(f"{wrong}, got something else") from None
+
+
+def _are_corrections(value: object) -> bool:
+    if value is None:
+        return True
+    try:
+        Corrections.from_facts(value)
+    except (EngineError, TypeError, AttributeError):
+        return False
+    return True
 
 
 def _is_text(value: object) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from engine.navigator_options import ACCEPT_ALL
 from engine.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from engine.report.metrics import Ground
 from engine.runs.arguments import parse_budget, parse_position
+from engine.runs.checking import as_rows, diagnose_flight
 from engine.runs.folders import StrPath, check_folder, prepare_folder
 from engine.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
@@ -32,6 +33,8 @@ from engine.values import Fix, NoFix, Prior
 
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView
+
+_FEW_SHARE = 0.5  # of the frames; with fewer fixed the inputs are checked
 
 
 def track(
@@ -81,9 +84,13 @@ def track(
     with open_view(matcher, live_view) as view:
         attitude = _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
     ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
-    record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
     # From the rows as they stand in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
+    record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
+    if settings.profile == "engine" and sum(row.fixed for row in rows) < _FEW_SHARE * len(rows):
+        progress.message("few frames were fixed: looking for what does not fit")
+        found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
+        record = replace(record, diagnosis=dict(as_rows(found)))
     return write_results(out, rows, inputs.truth, site, ground, record, shown, report=report, progress=progress)
 
 
@@ -116,6 +123,7 @@ def _record(
         hfov_deg=files.hfov_deg,
         mount=files.mount,
         camera_pitch_deg=files.camera_pitch_deg,
+        corrections=None if files.corrections.changes_nothing else files.corrections.facts(),
         heights=dict(inputs.flight.heights),
         method=settings.method,
         profile=settings.profile,

@@ -50,6 +50,8 @@ def summary_of(**known):
         "max_m": 0.42,
         "wrong_over_10m": 0,
         "false_fixes": 0,
+        "beyond_3_sigma": 0,
+        "nees_mean": 1.9,
     } | known
 
 
@@ -68,6 +70,16 @@ def summary_of(**known):
         ),
         ({"fixes": 0, "scored_fixes": 0}, "bad", "None of 10 frames fixed; most were refused as ambiguous"),
         ({"frames": 0, "fixes": 0}, "bad", "The track has no frames"),
+        (  # a map that is shifted by 8 m and calls itself good to 0.5
+            {"beyond_3_sigma": 9, "nees_mean": 552.0, "max_m": 8.4},
+            "bad",
+            "9 of 9 fixes are off by more than three of their own sigmas (mean NEES 552, 2 is expected)",
+        ),
+        (
+            {"fixes": 0, "scored_fixes": 0, "settings": {"diagnosis": {"heading": "the heading reads low"}}},
+            "bad",
+            "The heading reads low. None of 10 frames fixed",
+        ),
     ],
 )
 def test_the_verdict_says_the_worst_first(known, grade, begins):

@@ -9,10 +9,14 @@ import typer
 
 from engine.cli import console, tables
 from engine.cli.options import (
+    AnglesOption,
     BudgetOption,
     CameraPitchOption,
+    ColumnOption,
     ForceOption,
     FrameStampsOption,
+    HeadingOffsetOption,
+    HeightOffsetOption,
     HfovOption,
     ImageTopicOption,
     JsonOption,
@@ -30,8 +34,10 @@ from engine.cli.options import (
     SettingsOption,
     StartOption,
     SurfaceOption,
+    TelemetryOffsetOption,
     ThreadsOption,
     WeightsOption,
+    corrections,
     use_threads,
 )
 
@@ -57,6 +63,11 @@ def track(
     image_topic: ImageTopicOption = None,
     frame_stamps: FrameStampsOption = None,
     log_offset_s: LogOffsetOption = 0.0,
+    angles: AnglesOption = "degrees",
+    columns: ColumnOption = None,
+    heading_offset_deg: HeadingOffsetOption = 0.0,
+    height_offset_m: HeightOffsetOption = 0.0,
+    telemetry_offset_s: TelemetryOffsetOption = 0.0,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
     map_bounds: MapBoundsOption = None,
@@ -103,6 +114,7 @@ def track(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
         map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip
     settings = load_settings(
         settings_path, weights=weights or (), method=method, profile=profile, device=device, start=start,

@@ -1,0 +1,86 @@
+"""The command `check`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console
+from engine.cli.options import (
+    AnglesOption,
+    CameraPitchOption,
+    ColumnOption,
+    FrameStampsOption,
+    HeadingOffsetOption,
+    HeightOffsetOption,
+    HfovOption,
+    ImageTopicOption,
+    JsonOption,
+    LogOffsetOption,
+    MapBoundsOption,
+    MapCrsOption,
+    MapOption,
+    MapSigmaOption,
+    MountOption,
+    OptionalCameraOption,
+    StartOption,
+    SurfaceOption,
+    TelemetryOffsetOption,
+    ThreadsOption,
+    corrections,
+    use_threads,
+)
+
+
+def check(
+    map_path: MapOption,
+    frames: Annotated[
+        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
+    ],
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
+    telemetry: Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help="As of track.")] = None,
+    image_topic: ImageTopicOption = None,
+    frame_stamps: FrameStampsOption = None,
+    log_offset_s: LogOffsetOption = 0.0,
+    angles: AnglesOption = "degrees",
+    columns: ColumnOption = None,
+    heading_offset_deg: HeadingOffsetOption = 0.0,
+    height_offset_m: HeightOffsetOption = 0.0,
+    telemetry_offset_s: TelemetryOffsetOption = 0.0,
+    surface: SurfaceOption = None,
+    map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", metavar="FILE", help="Positions that the map is held against.")
+    ] = None,
+    start: StartOption = None,
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """What of a flight's inputs does not fit.
+
+    Places a few pictures on the map without the telemetry, and says which change of units, signs, offsets, mount,
+    focal length or clock would make the telemetry fit them. Takes the files of track.
+    """
+    from engine.runs.checking import as_rows, diagnose_flight
+    from engine.runs.inputs import FlightFiles
+
+    use_threads(threads)
+    files = FlightFiles(
+        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
+        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
+        map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
+    )  # fmt: skip
+    found = diagnose_flight(files, start, progress=console.PROGRESS)
+    if as_json:
+        console.print_json(asdict(found))
+    else:
+        console.print_pairs(f"check of {frames}", as_rows(found))

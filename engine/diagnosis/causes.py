@@ -1,0 +1,360 @@
+"""Causes: the single change of what the engine was told that makes it fit what the pictures show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.diagnosis.sightings import Sighting
+from engine.geo import enu_from_body
+
+Array = NDArray[np.float64]
+
+_SIGMA_DEG = np.array([1.2, 1.2, 1.5])  # of an attitude by features alone, against the telemetry's
+_OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
+_MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
+_GAIN = 0.6  # by which a change must lessen it
+_PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
+_HEIGHT_SHARE, _HEIGHT_M = 0.02, 1.5  # of a height by features alone
+_LEAST = 3
+_SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
+_FEET = 0.3048
+_VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": _FEET}
+_MAX_LEG_S, _MIN_LEG_M = 12.0, 4.0
+_VELOCITY_SIGMA_MPS, _LEG_SIGMA_M = 0.7, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that does not fit, and the change that would make it fit.
+
+    Attributes:
+        cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "tilt", "mount",
+            "height", "height_feet", "clock", "velocity", "stamps", "frozen", "mirrored", "map".
+        text: a sentence with the figures.
+        cure: the option to try, or what to look at.
+        value: of the error in the unit of the text; None where it has none.
+        sigma: standard deviation of the value.
+    """
+
+    cause: str
+    text: str
+    cure: str
+    value: float | None = None
+    sigma: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What was found of a flight's inputs.
+
+    Attributes:
+        findings: the strongest first; empty where everything fits.
+        looked_at: pictures that were looked at.
+        seen: of them, those whose pose the picture showed by itself.
+    """
+
+    findings: list[Finding]
+    looked_at: int
+    seen: int
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the telemetry says at every picture of a flight; NaN where it says nothing.
+
+    Attributes:
+        time_s: (N,) of the pictures.
+        angles_deg: (N, 3) roll, pitch and heading.
+        height_m: (N,) above the ground.
+        velocity_mps: (N, 2) east and north.
+        reference_m: (N, 2) positions of another source, on the map's axes.
+        reference_sigma_m: (N,) of them.
+        mount: (3, 3) of the calibration.
+    """
+
+    time_s: Array
+    angles_deg: Array
+    height_m: Array
+    velocity_mps: Array
+    reference_m: Array
+    reference_sigma_m: Array
+    mount: Array = field(repr=False)
+
+
+def findings(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
+    """What does not fit; the telemetry's attitude, height, velocity and the map are tried one after the other.
+
+    Args:
+        told: of the whole flight.
+        seen: the poses of some of its pictures.
+        map_sigma_m: georeferencing accuracy of the map.
+    """
+    if len(seen) < _LEAST:
+        return []
+    tries = (_attitude(told, seen), _height(told, seen), _velocity(told, seen), _place(told, seen, map_sigma_m))
+    return [found for found in tries if found is not None]
+
+
+# ------------------------------------------------------------------------------------------------ attitude
+
+
+def _wrapped(angles_deg: Array) -> Array:
+    return np.asarray((angles_deg + 180.0) % 360.0 - 180.0, np.float64)
+
+
+def _cost(measured_deg: Array, told_deg: Array) -> float:
+    """Mean chi-square of a component, each limited."""
+    chi = (_wrapped(measured_deg - told_deg) / _SIGMA_DEG) ** 2
+    known = np.isfinite(chi)
+    return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
+
+
+_DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
+    ("radians", "roll, pitch and heading are in radians", "--angles radians", np.degrees),
+    ("radians", "the heading is in radians", '--column "heading_deg=57.29578*heading_deg"',
+     lambda a: a * [1.0, 1.0, 180.0 / math.pi]),
+    ("radians", "roll and pitch are in radians",
+     '--column "roll_deg=57.29578*roll_deg" --column "pitch_deg=57.29578*pitch_deg"',
+     lambda a: a * [180.0 / math.pi, 180.0 / math.pi, 1.0]),
+    ("degrees", "the angles were multiplied by 57.3, as if they had been in radians",
+     "look at the conversion of the telemetry", np.radians),
+    ("swapped", "roll and pitch are in each other's place",
+     "--column roll_deg=pitch_deg --column pitch_deg=roll_deg",
+     lambda a: a[:, [1, 0, 2]]),
+    ("sign", "roll and pitch have the other sign", "--column roll_deg=-roll_deg --column pitch_deg=-pitch_deg",
+     lambda a: a * [-1.0, -1.0, 1.0]),
+    ("sign", "roll has the other sign: positive is right side down", "--column roll_deg=-roll_deg",
+     lambda a: a * [-1.0, 1.0, 1.0]),
+    ("sign", "pitch has the other sign: positive is nose up", "--column pitch_deg=-pitch_deg",
+     lambda a: a * [1.0, -1.0, 1.0]),
+    ("heading_convention", "the heading is counted counter-clockwise from north",
+     "--column heading_deg=-heading_deg",
+     lambda a: a * [1.0, 1.0, -1.0]),
+    ("heading_convention", "the heading is counted counter-clockwise from east, as ROS' yaw is",
+     "--column heading_deg=-heading_deg+90", lambda a: a * [1.0, 1.0, -1.0] + [0.0, 0.0, 90.0]),
+)  # fmt: skip
+
+
+def _attitude(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+    index = np.array([s.index for s in seen])
+    measured = np.array([(s.attitude.roll_deg, s.attitude.pitch_deg, s.attitude.heading_deg) for s in seen])
+    angles = told.angles_deg[index]
+    if np.isfinite(angles).sum() < 2 * _LEAST:
+        return None
+    as_told = _cost(measured, angles)
+    if as_told < _MISFIT:
+        return None
+    tried: list[tuple[float, Finding]] = [
+        (_cost(measured, change(angles)) + _PENALTY["discrete"], Finding(cause, text, cure))
+        for cause, text, cure, change in _DISCRETE
+    ]
+    tried.append(_turned_heading(measured, angles))
+    tried.append(_turned_mount(measured, angles, told.mount))
+    tried.append(_late(measured, told, index))
+    cost, finding = min((row for row in tried if math.isfinite(row[0])), key=lambda row: row[0])
+    return finding if cost < as_told - _GAIN else None
+
+
+def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
+    off_deg, sigma_deg = _median_angle(measured[:, 2] - angles[:, 2])
+    cost = _cost(measured, angles + np.array([0.0, 0.0, off_deg])) + _PENALTY["offset"]
+    text = f"the heading reads {abs(off_deg):.1f} degrees too {'low' if off_deg > 0 else 'high'}"
+    if abs(off_deg) < 30.0:
+        text += ": a magnetic heading, or a compass that is not calibrated?"
+    return cost, Finding("heading", text, f"--heading-offset-deg {off_deg:+.1f}", off_deg, sigma_deg)
+
+
+def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding]:
+    """One rotation between the told body and the one that the pictures show: the camera hangs otherwise."""
+    known = np.isfinite(angles).all(axis=1)
+    if known.sum() < _LEAST:
+        return math.inf, Finding("mount", "", "")
+    bodies = [enu_from_body(*row) for row in angles[known]]
+    shown = [enu_from_body(*row) for row in measured[known]]
+    turns = [b.T @ s for b, s in zip(bodies, shown, strict=True)]  # shown = told @ turn
+    median = _middle_rotation(turns)
+    leftover = [_rotation_deg(median.T @ turn) for turn in turns]
+    chi = np.minimum((np.array(leftover) / 1.5) ** 2 / 2.0, _OUTLIER)
+    about_down_deg = math.degrees(math.atan2(median[1, 0], median[0, 0]))
+    tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(median[2, 2])))))
+    quarter = round(about_down_deg / 90.0) * 90
+    sigma_deg = float(np.median(leftover)) / math.sqrt(len(leftover))
+    if quarter and abs(about_down_deg - quarter) < 6.0 and tilt_deg < 6.0:
+        name = {90: "nadir-right", -90: "nadir-left"}.get(quarter, "nadir-tail")
+        text = f"the camera is turned by {quarter % 360} degrees: its top does not point to the nose"
+        return float(chi.mean()) + _PENALTY["discrete"], Finding(
+            "mount", text, f"--mount {name}", float(quarter), sigma_deg
+        )
+    if tilt_deg < 1.0:  # about the vertical alone: told as a heading
+        return math.inf, Finding("mount", "", "")
+    axis = (mount @ np.array([0.0, 0.0, 1.0]), median @ mount @ np.array([0.0, 0.0, 1.0]))
+    forward_deg = math.degrees(math.atan2(axis[1][0], axis[1][2]) - math.atan2(axis[0][0], axis[0][2]))
+    text = (
+        f"the camera hangs {tilt_deg:.1f} degrees off its mount ({forward_deg:+.1f} towards the nose), "
+        "or roll and pitch are off by that, or the principal point"
+    )
+    rows = ", ".join(f"{v:.5f}" for v in (median @ mount).ravel())
+    return float(chi.mean()) + _PENALTY["rotation"], Finding(
+        "mount", text, f"mount: [{rows}] in the calibration", tilt_deg, sigma_deg
+    )
+
+
+def _late(measured: Array, told: Told, index: NDArray[np.intp]) -> tuple[float, Finding]:
+    nothing = math.inf, Finding("clock", "", "")
+    known = np.isfinite(told.angles_deg).all(axis=1) & np.isfinite(told.time_s)
+    if known.sum() < 2 * _LEAST or not np.all(np.diff(told.time_s[known]) > 0.0):
+        return nothing
+    time_s, angles = told.time_s[known], told.angles_deg[known].copy()
+    angles[:, 2] = np.degrees(np.unwrap(np.radians(angles[:, 2])))
+
+    def cost_of(shift_s: float) -> float:
+        at = told.time_s[index] + shift_s
+        shifted = np.stack([np.interp(at, time_s, column) for column in angles.T], axis=1)
+        return _cost(measured, shifted)
+
+    costs = [cost_of(float(shift_s)) for shift_s in _SHIFTS_S]
+    best = int(np.argmin(costs))
+    shift_s = float(_SHIFTS_S[best])
+    late = "late" if shift_s > 0.0 else "early"
+    text = f"the telemetry is {abs(shift_s):.2f} s {late} against the pictures"
+    return costs[best] + _PENALTY["shift"], Finding(
+        "clock", text, f"--telemetry-offset-s {-shift_s:+.2f}", shift_s, 0.05
+    )
+
+
+def _median_angle(angles_deg: Array) -> tuple[float, float]:
+    """Median of angles about their mean direction, and its standard deviation."""
+    known = np.radians(angles_deg[np.isfinite(angles_deg)])
+    if not known.size:
+        return 0.0, math.inf
+    middle = math.atan2(np.sin(known).sum(), np.cos(known).sum())
+    off = _wrapped(np.degrees(known - middle))
+    spread = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    middle_deg = float(_wrapped(np.array(math.degrees(middle) + float(np.median(off)))))
+    return middle_deg, max(spread, 0.3) * 1.25 / math.sqrt(known.size)
+
+
+def _middle_rotation(turns: Sequence[Array]) -> Array:
+    """Of rotations with a few outliers: the mean of those nearest to the one that is nearest to all."""
+    apart = np.array([[_rotation_deg(a.T @ b) for b in turns] for a in turns])
+    near = np.argsort(apart[int(np.argmin(np.median(apart, axis=1)))])[: max(_LEAST, (3 * len(turns)) // 4)]
+    u, _, vt = np.linalg.svd(np.mean([turns[k] for k in near], axis=0))
+    return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt, np.float64)
+
+
+def _rotation_deg(rotation: Array) -> float:
+    return math.degrees(math.acos(max(-1.0, min(1.0, (float(np.trace(rotation)) - 1.0) / 2.0))))
+
+
+# -------------------------------------------------------------------------------------------------- height
+
+
+def _height(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+    height = told.height_m[[s.index for s in seen]]
+    measured = np.array([s.height_agl_m for s in seen])
+    known = np.isfinite(height)
+    if known.sum() < _LEAST:
+        return None
+    height, measured = height[known], measured[known]
+    sigma = np.hypot(_HEIGHT_SHARE * measured, _HEIGHT_M)
+
+    def cost(expected: Array) -> float:
+        return float(np.minimum(((measured - expected) / sigma) ** 2, _OUTLIER).mean())
+
+    off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
+    by_offset, by_factor = cost(height + off_m), cost(height * factor)
+    if cost(height) < _MISFIT or min(by_offset, by_factor) > cost(height) - _GAIN:
+        return None
+    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
+    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
+    if abs(factor / _FEET - 1.0) < 0.04:
+        text = "the height is in feet"
+        return Finding("height_feet", text, '--column "height_agl_m=0.3048*height_agl_m"', factor)
+    side = "low" if off_m > 0.0 else "high"
+    if by_factor < by_offset - 0.3:
+        text = f"heights are to be multiplied by {factor:.3f}, or the focal length divided by it"
+        return Finding("focal", text, f'--column "height_agl_m={factor:.3f}*height_agl_m"', factor, 0.01)
+    text = (
+        f"the height reads {abs(off_m):.1f} m too {side} (above sea level, above another ground?), "
+        f"or the focal length {abs(100.0 * (factor - 1.0)):.0f} % too {'short' if off_m < 0.0 else 'long'}"
+    )
+    return Finding("height", text, f"--height-offset-m {off_m:+.1f}", off_m, sigma_m)
+
+
+# ------------------------------------------------------------------------------------- velocity, position
+
+
+def _velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+    legs = [_leg(told, a, b) for a, b in pairwise(seen)]
+    known = [leg for leg in legs if leg is not None]
+    if len(known) < _LEAST:
+        return None
+    moved, reckoned, seconds = (np.array(column) for column in zip(*known, strict=True))
+    sigma = np.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds)[:, None]
+
+    def cost(expected: Array) -> float:
+        return float(np.minimum(((moved - expected) / sigma) ** 2, _OUTLIER).mean())
+
+    tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
+              "--column east_velocity_mps=north_velocity_mps --column north_velocity_mps=east_velocity_mps"),
+             (cost(-reckoned), "the velocity has the other sign",
+              "--column east_velocity_mps=-east_velocity_mps "
+              "--column north_velocity_mps=-north_velocity_mps")]  # fmt: skip
+    tried += [
+        (cost(factor * reckoned), f"the velocity is in {unit}",
+         " ".join(f'--column "{n}_velocity_mps={factor:.4g}*{n}_velocity_mps"' for n in ("east", "north")))
+        for unit, factor in _VELOCITY_FACTORS.items()
+    ]  # fmt: skip
+    square = float((reckoned**2).sum())
+    factor = float(np.median((moved * reckoned).sum(axis=1) / np.maximum((reckoned**2).sum(axis=1), 1e-9)))
+    if square > 0.0 and factor > 0.0:
+        text = f"the vehicle moves {factor:.2f} times as far between pictures as velocity and stamps say"
+        tried.append(
+            (
+                cost(factor * reckoned) + 0.1,
+                text,
+                "look at the frame rate, the stamps and the unit of the velocity",
+            )
+        )
+    best, text, cure = min(tried, key=lambda row: row[0])
+    if cost(reckoned) < _MISFIT or best > cost(reckoned) - _GAIN:
+        return None
+    return Finding("velocity", text, cure, factor)
+
+
+def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
+    """The movement between two sightings, the one that the velocity says, and the seconds between them."""
+    between = slice(a.index, b.index + 1)
+    time_s, velocity = told.time_s[between], told.velocity_mps[between]
+    seconds = float(time_s[-1] - time_s[0])
+    if not (np.isfinite(velocity).all() and np.isfinite(time_s).all()) or not seconds > 0.0:
+        return None
+    reckoned = np.asarray(np.trapezoid(velocity, time_s, axis=0), np.float64)
+    moved = b.en_m - a.en_m
+    if seconds > _MAX_LEG_S * 10 or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
+        return None
+    return moved, reckoned, seconds
+
+
+def _place(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:
+    index = np.array([s.index for s in seen])
+    off = np.array([s.en_m for s in seen]) - told.reference_m[index]
+    known = np.isfinite(off).all(axis=1)
+    if known.sum() < _LEAST:
+        return None
+    middle = np.median(off[known], axis=0)
+    sigma_m = math.hypot(float(np.median(told.reference_sigma_m[index][known])), map_sigma_m)
+    if float(np.hypot(*middle)) < 3.0 * sigma_m:
+        return None
+    text = (
+        f"the map shows places {np.hypot(*middle):.1f} m ({middle[0]:+.1f} east, {middle[1]:+.1f} north) "
+        "from where the other positions are"
+    )
+    return Finding("map", text, "look at the map's georeference, or at the datum of the positions",
+                   float(np.hypot(*middle)), sigma_m)  # fmt: skip

@@ -1,0 +1,157 @@
+"""The diagnosis: which single change makes telemetry, camera and clock fit what the pictures show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine.camera import mount_rotation
+from engine.diagnosis import diagnose
+from engine.diagnosis.causes import Told, findings
+from engine.diagnosis.sightings import Sighting
+from engine.geo import attitude_from_rotation, enu_from_body
+from engine.sim import plan_flight
+from engine.values import Attitude, Prior
+from tests.support.towns import drawn_town, site_of
+
+RNG = np.random.default_rng(5)
+N = 80
+TIME_S = 0.5 * np.arange(N)
+ANGLES = np.stack(
+    [9.0 * np.sin(0.9 * TIME_S), 7.0 * np.cos(0.7 * TIME_S), (40.0 + 60.0 * np.sin(0.15 * TIME_S)) % 360.0], axis=1
+)
+VELOCITY = np.stack([5.0 + np.sin(0.1 * TIME_S), -4.0 + np.cos(0.2 * TIME_S)], axis=1)
+PLACES = np.concatenate([[[0.0, 0.0]], np.cumsum(0.5 * (VELOCITY[1:] + VELOCITY[:-1]) * 0.5, axis=0)])
+
+
+def told(**changes):
+    nothing = np.full((N, 2), np.nan)
+    return replace(
+        Told(TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, nothing, np.full(N, np.nan), mount_rotation()), **changes
+    )
+
+
+def seen(noise=True, outliers=2):
+    """Sixteen poses as features give them, two of them wrong."""
+    out = []
+    for number, k in enumerate(range(0, N, 5)):
+        roll, pitch, heading = ANGLES[k] + (RNG.normal(0.0, 0.5, 3) if noise else 0.0)
+        place, height = PLACES[k] + RNG.normal(0.0, 0.3, 2), 120.0 + RNG.normal(0.0, 1.0)
+        if number in range(3, 3 + outliers):
+            roll, heading, height, place = roll + 30.0, heading + 100.0, 60.0, place + 90.0
+        out.append(Sighting(k, Attitude(roll, pitch, heading % 360.0), height, place))
+    return out
+
+
+def cause_of(**changes):
+    found = findings(told(**changes), seen(), 1.0)
+    return [finding.cause for finding in found]
+
+
+def test_what_fits_is_not_doubted():
+    for _ in range(50):
+        assert findings(told(), seen(), 1.0) == []
+
+
+@pytest.mark.parametrize(
+    ("angles", "cause"),
+    [
+        (np.radians(ANGLES), "radians"),
+        (ANGLES[:, [1, 0, 2]], "swapped"),
+        (ANGLES * [-1, 1, 1], "sign"),
+        (ANGLES * [-1, -1, 1], "sign"),
+        (ANGLES * [1, 1, -1], "heading_convention"),
+        (ANGLES * [1, 1, -1] + np.array([0, 0, 90]), "heading_convention"),
+        (ANGLES + np.array([0, 0, 8.1]), "heading"),
+        (ANGLES + np.array([0, 0, -14.0]), "heading"),
+        (ANGLES + np.array([4.0, -3.0, 0]), "mount"),
+    ],
+)
+def test_an_attitude_that_is_wrong_is_named(angles, cause):
+    assert cause_of(angles_deg=np.asarray(angles, float)) == [cause]
+
+
+def test_an_offset_has_its_value_within_three_sigma():
+    for off_deg in (-12.0, 5.0, 8.1):
+        (found,) = findings(told(angles_deg=ANGLES + np.array([0, 0, off_deg])), seen(), 1.0)
+        assert abs(found.value + off_deg) < 3.0 * found.sigma
+        assert found.cure.startswith(f"--heading-offset-deg {found.value:+.1f}")
+
+
+@pytest.mark.parametrize("turn_deg", [90, 180, 270])
+def test_a_camera_that_is_turned_is_no_compass_error(turn_deg):
+    """The poses that its pictures give by the calibration's mount have roll and pitch turned as well."""
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    turned = []
+    for one in seen(noise=False, outliers=0):
+        a = one.attitude
+        rotation = enu_from_body(a.roll_deg, a.pitch_deg, a.heading_deg) @ turn
+        turned.append(replace(one, attitude=Attitude(*attitude_from_rotation(rotation))))
+    (found,) = findings(told(), turned, 1.0)
+    assert found.cause == "mount"
+    name = {90: "nadir-right", 180: "nadir-tail", 270: "nadir-left"}[turn_deg]
+    assert found.cure == f"--mount {name}"
+
+
+@pytest.mark.parametrize(
+    ("height", "cause"), [(140.0, "height"), (100.0, "height"), (120.0 / 0.3048, "height_feet"), (330.0, "height")]
+)
+def test_a_height_that_is_wrong_is_named(height, cause):
+    assert cause_of(height_m=np.full(N, height)) == [cause]
+
+
+def test_a_height_that_is_scaled_is_told_from_one_that_is_shifted():
+    true = 60.0 + TIME_S * 2.0
+    poses = [replace(one, height_agl_m=float(true[one.index])) for one in seen(outliers=0)]
+    assert findings(told(height_m=true * 1.2), poses, 1.0)[0].cause == "focal"
+    assert findings(told(height_m=true + 25.0), poses, 1.0)[0].cause == "height"
+
+
+@pytest.mark.parametrize("shift_s", [-1.5, 0.5, 2.0])
+def test_a_clock_that_is_off_is_named(shift_s):
+    late = np.stack([np.interp(TIME_S - shift_s, TIME_S, column) for column in ANGLES.T], axis=1)
+    (found,) = findings(told(angles_deg=late), seen(), 1.0)
+    assert found.cause == "clock"
+    assert found.value == pytest.approx(shift_s, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "word"),
+    [(VELOCITY[:, ::-1], "place"), (-VELOCITY, "sign"), (3.6 * VELOCITY, "km/h"), (VELOCITY / 0.5144, "knots"),
+     (VELOCITY / 1.7, "times as far")],
+)  # fmt: skip
+def test_a_velocity_that_is_wrong_is_named(velocity, word):
+    (found,) = findings(told(velocity_mps=np.asarray(velocity, float)), seen(), 1.0)
+    assert found.cause == "velocity"
+    assert word in found.text
+
+
+def test_a_map_that_other_positions_contradict_is_named():
+    reference = {"reference_m": PLACES + np.array([8.0, 0.0]), "reference_sigma_m": np.full(N, 1.0)}
+    (found,) = findings(told(**reference), seen(), 1.0)
+    assert found.cause == "map"
+    assert found.value == pytest.approx(8.0, abs=0.5)
+    assert findings(told(**reference), seen(), 5.0) == []  # within what the map states
+
+
+def test_pictures_say_it_by_themselves():
+    """The whole way, on a drawn town: a heading that is off, mirrored pictures, stamps in milliseconds."""
+    town = drawn_town()
+    plan = plan_flight(town=town, frames=12)
+    frames, site, camera = list(plan.iter_frames()), site_of(town), plan.camera
+    first = plan.truth_rows()[0]
+    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=15.0)
+    assert diagnose(frames, site, camera, start=start).findings == []
+    off = [replace(frame, heading_deg=(frame.heading_deg + 9.0) % 360.0) for frame in frames]
+    (found,) = diagnose(off, site, camera, start=start).findings
+    assert found.cause == "heading"
+    assert found.value == pytest.approx(-9.0, abs=1.0)
+    mirrored = [replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1])) for frame in frames]
+    assert diagnose(mirrored, site, camera, start=start).findings[0].cause == "mirrored"
+    hurried = [replace(frame, timestamp_ns=frame.timestamp_ns // 1_000_000) for frame in frames]
+    assert diagnose(hurried, site, camera, start=start).findings[0].cause == "stamps"
+    still = [replace(frame, image=frames[2 * (k // 2)].image) for k, frame in enumerate(frames)]
+    assert "frozen" in [found.cause for found in diagnose(still, site, camera, start=start).findings]
