@@ -23,6 +23,7 @@ from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 Array = NDArray[np.float64]
 
 _AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
+_MOST_TURNED = math.radians(60.0)
 _ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
 
 
@@ -132,8 +133,9 @@ class Query:
     def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
         """By how much a position may be off where the height that it was measured at is not the telemetry's.
 
-        A focal length that is wrong by a share scales the height and what the optical axis is off the vertical. The
-        telemetry's height may be the wrong one, too: the picture does not tell.
+        A focal length that is wrong by a share scales the height and what the optical axis is off the vertical, and
+        a distortion that the calibration lacks passes for a tilt besides. The telemetry's height may be the wrong
+        one, too: the picture does not tell.
 
         Args:
             nadir_px: (2,) of the camera.
@@ -152,7 +154,12 @@ class Query:
         if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
             return 0.0
         aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3)
-        return off_m * (aside + _ASIDE)
+        told = self.telemetry.grid_attitude
+        turned = 0.0
+        if told is not None and self.telemetry.has_tilt:
+            told_down = self.camera.enu_from_camera(told)[:, 2]
+            turned = math.acos(min(1.0, float(told_down @ camera_down)))
+        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MOST_TURNED)))
 
     # --------------------------------------------------------------------------------------------- answers
 
