@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.anchors import Anchor, RecentAnchors
-from engine.attitude_bias import AttitudeBias, Bias
-from engine.attitude_lag import AttitudeLag
+from engine.attitude_bias import Bias
 from engine.budget import Budget
 from engine.covariance import map_sigma_of
 from engine.evidence import (
@@ -37,6 +36,7 @@ from engine.motion import (
 from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.repeats import Repeats
+from engine.telemetry_errors import Calibration, TelemetryErrors
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
 Array = NDArray[np.float64]
@@ -89,8 +89,7 @@ class Navigator:
         self._options = o = options or NavigatorOptions()
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
-        self._attitude_lag = AttitudeLag(o.attitude_lag_s, o.attitude_jitter_s)
-        self._attitude_bias = self._unknown_bias()
+        self._errors = TelemetryErrors(o)
         self._repeats = Repeats()
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
@@ -151,12 +150,17 @@ class Navigator:
     @property
     def attitude_lag_s(self) -> float:
         """How late the frames' attitude is, as far as fixes measured it."""
-        return self._attitude_lag.mean_s
+        return self._errors.lag_s
 
     @property
     def attitude_bias(self) -> Bias | None:
         """By how much the frames' attitude is off; None before a fix measured it."""
-        return self._attitude_bias.bias
+        return self._errors.bias
+
+    @property
+    def calibration(self) -> Calibration:
+        """By how much the telemetry's attitude, its clock and its height are off, with their uncertainties."""
+        return self._errors.calibration
 
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
@@ -181,11 +185,7 @@ class Navigator:
             self._note_loss(now)
             return repeated
         sources = self._sources(now, prior, late=late)
-        shown = frame
-        if not late:
-            shown = self._attitude_lag.corrected(frame)
-            self._attitude_bias.follow(shown, now.time_s)
-        shown = self._attitude_bias.corrected(shown)
+        shown = self._errors.corrected(frame, now.time_s, late=late)
         result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
@@ -198,17 +198,12 @@ class Navigator:
             result = self._add_doubted(result, now, sources, frame.height_agl_m)
         if not late:
             if isinstance(result, Fix):
-                self._attitude_lag.note(result, self._attitude_bias.bias)
-                if self._matcher.site.has_surface:  # else a slope of the ground passes for a tilt
-                    self._attitude_bias.note(result)
+                self._errors.note(result, self._ground_below(result))
             self._fixed = isinstance(result, Fix)
             if isinstance(result, NoFix) and result.reason is not Reason.LATE:
                 self._refusals += 1  # a lack of time is no evidence about the position
             self._note_loss(now)
         return result
-
-    def _unknown_bias(self) -> AttitudeBias:
-        return AttitudeBias(self._options.tilt_bias_deg, self._options.heading_bias_deg)
 
     # ------------------------------------------------------------------------------------------ predictions
 
@@ -265,6 +260,13 @@ class Navigator:
         """Dead reckoning from the strongest match that waits for others."""
         pending = self._hypotheses.pending
         return None if pending is None else self._hypotheses.position(pending, now)
+
+    def _ground_below(self, fix: Fix) -> float | None:
+        """Height of the ground below a fix that measured its height; None over ground that is taken for flat."""
+        site = self._matcher.site
+        if fix.up_m is None or not site.has_surface:
+            return None
+        return float(site.ground_at(np.array(fix.map_xy_px)))
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
@@ -363,7 +365,7 @@ class Navigator:
         jump = jump or self._lost
         self._resets += known and jump
         if jump:  # what was learnt, was learnt where the vehicle was not
-            self._attitude_bias = self._unknown_bias()
+            self._errors.forget()
         support = count if last is None or jump else last.support + count
         odds = min(odds, log_odds(MAX_PROBABILITY))
         position = PositionEstimate(en_m(fix), fix.relative_sigma_m, odds, on_map=True)
@@ -388,7 +390,7 @@ class Navigator:
         if anchor is None or self._fixed:
             return
         if self._refusals == options.lost_after:  # a wrong bias, or one that is no more, would keep them refused
-            self._attitude_bias = self._unknown_bias()
+            self._errors.forget()
         estimate = self._reckoned(now)
         far = estimate is not None and estimate.sigma_m > options.lost_sigma_m
         if anchor.fix is not None:

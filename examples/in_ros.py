@@ -1,4 +1,4 @@
-"""In ROS: in_ros.py 1|2, a node of your own with the engine inside. Run it where the map and camera.yaml lie."""
+"""In ROS: in_ros.py 1|2 [NAME:=VALUE ...], a node of your own, run where the map and camera.yaml lie."""
 
 import sys
 from importlib import import_module
@@ -6,11 +6,13 @@ from importlib import import_module
 from engine import Camera, Navigator, OrthoMap, SceneMatcher, set_threads
 from engine.adapters.ros import RosBridge, RosOptions, RosTopics
 
+if sys.argv[1:2] not in (["1"], ["2"]):
+    sys.exit(__doc__)
 set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()
-node = import_module(f"engine.adapters.ros{sys.argv[1]}").Node("scenematch")
+node = import_module(f"engine.adapters.ros{sys.argv[1]}").Node("scenematch", tuple(sys.argv[2:]))
 bridge = RosBridge(node, site, lambda prior: Navigator(matcher, prior), RosOptions())
 topics = RosTopics(
     image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt"

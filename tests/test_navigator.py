@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,7 +31,7 @@ from engine import (
 )
 from engine.navigator_options import ACCEPT_ALL
 
-IMAGE = np.zeros((8, 8), np.uint8)
+NUMBERS = itertools.count()
 START = Prior(east_m=10.0, north_m=20.0, sigma_m=5.0)
 STILL = (0.0, 0.0)
 SECOND = 1_000_000_000
@@ -74,9 +75,14 @@ class Script:
         return fix_at(*place, self.sigma_m, timestamp_ns=frame.timestamp_ns, up_m=self.up_m)
 
 
+def new_image():
+    """A picture like no other: one that repeats is refused."""
+    return np.full((8, 8), next(NUMBERS) % 256, np.uint8)
+
+
 def at(seconds, velocity=(None, None), height_agl_m=100.0):
     stamp = None if seconds is None else round(seconds * SECOND)
-    return Frame(IMAGE, stamp, height_agl_m, 0.0, east_velocity_mps=velocity[0], north_velocity_mps=velocity[1])
+    return Frame(new_image(), stamp, height_agl_m, 0.0, east_velocity_mps=velocity[0], north_velocity_mps=velocity[1])
 
 
 def reasons(results):
@@ -563,3 +569,23 @@ def test_a_flight_is_found_again_after_an_outage(sim_site, sim_flight, error_m):
             assert navigator.update(black).reason is Reason.NO_TEXTURE
         else:
             assert error_m(sim_site, navigator.update(frame), truth) < 10.0
+
+
+def test_a_picture_that_repeats_while_the_vehicle_moves_is_refused():
+    """Of a camera that hangs: its match is where the vehicle was."""
+    navigator = Navigator(Script(*[(10.0, 20.0)] * 8), START)
+    first = at(0.0, (4.0, 0.0))
+    assert isinstance(navigator.update(first), Fix)
+    again = replace(at(1.0, (4.0, 0.0)), image=first.image.copy())
+    result = navigator.update(again)
+    assert result.reason is Reason.FAILED
+    assert result.detail == "the picture is the one of 1.0 s and 4.0 m ago"
+    assert navigator.state.value == "coasting"
+    assert isinstance(navigator.update(replace(at(1.1, (0.0, 0.0)), image=first.image.copy())), NoFix)
+
+
+def test_a_camera_without_noise_may_show_one_place_twice():
+    navigator = Navigator(Script(*[(10.0, 20.0)] * 8), START)
+    first = at(0.0, (0.0, 0.0))
+    navigator.update(first)
+    assert isinstance(navigator.update(replace(at(1.0, (0.0, 0.0)), image=first.image)), Fix)

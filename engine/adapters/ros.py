@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import math
 import threading
 import time
@@ -33,7 +34,9 @@ from engine.formats.ros.messages import (
 from engine.live import Answer, Counts, Live, LiveOptions
 from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
-from engine.values import Fix, NoFix, Prior
+from engine.values import Fix, Frame, NoFix, Prior
+
+_log = logging.getLogger("scenematch")
 
 __all__ = ["RosBridge", "RosNode", "RosOptions", "RosStatus", "RosTopics"]
 
@@ -227,6 +230,8 @@ class RosBridge:
         self._make_navigator, self._live_options = make_navigator, live
         self._live = self._start_live()
         self._held = _Held()
+        self._image_topic = ""
+        self._said: set[str] = set()  # in the terminal, each once
         self._last_ns: int | None = None
         self._last_image_s = time.monotonic()
         self._fixes = self._unusable = self._restarts = 0
@@ -248,6 +253,7 @@ class RosBridge:
     def handlers(self, topics: RosTopics) -> dict[str, tuple[str, Handler]]:
         """Type and handler of every topic to subscribe to, by name."""
         telemetry, now_ns = self.telemetry, self._node.now_ns
+        self._image_topic = topics.image
         handlers: dict[str, tuple[str, Handler]] = {
             topics.image: (topics.image_type, self.on_image),
             topics.imu: ("sensor_msgs/msg/Imu", self.on_imu),
@@ -277,6 +283,7 @@ class RosBridge:
             image = image_from_message(message)
         except EngineError as error:
             self._unusable += 1
+            self._say("unusable", f"a picture cannot be used: {error}")
             self._diagnose(captured_ns, _ERROR, str(error), {})
             return
         self._last_ns = captured_ns
@@ -317,7 +324,7 @@ class RosBridge:
         """Publish the answer to a frame."""
         captured_ns, result = answer.frame.timestamp_ns, answer.result
         assert captured_ns is not None  # set by on_image
-        values = {"method": result.method or "", "age_ms": f"{answer.age_ms:.1f}"}
+        values = {"method": result.method or "", "age_ms": f"{answer.age_ms:.1f}", **_known(answer.frame)}
         if result.score is not None:
             values["score"] = f"{result.score:.3f}"
         if isinstance(result, Fix) and is_finite(result):
@@ -334,6 +341,7 @@ class RosBridge:
             reason = "not finite" if refusal is None else refusal.reason.value
             self._refused[reason] += 1
             values |= {"reason": reason, "detail": "" if refusal is None else refusal.detail}
+            self._say(reason, f"first frame without a fix for this reason: {reason}; {values['detail']}")
             self._diagnose(captured_ns, _WARN, f"no fix: {reason}", values)
         if result.window is not None and self._node.has_subscribers("window"):
             crop = window_picture(self._site, result.window, result if isinstance(result, Fix) else None)
@@ -345,7 +353,14 @@ class RosBridge:
         """Publish an error where no images arrive; to be called once a second."""
         silence_s = time.monotonic() - self._last_image_s
         if silence_s > _MAX_SILENCE_S:
+            self._say("no picture", f"no picture on {self._image_topic}: does anything publish it, of that type?")
             self._diagnose(self._node.now_ns(), _ERROR, f"no picture for {silence_s:.0f} s", {})
+
+    def _say(self, cause: str, text: str) -> None:
+        """A line in the terminal, once for each cause; the diagnostics have it each time."""
+        if cause not in self._said:
+            self._said.add(cause)
+            _log.warning("%s (more in /diagnostics)", text)
 
     def _diagnose(self, time_ns: int, level: int, text: str, values: dict[str, str]) -> None:
         status = self.status
@@ -354,6 +369,12 @@ class RosBridge:
         self._node.publish(
             "diagnostics", diagnostics(self._node.messages, time_ns, level, text, values | counters)
         )
+
+
+def _known(frame: Frame) -> dict[str, str]:
+    """What of a frame's telemetry was there: a topic by another name is silent."""
+    values = {"attitude": frame.heading_deg, "height": frame.height_agl_m, "velocity": frame.east_velocity_mps}
+    return {name: "unknown" if value is None else "known" for name, value in values.items()}
 
 
 class _Held:

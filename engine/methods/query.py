@@ -133,9 +133,9 @@ class Query:
     def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
         """By how much a position may be off where the height that it was measured at is not the telemetry's.
 
-        A focal length that is wrong by a share scales the height and what the optical axis is off the vertical, and
-        a distortion that the calibration lacks passes for a tilt besides. The telemetry's height may be the wrong
-        one, too: the picture does not tell.
+        A focal length that is wrong by a share scales the height, and what the optical axis is off the vertical; a
+        distortion that the calibration lacks passes for a tilt, too. Or the height of the telemetry is wrong: the
+        picture does not tell.
 
         Args:
             nadir_px: (2,) of the camera.

@@ -15,15 +15,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from engine.formats.corrections import Corrections
     from engine.formats.datasets.sequence import ImportOptions
     from engine.runs.bag_conversion import convert_to_bag
     from engine.runs.campaign import run_campaign
+    from engine.runs.checking import diagnose_flight
     from engine.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
     from engine.runs.comparison import compare, parse_runs
     from engine.runs.dataset_import import PhotographOptions, check_flight, import_dataset, import_photographs
     from engine.runs.demo import run_demo
-    from engine.formats.corrections import Corrections
-    from engine.runs.checking import diagnose_flight
     from engine.runs.evaluation import evaluate
     from engine.runs.inputs import FlightFiles
     from engine.runs.live_viewing import LiveViewTarget

@@ -41,6 +41,10 @@ def convert_to_bag(
     check_choice("kind", kind, BAG_KINDS)
     if (out.suffix.lower() == ".bag") != (kind == "ros1"):
         raise OptionError(f"out: expected a name that ends in .bag for ros1 and for no other format, got {out}")
+    if out.suffix.lower() in (".db3", ".mcap"):
+        raise OptionError(f"out: expected the name of a folder, which a bag of ROS 2 is, got {out}")
+    if not Path(folder).is_dir():
+        raise OptionError(f"folder: expected a flight folder, got {folder}; `track` reads a bag as it is")
     with renamed_in_errors(path="out", replace="force"):
         check_replaceable(out, force)
     paths = {name: Path(folder) / file for name, file in FOLDER_LAYOUT.items()}

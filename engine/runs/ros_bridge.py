@@ -118,6 +118,7 @@ def run_ros_bridge(
         ros.map, ros.surface, ros.map_sigma_m, bounds=ros.map_bounds, crs=ros.map_crs, progress=progress
     )
     check_position("start", start, site, OptionError)
+    check_position("origin", parse_position("origin", ros.origin), site, OptionError)
     described = ros.camera_files()
     camera = None if ros.camera is None else described.load(None)
     node = node or _node(ros.version, ros.arguments)

@@ -12,6 +12,7 @@ import numpy as np
 
 from engine import OrthoMap
 from engine.adapters.vehicle import NedOrigin, north_east_m
+from engine.errors import EngineError
 
 MODEL = """<?xml version="1.0"?>
 <sdf version="{sdf}">
@@ -107,7 +108,10 @@ def write_ground(map_path: Path, surface: Path | None, models: Path, step_px: in
     with rasterio.open(map_path) as source:
         picture = np.moveaxis(source.read([1, 2, 3] if source.count >= 3 else [1]), 0, 2)
     if picture.shape[:2] != (site.height_px, site.width_px):
-        raise SystemExit(f"{map_path}: expected a map on a metric grid, which is not resampled when it is opened")
+        raise SystemExit(
+            f"{map_path}: expected a map on a metric grid, which is not resampled when it is opened; "
+            f"gdalwarp -t_srs {site.crs.to_string()} {map_path} metric.tif makes one"
+        )
     Image.fromarray(picture.squeeze()).save(folder / "materials/textures/map.png")
     places, in_picture, shape = vertices(site, step_px)
     extent_m = np.ptp(places[:, :2], axis=0)
@@ -128,7 +132,10 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path(__file__).parent / "models")
     parser.add_argument("--step-px", type=int, default=8, help="of the mesh, in pixels of the map")
     wanted = parser.parse_args()
-    site = write_ground(wanted.map, wanted.surface, wanted.models, wanted.step_px)
+    try:
+        site = write_ground(wanted.map, wanted.surface, wanted.models, wanted.step_px)
+    except (EngineError, OSError) as error:
+        raise SystemExit(f"make_world.py: {error}") from None
     lat_lon = f"{site.frame.lat_deg:.7f},{site.frame.lon_deg:.7f}"
     print(f"origin:={lat_lon}")
     print(f"--custom-location={lat_lon},0,0")

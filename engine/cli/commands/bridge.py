@@ -223,7 +223,7 @@ def ros(
     map_path: MapOption,
     ros_arguments: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME:=VALUE", help="Of ROS, also after --ros-args: remaps, parameters."),
+        typer.Argument(metavar="NAME:=VALUE", help="Of ROS: remaps; of ROS 2 after --ros-args, and parameters."),
     ] = None,
     version: Annotated[int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.")] = 1,
     surface: SurfaceOption = None,
