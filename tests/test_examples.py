@@ -87,7 +87,7 @@ class NodeOfNoRos:
 
     made = None
 
-    def __init__(self, name):
+    def __init__(self, name, arguments=()):
         from rosbags.typesys import Stores, get_typestore
 
         from engine.formats.ros.messages import MessageFactory

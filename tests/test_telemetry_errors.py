@@ -29,7 +29,8 @@ def flown(off_deg=(0.0, 0.0, 0.0), off_m=0.0, frames=40, seed=1, ground_m=GROUND
     for k in range(frames):
         true = np.array([3.0 * math.sin(0.3 * k), 2.0 * math.cos(0.2 * k), (40.0 + k) % 360.0])
         told = true + off_deg
-        frame = Frame(IMAGE, round(k * 2e8), HEIGHT_M + off_m, float(told[2] % 360.0), float(told[0]), float(told[1]))
+        roll, pitch, heading = told.tolist()
+        frame = Frame(IMAGE, round(k * 2e8), HEIGHT_M + off_m, heading % 360.0, roll, pitch)
         shown = errors.corrected(frame, 0.2 * k, late=False)
         measured = true + rng.normal(0.0, 0.4, 3)
         errors.note(fix_of(Attitude(*measured), GROUND_M + HEIGHT_M + rng.normal(0.0, 0.5)), ground_m)

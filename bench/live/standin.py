@@ -28,6 +28,7 @@ RATES_HZ = {
 }  # fmt: skip
 """What the stand-in sends; the last three are not for the bridge. Each divides 50."""
 _UNIX_NS = 1_790_000_000 * S
+_ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED  # it flies
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 
 
@@ -276,7 +277,7 @@ class Standin:
             "distance_sensor": lambda: (ms, 20, 30_000, round(slant_m * 100), 0, 0, _DOWN, 0),
             "altitude": lambda: (ms * 1000, 600, 600, height, height, -1001.0, height),
             "timesync": lambda: (0, self.boot_ns),
-            "heartbeat": lambda: (mavlink.MAV_TYPE_QUADROTOR, self._firmware, 0, 0, 4, 3),
+            "heartbeat": lambda: (mavlink.MAV_TYPE_QUADROTOR, self._firmware, _ARMED, 0, 4, 3),
             "system_time": lambda: ((_UNIX_NS + self.now_ns) // 1000, ms),
             "vfr_hud": lambda: (10.0, 10.0, 90, 50, 600.0, 0.0),
             "raw_imu": lambda: (ms * 1000, 0, 0, -1000, 0, 0, 0, 0, 0, 0),

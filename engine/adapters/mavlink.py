@@ -70,6 +70,7 @@ _SILENCE_NS = 5_000_000_000  # without a heartbeat, after which the vehicle coun
 _REOPEN_S = 1.0
 _ORIGIN_TIMEOUT_NS = 3_000_000_000  # after which an origin is set on an autopilot that reports none
 _ORIGIN_TIMEOUT_GNSS_NS = 60_000_000_000  # the same while its GNSS receiver may still get a first fix
+_RECEIVER_FOUND_MS = 20_000  # after its start, by when an autopilot has found its receiver: ArduPilot takes 9 s
 _GNSS_STALE_NS = 2_000_000_000
 
 
@@ -373,7 +374,10 @@ class MavlinkBridge:
         origin = mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
         self._send(command_message(self._system_id, *origin))
         # An autopilot with a receiver sets its origin itself, in a better place, when that has a fix.
-        waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if self.telemetry.has_receiver else _ORIGIN_TIMEOUT_NS
+        receiver, uptime_ms = self.telemetry.has_receiver, self.telemetry.uptime_ms
+        on_ground = not self.telemetry.armed
+        seeks = on_ground and not receiver and uptime_ms is not None and uptime_ms < _RECEIVER_FOUND_MS
+        waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if receiver or seeks else _ORIGIN_TIMEOUT_NS
         wanted = self._origin is not None and self._options.kind != "gps_input"
         if self._origin is not None and wanted and now_ns - self._without_origin_ns > waited_ns:
             self._send(set_origin_message(self._system_id, self._origin, now_ns))

@@ -140,6 +140,7 @@ class MavlinkTelemetry:
         firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
         armed: whether its motors are armed.
         has_receiver: whether a GNSS receiver is connected to it; None where it has not said.
+        uptime_ms: how long it has run; None where it has not said.
         gnss: the last three-dimensional fix of that receiver; None before the first.
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
@@ -157,6 +158,7 @@ class MavlinkTelemetry:
         self._home_down_m = 0.0  # of its home below its origin
         self.origin: NedOrigin | None = None
         self.has_receiver: bool | None = None
+        self.uptime_ms: int | None = None
         self.gnss: GnssFix | None = None
         self.armed = False
         self.firmware: int | None = None
@@ -244,6 +246,7 @@ class MavlinkTelemetry:
         elif kind == "ALTITUDE":
             self._add_sample(message, self._time_ns(message.time_usec * 1000, arrival_ns))
         else:
+            self.uptime_ms = message.time_boot_ms
             self._add_sample(message, self._time_ns(message.time_boot_ms * 1_000_000, arrival_ns))
 
     def _time_ns(self, remote_ns: int, arrival_ns: int) -> int | None:
@@ -258,7 +261,7 @@ class MavlinkTelemetry:
     def _reset(self) -> None:
         self._clock = AutopilotClock()
         self.origin, self._unix_offset_ns, self._stale_stamps = None, None, 0
-        self.has_receiver, self.gnss = None, None
+        self.has_receiver, self.gnss, self.uptime_ms = None, None, None
         self._has_velocity, self._home_down_m = True, 0.0
         for series in (self._holder, self._attitude, self._velocity, self._range, self._clearance, self._relative):
             series.clear()

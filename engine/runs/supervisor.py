@@ -38,10 +38,13 @@ def become_worker(progress: Progress = SILENT) -> None:
     passed on; SIGINT, which a terminal sends to both, is left to the worker.
     """
     pause_s = _PAUSE_S
+    reading, writing = os.pipe()  # its end is that of this process
     while True:
         begin = time.monotonic()
         worker = os.fork()
         if worker == 0:
+            os.close(writing)
+            _die_with_the_writer_of(reading)
             return
         code, is_told = _wait(worker)
         if code >= 0 or is_told:
@@ -49,6 +52,16 @@ def become_worker(progress: Progress = SILENT) -> None:
         pause_s = min(2.0 * pause_s, _MAX_PAUSE_S) if time.monotonic() - begin < _SHORT_S else _PAUSE_S
         progress.message(f"the worker was ended by signal {-code}; another takes over")
         time.sleep(pause_s)
+
+
+def _die_with_the_writer_of(pipe: int) -> None:
+    """End this process when its parent is killed: two bridges at one autopilot would push each other out."""
+
+    def watch() -> None:
+        os.read(pipe, 1)  # returns when nobody is left who could write
+        os._exit(1)
+
+    threading.Thread(target=watch, name="scenematch-supervised", daemon=True).start()
 
 
 def _wait(worker: int) -> tuple[int, bool]:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -62,6 +63,25 @@ def test_sigterm_ends_both_with_the_workers_exit_code(supervisor):
     supervisor.send_signal(signal.SIGTERM)
     assert supervisor.stdout.readline() == "table\n"
     assert supervisor.wait(5.0) == 3
+
+
+def is_running(pid):
+    """Not gone, nor dead and not yet reaped."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state not in "ZX"
+
+
+def test_a_worker_does_not_outlive_its_supervisor(supervisor):
+    pid = int(supervisor.stdout.readline().split()[0])
+    assert is_running(pid)
+    supervisor.kill()
+    until = time.monotonic() + 5.0
+    while is_running(pid) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert not is_running(pid)
 
 
 def test_a_gpu_cannot_be_supervised():
