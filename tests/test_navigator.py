@@ -82,7 +82,8 @@ def new_image():
 
 def at(seconds, velocity=(None, None), height_agl_m=100.0):
     stamp = None if seconds is None else round(seconds * SECOND)
-    return Frame(new_image(), stamp, height_agl_m, 0.0, east_velocity_mps=velocity[0], north_velocity_mps=velocity[1])
+    east, north = velocity
+    return Frame(new_image(), stamp, height_agl_m, 0.0, east_velocity_mps=east, north_velocity_mps=north)
 
 
 def reasons(results):
