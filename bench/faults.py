@@ -1,28 +1,33 @@
 """The fault matrix: what the engine makes of wrong telemetry, cameras, clocks, maps and surfaces.
 
     python -m bench.faults FOLDER... [--methods ncc sift auto] [--step 4] [--count 60] [--only TEXT] [--map NAME]
+                           [--no-diagnosis] [--docs DIR]
 
 Each fault is put into what the engine is told of a flight folder with truth; the flight begins at its true place.
-A false fix is off by more than 5 m and by more than three of its own standard deviations.
+A false fix is off by more than 5 m and by more than three of its own standard deviations. ``--docs`` writes the
+table of docs/wrong-inputs.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from bench import DOCS
 from bench.inputs.faults import Fault, Told, faults, load
+from bench.pages.text import table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.device import set_threads
 from engine.diagnosis import diagnose
 from engine.formats.truth import interpolate_truth
 
+BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
 START_SIGMA_M = 15.0
 
@@ -36,7 +41,8 @@ class Cell:
         frames, fixed, false: their numbers.
         rms_m: over all fixes; None without one.
         nees: mean over the fixes, 1 where covariances are true.
-        said: what was diagnosed.
+        largest_m: the largest error.
+        named: what the diagnosis made of the fault: "right", "silent", "wrong", "false alarm"; "" was not asked.
     """
 
     flight: str
@@ -48,7 +54,7 @@ class Cell:
     rms_m: float | None
     nees: float | None
     largest_m: float | None
-    said: str = ""
+    named: str = ""
 
 
 def fly(told: Told, stamps_ns: list[int], flight: str, fault: str, method: str) -> Cell:
@@ -88,27 +94,68 @@ def cell(told: Told, fault: Fault, flight: str, method: str) -> Cell:
     return fly(spoiled, stamps, flight, fault.name, method)
 
 
-def diagnosed(told: Told, fault: Fault) -> str:
-    """What a diagnosis says of it."""
+def diagnosed(told: Told, fault: Fault) -> tuple[str, str]:
+    """Whether a diagnosis names it, and what it says."""
     spoiled = fault.spoil(told)
     first = interpolate_truth(told.truth, told.frames[0].timestamp_ns or 0)
     assert first is not None
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-    found = diagnose(spoiled.frames, spoiled.site(), spoiled.camera, start=start)
-    named = bool(set(fault.causes) & {finding.cause for finding in found.findings[:1]})
-    verdict = "right" if named else "silent" if not found.findings else "WRONG" if fault.causes else "FALSE ALARM"
-    return f"{verdict}: seen {found.seen}: " + "; ".join(f"{f.cause}: {f.text}" for f in found.findings)
+    found = diagnose(
+        spoiled.frames, spoiled.frames.__getitem__, spoiled.site(), spoiled.camera, start=start
+    ).findings
+    if not found:
+        verdict = "silent"
+    elif found[0].cause in fault.causes:
+        verdict = "right"
+    else:
+        verdict = "wrong" if fault.causes else "false alarm"
+    return verdict, "; ".join(f"{finding.cause}: {finding.text}" for finding in found)
+
+
+def shown(value: float | None, digits: int = 2) -> str:
+    """A figure, or a dash."""
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _row(found: Cell) -> str:
-    def shown(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2f}"
-
     return (
         f"{found.flight:18s} {found.fault:38s} {found.method:5s} {found.fixed:3d} of {found.frames:3d}  "
         f"false {found.false:3d}  RMS {shown(found.rms_m):>6s}  max {shown(found.largest_m):>6s}  "
-        f"NEES {shown(found.nees):>7s}  {found.said}"
+        f"NEES {shown(found.nees):>7s}  {found.named}"
     )
+
+
+def rows_of(told: Told, flight: str, methods: list[str], only: str, *, diagnosis: bool) -> Iterator[Cell]:
+    """Every cell of a flight."""
+    for fault in faults():
+        if only not in fault.name:
+            continue
+        named, text = diagnosed(told, fault) if diagnosis else ("", "")
+        if text:
+            print(f"{flight:18s} {fault.name:38s} {named}: {text}", flush=True)
+        for method in methods:
+            yield replace(cell(told, fault, flight, method), named=named)
+
+
+def lines_of(cells: list[Cell]) -> list[str]:
+    """The table of each flight: fixes and false ones by method, and whether the fault is named."""
+    lines = []
+    methods = list(dict.fromkeys(found.method for found in cells))
+    for flight in dict.fromkeys(found.flight for found in cells):
+        rows = []
+        of_flight = [found for found in cells if found.flight == flight]
+        for name in dict.fromkeys(found.fault for found in of_flight):
+            of_fault = {found.method: found for found in of_flight if found.fault == name}
+            counts = [f"{of_fault[m].fixed}, {of_fault[m].false}" for m in methods]
+            nees = max((found.nees for found in of_fault.values() if found.nees is not None), default=None)
+            far = max(
+                (found.largest_m for found in of_fault.values() if found.largest_m is not None), default=None
+            )
+            rows.append([name, *counts, shown(far, 1), shown(nees, 1), next(iter(of_fault.values())).named])
+        frames = max(found.frames for found in of_flight)
+        columns = [f"`{flight}`, {frames} frames: fixed, false", *methods, "largest m", "NEES", "named"]
+        lines += table(columns, rows)
+    return lines
 
 
 def main() -> None:
@@ -120,24 +167,23 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--map", default="map.tif")
     parser.add_argument("--only", default="")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--diagnose", action="store_true")
+    parser.add_argument("--no-diagnosis", action="store_true")
+    parser.add_argument("--docs", type=Path, nargs="?", const=DOCS)
     wanted = parser.parse_args()
     set_threads(1)
     begin, cells = time.monotonic(), []
     for folder in wanted.folders:
         told = load(folder, wanted.map, wanted.step, wanted.count)
-        for fault in faults():
-            if wanted.only not in fault.name:
-                continue
-            if wanted.diagnose:
-                print(f"{folder.name:18s} {fault.name:38s} {diagnosed(told, fault)}", flush=True)
-            for method in wanted.methods:
-                cells.append(cell(told, fault, folder.name, method))
-                print(_row(cells[-1]), flush=True)
+        of_flight = rows_of(told, folder.name, wanted.methods, wanted.only, diagnosis=not wanted.no_diagnosis)
+        for found in of_flight:
+            cells.append(found)
+            print(_row(found), flush=True)
     print(f"{len(cells)} cells in {time.monotonic() - begin:.0f} s")
-    if wanted.json is not None:
-        wanted.json.write_text(json.dumps([asdict(found) for found in cells], indent=1), encoding="utf-8")
+    if wanted.docs is not None:
+        page = wanted.docs / "wrong-inputs.md"
+        before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+        text = "\n".join([BEGIN, "", *lines_of(cells), END])
+        page.write_text(before + text + rest.split(END)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":

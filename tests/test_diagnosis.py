@@ -9,7 +9,7 @@ import pytest
 
 from engine.camera import mount_rotation
 from engine.diagnosis import diagnose
-from engine.diagnosis.causes import Told, findings
+from engine.diagnosis.causes import Told, findings, is_known
 from engine.diagnosis.sightings import Sighting
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.sim import plan_flight
@@ -137,6 +137,34 @@ def test_a_map_that_other_positions_contradict_is_named():
     assert findings(told(**reference), seen(), 5.0) == []  # within what the map states
 
 
+@pytest.mark.parametrize(
+    "angles",
+    [
+        np.column_stack([ANGLES[:, :2], np.zeros(N)]),  # a heading that is stuck
+        np.column_stack([ANGLES[:, :2], RNG.uniform(0, 360, N)]),
+    ],
+)
+def test_what_no_single_change_explains_is_said_not_to_fit(angles):
+    assert cause_of(angles_deg=angles) == ["attitude"]
+
+
+def test_what_is_not_known_is_not_said_to_fit():
+    unknown = told(angles_deg=np.full((N, 3), np.nan), velocity_mps=np.full((N, 2), np.nan))
+    assert findings(unknown, seen(), 1.0) == []
+    assert is_known(unknown, seen()) == ("height",)
+    assert is_known(told(), seen()) == ("attitude", "height", "velocity")
+
+
+def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
+    angles = np.radians(np.column_stack([ANGLES[:, :2], (ANGLES[:, 2] + 180.0) % 360.0 - 180.0 - 100.0]))
+    angles[:, 2] %= 360.0  # as telemetry.csv is read
+    poses = [
+        replace(one, attitude=replace(one.attitude, heading_deg=one.attitude.heading_deg - 100.0))
+        for one in seen()
+    ]
+    assert [found.cause for found in findings(told(angles_deg=angles), poses, 1.0)] == ["radians"]
+
+
 def test_pictures_say_it_by_themselves():
     """The whole way, on a drawn town: a heading that is off, mirrored pictures, stamps in milliseconds."""
     town = drawn_town()
@@ -144,14 +172,16 @@ def test_pictures_say_it_by_themselves():
     frames, site, camera = list(plan.iter_frames()), site_of(town), plan.camera
     first = plan.truth_rows()[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=15.0)
-    assert diagnose(frames, site, camera, start=start).findings == []
+    assert diagnose(frames, frames.__getitem__, site, camera, start=start).findings == []
     off = [replace(frame, heading_deg=(frame.heading_deg + 9.0) % 360.0) for frame in frames]
-    (found,) = diagnose(off, site, camera, start=start).findings
+    (found,) = diagnose(off, off.__getitem__, site, camera, start=start).findings
     assert found.cause == "heading"
     assert found.value == pytest.approx(-9.0, abs=1.0)
     mirrored = [replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1])) for frame in frames]
-    assert diagnose(mirrored, site, camera, start=start).findings[0].cause == "mirrored"
+    assert diagnose(mirrored, mirrored.__getitem__, site, camera, start=start).findings[0].cause == "mirrored"
     hurried = [replace(frame, timestamp_ns=frame.timestamp_ns // 1_000_000) for frame in frames]
-    assert diagnose(hurried, site, camera, start=start).findings[0].cause == "stamps"
-    still = [replace(frame, image=frames[2 * (k // 2)].image) for k, frame in enumerate(frames)]
-    assert "frozen" in [found.cause for found in diagnose(still, site, camera, start=start).findings]
+    assert diagnose(hurried, hurried.__getitem__, site, camera, start=start).findings[0].cause == "stamps"
+    still = [replace(frame, image=frames[3 * (k // 3)].image) for k, frame in enumerate(frames)]
+    assert "frozen" in [
+        found.cause for found in diagnose(still, still.__getitem__, site, camera, start=start).findings
+    ]

@@ -585,6 +585,13 @@ def test_a_picture_that_repeats_while_the_vehicle_moves_is_refused():
     assert isinstance(navigator.update(replace(at(1.1, (0.0, 0.0)), image=first.image.copy())), NoFix)
 
 
+def test_a_buffer_that_is_filled_again_is_no_repeat():
+    navigator, buffer = Navigator(Script(*[(10.0, 20.0)] * 3), START), np.zeros((8, 8), np.uint8)
+    for seconds in (0.0, 0.1, 0.2):
+        buffer[:] = round(100 * seconds)
+        assert isinstance(navigator.update(replace(at(seconds, (0.1, 0.0)), image=buffer)), Fix)
+
+
 def test_a_camera_without_noise_may_show_one_place_twice():
     navigator = Navigator(Script(*[(10.0, 20.0)] * 8), START)
     first = at(0.0, (0.0, 0.0))

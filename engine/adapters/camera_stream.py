@@ -184,9 +184,9 @@ class CameraStream:
         """Abandon the present reader and open the source again.
 
         Raises:
-            TelemetryError: the source ended without ever having given a picture.
+            TelemetryError: a command ended without ever having given a picture.
         """
-        if not self._has_read and not self._thread.is_alive():
+        if not self._has_read and self._name.startswith(EXEC) and not self._thread.is_alive():
             raise TelemetryError(
                 f"camera_source: expected pictures, got none: {quoted(self._name)} ended before the first"
             )
@@ -248,7 +248,8 @@ def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple
         last is none: a camera that hangs repeats its last one.
 
     Raises:
-        TelemetryError: the camera or stream cannot be opened at first, or ends before its first picture.
+        TelemetryError: the camera or stream cannot be opened at first, or is a command that ends before its first
+            picture.
     """
     stream = CameraStream(source)
     try:

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.camera import MOUNTS, mount_rotation
 from engine.diagnosis.sightings import Sighting
 from engine.geo import enu_from_body
 
@@ -35,7 +36,8 @@ class Finding:
 
     Attributes:
         cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "tilt", "mount",
-            "height", "height_feet", "clock", "velocity", "stamps", "frozen", "mirrored", "map".
+            "height", "height_feet", "focal", "clock", "velocity", "stamps", "frozen", "mirrored", "map"; or
+            "attitude" where none of the changes explains what does not fit.
         text: a sentence with the figures.
         cure: the option to try, or what to look at.
         value: of the error in the unit of the text; None where it has none.
@@ -57,11 +59,13 @@ class Diagnosis:
         findings: the strongest first; empty where everything fits.
         looked_at: pictures that were looked at.
         seen: of them, those whose pose the picture showed by itself.
+        compared: what of the telemetry was known and held against them.
     """
 
     findings: list[Finding]
     looked_at: int
     seen: int
+    compared: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +105,16 @@ def findings(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> list[F
     return [found for found in tries if found is not None]
 
 
+def is_known(told: Told, seen: Sequence[Sighting]) -> tuple[str, ...]:
+    """What of the telemetry was known at enough of the sightings to be compared."""
+    index = [s.index for s in seen]
+    columns = {"attitude": told.angles_deg, "height": told.height_m[:, None], "velocity": told.velocity_mps,
+               "map": told.reference_m}  # fmt: skip
+    return tuple(
+        name for name, values in columns.items() if np.isfinite(values[index]).all(axis=1).sum() >= _LEAST
+    )
+
+
 # ------------------------------------------------------------------------------------------------ attitude
 
 
@@ -115,10 +129,17 @@ def _cost(measured_deg: Array, told_deg: Array) -> float:
     return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
 
 
+def _signed(angles: Array) -> Array:
+    """Angles of which the heading is what it was before it was wrapped into [0, 360) as if in degrees."""
+    heading = np.where(angles[:, 2] > 2.0 * math.pi + 1e-3, angles[:, 2] - 360.0, angles[:, 2])
+    return np.column_stack([angles[:, :2], heading])
+
+
 _DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
-    ("radians", "roll, pitch and heading are in radians", "--angles radians", np.degrees),
+    ("radians", "roll, pitch and heading are in radians", "--angles radians",
+     lambda a: np.degrees(_signed(a))),
     ("radians", "the heading is in radians", '--column "heading_deg=57.29578*heading_deg"',
-     lambda a: a * [1.0, 1.0, 180.0 / math.pi]),
+     lambda a: _signed(a) * [1.0, 1.0, 180.0 / math.pi]),
     ("radians", "roll and pitch are in radians",
      '--column "roll_deg=57.29578*roll_deg" --column "pitch_deg=57.29578*pitch_deg"',
      lambda a: a * [180.0 / math.pi, 180.0 / math.pi, 1.0]),
@@ -158,7 +179,10 @@ def _attitude(told: Told, seen: Sequence[Sighting]) -> Finding | None:
     tried.append(_turned_mount(measured, angles, told.mount))
     tried.append(_late(measured, told, index))
     cost, finding = min((row for row in tried if math.isfinite(row[0])), key=lambda row: row[0])
-    return finding if cost < as_told - _GAIN else None
+    if cost < as_told - _GAIN:
+        return finding
+    text = "roll, pitch and heading do not fit the pictures, and no single change of them would make them"
+    return Finding("attitude", text, "look at the telemetry's attitude, its clock and its units")
 
 
 def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
@@ -186,11 +210,12 @@ def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, 
     quarter = round(about_down_deg / 90.0) * 90
     sigma_deg = float(np.median(leftover)) / math.sqrt(len(leftover))
     if quarter and abs(about_down_deg - quarter) < 6.0 and tilt_deg < 6.0:
-        name = {90: "nadir-right", -90: "nadir-left"}.get(quarter, "nadir-tail")
-        text = f"the camera is turned by {quarter % 360} degrees: its top does not point to the nose"
-        return float(chi.mean()) + _PENALTY["discrete"], Finding(
-            "mount", text, f"--mount {name}", float(quarter), sigma_deg
-        )
+        turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        hung = np.linalg.matrix_power(turned, quarter // 90 % 4) @ mount
+        names = [name for name in MOUNTS if np.allclose(mount_rotation(name), hung, atol=1e-6)]
+        text = f"the camera is turned by {quarter % 360} degrees against its mount"
+        cure = f"--mount {names[0]}" if names else _mount_line(hung)
+        return float(chi.mean()) + _PENALTY["discrete"], Finding("mount", text, cure, float(quarter), sigma_deg)
     if tilt_deg < 1.0:  # about the vertical alone: told as a heading
         return math.inf, Finding("mount", "", "")
     axis = (mount @ np.array([0.0, 0.0, 1.0]), median @ mount @ np.array([0.0, 0.0, 1.0]))
@@ -199,10 +224,12 @@ def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, 
         f"the camera hangs {tilt_deg:.1f} degrees off its mount ({forward_deg:+.1f} towards the nose), "
         "or roll and pitch are off by that, or the principal point"
     )
-    rows = ", ".join(f"{v:.5f}" for v in (median @ mount).ravel())
-    return float(chi.mean()) + _PENALTY["rotation"], Finding(
-        "mount", text, f"mount: [{rows}] in the calibration", tilt_deg, sigma_deg
-    )
+    cure = _mount_line(median @ mount)
+    return float(chi.mean()) + _PENALTY["rotation"], Finding("mount", text, cure, tilt_deg, sigma_deg)
+
+
+def _mount_line(mount: Array) -> str:
+    return f"mount: [{', '.join(f'{v:.5f}' for v in mount.ravel())}] in the calibration"
 
 
 def _late(measured: Array, told: Told, index: NDArray[np.intp]) -> tuple[float, Finding]:
@@ -269,8 +296,11 @@ def _height(told: Told, seen: Sequence[Sighting]) -> Finding | None:
 
     off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
     by_offset, by_factor = cost(height + off_m), cost(height * factor)
-    if cost(height) < _MISFIT or min(by_offset, by_factor) > cost(height) - _GAIN:
+    if cost(height) < _MISFIT:
         return None
+    if min(by_offset, by_factor) > cost(height) - _GAIN:
+        text = "the height does not fit the pictures, and no offset or factor would make it"
+        return Finding("height", text, "look at the telemetry's height")
     spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
     sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
     if abs(factor / _FEET - 1.0) < 0.04:
@@ -323,8 +353,11 @@ def _velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
             )
         )
     best, text, cure = min(tried, key=lambda row: row[0])
-    if cost(reckoned) < _MISFIT or best > cost(reckoned) - _GAIN:
+    if cost(reckoned) < _MISFIT:
         return None
+    if best > cost(reckoned) - _GAIN:
+        text = "velocity and stamps do not fit the ways between the pictures, and no single change would make them"
+        return Finding("velocity", text, "look at the velocity and the stamps")
     return Finding("velocity", text, cure, factor)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,7 +23,8 @@ _ENOUGH_SHARE = 0.25  # of the pictures; with fewer the search goes on
 _LEAST = 4
 _PROBED = 5  # pictures by which a change is tried
 _HEIGHT_FACTORS = (1.0, 0.88, 1.14, 0.77, 1.3)
-_TURNS_DEG = tuple(range(-40, 41, 8))
+_MOST_S = 15.0  # that the search for height and turn may take
+_TURNS_DEG = (0, 8, -8, 16, -16, 24, -24, 32, -32, 40, -40)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +107,15 @@ def _by_correlation(
     matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]
 ) -> list[Sighting]:
     """By the height and the turn with which most of a few pictures are found, refined to a whole pose."""
+    if not matcher.site.has_surface:  # refinement needs one
+        return []
     usable = [
         k for k, frame in enumerate(frames) if frame.height_agl_m is not None and frame.heading_deg is not None
     ]
+    usable = [k for k in usable if priors[k] is not None]  # of the whole map each would be a search of its own
     probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
     best: tuple[int, float, float] = (0, 1.0, 0.0)
+    until_s = time.monotonic() + _MOST_S
     for factor in _HEIGHT_FACTORS:
         for turn_deg in _TURNS_DEG:
             hits = 0
@@ -117,9 +123,9 @@ def _by_correlation(
                 result = matcher.locate(_changed(frames[k], factor, turn_deg), priors[k])
                 hits += isinstance(result, Fix) and result.stage == "refined"
             best = max(best, (hits, factor, float(turn_deg)), key=lambda row: row[0])
-            if 2 * best[0] > len(probed):
+            if 2 * best[0] > len(probed) or time.monotonic() > until_s:
                 break
-        if 2 * best[0] > len(probed):
+        if 2 * best[0] > len(probed) or time.monotonic() > until_s:
             break
     if best[0] < 2:
         return []

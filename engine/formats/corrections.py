@@ -18,7 +18,10 @@ _ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 _NUMBERS = tuple(f.name for f in fields(TelemetryRow) if f.name != "frame")
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?"
 _RULE = re.compile(rf"(\w+)=([+-]?)(?:({_NUMBER})\*)?([A-Za-z]\w*)([+-]{_NUMBER})?")
-_INTERPOLATED = (*_ANGLES, "height_agl_m", "alt_amsl_m", "east_velocity_mps", "north_velocity_mps")
+_MOST_RADIANS = 2.0 * math.pi + 1e-3  # of a heading; what is more was negative before it was wrapped
+_INTERPOLATED = (
+    *_ANGLES, "height_agl_m", "alt_amsl_m", "east_velocity_mps", "north_velocity_mps", "lat_deg", "lon_deg",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +75,7 @@ class Corrections:
         """The rows as they should have been.
 
         Raises:
-            TelemetryError: a corrected height is not above 0, or a pitch beyond 90 degrees.
+            TelemetryError: a corrected value is none that can be; a height that is not above 0 becomes unknown.
         """
         rules = [_rule(text) for text in self.columns]
         out = [self._corrected(row, rules) for row in rows]
@@ -80,29 +83,34 @@ class Corrections:
 
     def _corrected(self, row: TelemetryRow, rules: Sequence[tuple[str, float, str, float]]) -> TelemetryRow:
         if self.angles == "radians":
-            turned: dict[str, Any] = {name: _scaled(getattr(row, name), 180.0 / math.pi, 0.0) for name in _ANGLES}
+            turned: dict[str, Any] = {name: _scaled(row, name, 180.0 / math.pi, 0.0) for name in _ANGLES}
             row = replace(row, **turned)
         changed: dict[str, Any] = {
-            name: _scaled(getattr(row, source), factor, offset) for name, factor, source, offset in rules
+            name: _scaled(row, source, factor, offset) for name, factor, source, offset in rules
         }
-        if changed.get("timestamp_ns") is not None:
+        if "timestamp_ns" in changed:
             changed["timestamp_ns"] = round(changed["timestamp_ns"])
         row = replace(row, **changed)
-        heading = _scaled(row.heading_deg, 1.0, self.heading_offset_deg)
+        heading, height = row.heading_deg, _scaled(row, "height_agl_m", 1.0, self.height_offset_m)
         row = replace(
             row,
-            heading_deg=None if heading is None else wrap_heading_deg(heading),
-            height_agl_m=_scaled(row.height_agl_m, 1.0, self.height_offset_m),
+            heading_deg=None if heading is None else wrap_heading_deg(heading + self.heading_offset_deg),
+            height_agl_m=height if height is None or height > 0.0 else None,  # on the ground
         )
-        if row.height_agl_m is not None and row.height_agl_m <= 0.0:
-            raise TelemetryError(
-                f"frame {row.frame}: expected a height above 0 m, corrected it is {row.height_agl_m:g}"
-            )
-        if row.pitch_deg is not None and abs(row.pitch_deg) > 90.0:
-            raise TelemetryError(
-                f"frame {row.frame}: expected a pitch of -90 to 90, corrected it is {row.pitch_deg:g}"
-            )
+        for name in _NUMBERS:
+            value = getattr(row, name)
+            low, high = _LIMITS.get(name, (-math.inf, math.inf))
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
+                raise TelemetryError(
+                    f"frame {row.frame}: expected {name} of {low:g} to {high:g}, corrected it is {value:g}"
+                )
         return row
+
+
+_LIMITS = {
+    "pitch_deg": (-90.0, 90.0), "timestamp_ns": (-(2.0**63), 2.0**63),
+    **dict.fromkeys(("height_sigma_m", "heading_sigma_deg", "tilt_sigma_deg"), (1e-9, 1e6)),
+}  # fmt: skip
 
 
 def _rule(text: str) -> tuple[str, float, str, float]:
@@ -114,12 +122,18 @@ def _rule(text: str) -> tuple[str, float, str, float]:
     for name in (target, source):
         if name not in _NUMBERS:
             raise OptionError(f"columns: expected one of {', '.join(_NUMBERS)}, got {name!r}")
+    if "timestamp_ns" in (target, source) and target != source:
+        raise OptionError(f"columns: expected timestamp_ns of itself only, got {text!r}")
     return target, (-1.0 if sign == "-" else 1.0) * float(factor or 1.0), source, float(offset or 0.0)
 
 
-def _scaled(value: float | None, factor: float, offset: float) -> float | None:
+def _scaled(row: TelemetryRow, name: str, factor: float, offset: float) -> float | None:
+    """A column times a factor and more; of a heading in radians the sign is restored that reading it took away."""
+    value: float | None = getattr(row, name)
     if value is None or (factor == 1.0 and offset == 0.0):
         return value
+    if name == "heading_deg" and abs(factor) > 1.0 and value > _MOST_RADIANS:
+        value -= 360.0
     return factor * value + offset
 
 

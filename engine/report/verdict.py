@@ -23,7 +23,7 @@ MEANINGS = {
     Reason.MAP_TOO_LARGE: "The position was too uncertain: the part of the map to search is too large.",
     Reason.TILTED: "A corner of the frame looks so near the horizon that the ground is stretched beyond use.",
     Reason.LATE: "The answer came after the budget, or could not have come within it.",
-    Reason.FAILED: "The frame could not be used, or the worker that matched it died.",
+    Reason.FAILED: "The frame could not be used: it repeats the last one, or the worker that matched it died.",
 }
 """One sentence for each reason; ``docs/integrity.md`` has the rules behind them."""
 

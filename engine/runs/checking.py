@@ -9,10 +9,8 @@ from engine.runs.arguments import parse_position
 from engine.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from engine.runs.progress import SILENT, Progress
 from engine.runs.settings import TrackSettings
-from engine.values import Frame, Prior, Truth
+from engine.values import Prior, Truth
 
-MAX_FRAMES = 400
-"""Frames whose telemetry is compared; of a longer flight they are taken evenly."""
 _TRUTH_SIGMA_M = 1.0
 _LEAST_SEEN = 3
 
@@ -43,34 +41,48 @@ def diagnose_flight(
     flight = inputs.flight
     if not len(flight):
         raise OptionError("frames: expected at least one picture, got none")
-    step = -(-len(flight) // MAX_FRAMES)
-    frames: list[Frame] = []
-    priors: list[Prior | None] = []
-    for index in progress.track(range(0, len(flight), step), -(-len(flight) // step), "reading pictures"):
-        item = flight.read(index)
-        frames.append(item.frame)
-        priors.append(item.prior if begin is None else None)
-    known = begin or next((prior for prior in priors if prior is not None), None)
-    reference = [_of_truth(frame, inputs.truth) for frame in frames] if inputs.truth else None
-    return diagnose(frames, inputs.site, inputs.camera, priors=priors, start=known, reference=reference)
+    positions = [row.prior for row in flight.rows] or [None] * len(flight)
+    stamps = [row.timestamp_ns for row in flight.rows]
+    reference = [_of_truth(stamp, inputs.truth) for stamp in stamps] if inputs.truth and stamps else positions
+    with progress.task("placing pictures without the telemetry"):
+        return diagnose(
+            flight.rows or [flight.read(0).frame] * len(flight),
+            lambda index: flight.read(index).frame,
+            inputs.site,
+            inputs.camera,
+            priors=positions if begin is None else None,
+            start=begin,
+            reference=reference,
+        )
 
 
-def _of_truth(frame: Frame, truth: list[Truth] | None) -> Prior | None:
-    there = None if truth is None or frame.timestamp_ns is None else interpolate_truth(truth, frame.timestamp_ns)
+def _of_truth(stamp_ns: int, truth: list[Truth]) -> Prior | None:
+    there = interpolate_truth(truth, stamp_ns)
     if there is None:
         return None
     return Prior(lat_deg=there.lat_deg, lon_deg=there.lon_deg, sigma_m=_TRUTH_SIGMA_M)
 
 
-def as_rows(found: Diagnosis) -> list[tuple[str, str]]:
-    """What a diagnosis says, a name and a sentence a row."""
+def as_rows(found: Diagnosis, *, corrected: bool = False) -> list[tuple[str, str]]:
+    """What a diagnosis says, a name and a sentence a row.
+
+    Args:
+        found: the diagnosis.
+        corrected: whether the telemetry was corrected already: what is found comes on top of that.
+    """
     seen = f"{found.seen} of {found.looked_at} pictures were placed on the map without the telemetry"
+    more = ", on top of the corrections that were given" if corrected else ""
     out = [
-        (one.cause.replace("_", " "), f"{one.text}; {'try ' if one.cure.startswith('-') else ''}{one.cure}")
+        (
+            one.cause.replace("_", " "),
+            f"{one.text}; " + (f"try {one.cure}{more}" if one.cure[:2] == "--" else one.cure),
+        )
         for one in found.findings
     ]
     if found.seen < _LEAST_SEEN:
         seen += ", too few to say more: is it the map of this place and season, the calibration of this camera?"
+    elif not out and found.compared:
+        seen += f"; they fit what is said of {', '.join(found.compared)}"
     elif not out:
-        seen += "; height, attitude, clock, camera and map fit each other"
+        seen += "; there is no telemetry to compare them with"
     return [*out, ("pictures", seen)]

@@ -92,7 +92,7 @@ def compare(
     inputs = open_inputs(files, list(runs.values()), progress=progress)
     prepare_folder(out, force, (TABLE, CHART))
     results = {
-        name: track(files, out / name, settings, force=force, inputs=inputs, progress=progress)
+        name: track(files, out / name, settings, force=force, inputs=inputs, diagnosis=False, progress=progress)
         for name, settings in runs.items()
     }
     (out / TABLE).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

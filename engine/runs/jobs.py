@@ -48,7 +48,9 @@ class TrackTask:
 
     def run(self, folder: Path, progress: Progress) -> dict[str, Any]:
         """Write track.csv and summary.json; returns those figures of the summary that are no times."""
-        summary = track(self.files, folder, self.settings, force=True, report=False, progress=progress)
+        summary = track(
+            self.files, folder, self.settings, force=True, report=False, diagnosis=False, progress=progress
+        )
         return {name: value for name, value in summary.items() if name not in _TIMES}
 
 

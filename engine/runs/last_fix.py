@@ -59,11 +59,11 @@ def _mapped(path: Path | None) -> mmap.mmap:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
             try:
-                os.ftruncate(file, _RECORD.size)
+                os.posix_fallocate(file, 0, _RECORD.size)  # of a full disk here, not at the first fix
                 return mmap.mmap(file, _RECORD.size)
             finally:
                 os.close(file)
-        except (OSError, ValueError):  # a home that cannot be written is no reason to fail
+        except (OSError, ValueError, AttributeError):  # a home that cannot be written is no reason to fail
             pass
     return mmap.mmap(-1, _RECORD.size)
 

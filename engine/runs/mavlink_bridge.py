@@ -267,7 +267,9 @@ def run_mavlink_bridge(
     matcher.warmup()
     # A camera's bridge may start in the air; a flight that is played begins where it began.
     resumes = files.camera_source is not None
-    last_fix = LastFix(last_fix_file(link.connect, Path(files.map).absolute()) if resumes else None)
+    last_fix = LastFix(
+        last_fix_file(link.connect, link.system_id, Path(files.map).absolute()) if resumes else None
+    )
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from engine.formats.flight import FlightFrame
 from engine.formats.notes import frame_note, write_notes
 from engine.formats.settings import changed
 from engine.formats.telemetry import ground_amsl_m
-from engine.formats.track import TrackWriter, read_track, track_row
+from engine.formats.track import TrackRow, TrackWriter, read_track, track_row
 from engine.matcher import SceneMatcher
 from engine.navigator import Navigator
 from engine.navigator_options import ACCEPT_ALL
@@ -29,7 +29,7 @@ from engine.runs.progress import SILENT, Progress
 from engine.runs.record import RunRecord
 from engine.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
 from engine.runs.settings import TrackSettings
-from engine.values import Fix, NoFix, Prior
+from engine.values import Fix, NoFix, Prior, Reason
 
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView
@@ -44,6 +44,7 @@ def track(
     *,
     force: bool = False,
     report: bool = True,
+    diagnosis: bool = True,
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     inputs: FlightInputs | None = None,
     progress: Progress = SILENT,
@@ -58,6 +59,7 @@ def track(
         settings: how it is followed; None is the defaults.
         force: whether the folder may be there already.
         report: whether there are figures and a page; :func:`engine.runs.evaluation.evaluate` draws them later.
+        diagnosis: whether the inputs are checked where few frames were fixed.
         live_view: where the live view goes.
         inputs: what :func:`engine.runs.inputs.open_inputs` read of the files, where several runs share it.
         progress: is shown what the run does.
@@ -87,11 +89,27 @@ def track(
     # From the rows as they stand in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
     record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
-    if settings.profile == "engine" and sum(row.fixed for row in rows) < _FEW_SHARE * len(rows):
-        progress.message("few frames were fixed: looking for what does not fit")
-        found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
-        record = replace(record, diagnosis=dict(as_rows(found)))
+    if diagnosis and settings.profile == "engine" and _are_few(rows):
+        record = replace(record, diagnosis=_diagnosis(files, settings, inputs, progress))
     return write_results(out, rows, inputs.truth, site, ground, record, shown, report=report, progress=progress)
+
+
+def _are_few(rows: Sequence[TrackRow]) -> bool:
+    """Whether few frames were fixed; those that came too late say nothing of the inputs."""
+    answered = [row for row in rows if row.reason != Reason.LATE.value]
+    return sum(row.fixed for row in answered) < _FEW_SHARE * len(answered)
+
+
+def _diagnosis(
+    files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, progress: Progress
+) -> dict[str, str] | None:
+    """What of the inputs does not fit; None where that cannot be said, which is no reason to lose a track."""
+    progress.message("few frames were fixed: looking for what does not fit")
+    try:
+        found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
+    except (EngineError, MemoryError, KeyboardInterrupt):
+        return None
+    return dict(as_rows(found, corrected=not files.corrections.changes_nothing))
 
 
 def _record(

@@ -74,10 +74,27 @@ def test_what_cannot_be_is_refused_by_name(given, says):
 
 
 def test_what_a_correction_makes_impossible_is_refused_by_frame():
-    with pytest.raises(TelemetryError, match=r"frame a\.jpg: expected a height above 0 m, corrected it is -20"):
-        corrected(height_offset_m=-120.0)
-    with pytest.raises(TelemetryError, match=r"frame a\.jpg: expected a pitch of -90 to 90, corrected it is -229"):
+    with pytest.raises(
+        TelemetryError, match=r"frame a\.jpg: expected pitch_deg of -90 to 90, corrected it is -229"
+    ):
         corrected(angles="radians")
+    with pytest.raises(TelemetryError, match=r"frame a\.jpg: expected timestamp_ns of .* corrected it is 1e\+209"):
+        corrected(columns=("timestamp_ns=1e200*timestamp_ns",))
+    with pytest.raises(OptionError, match="columns: expected timestamp_ns of itself only"):
+        corrected(columns=("timestamp_ns=roll_deg",))
+
+
+def test_a_height_that_is_none_above_the_ground_becomes_unknown():
+    """Of a height above the sea, the rows before take-off."""
+    assert corrected(height_offset_m=-120.0).height_agl_m is None
+
+
+@pytest.mark.parametrize("yaw_rad", [-math.pi / 2, -0.1, 0.5, 3.0, 6.2])
+def test_a_yaw_in_radians_keeps_its_sign_though_it_was_read_as_a_heading(yaw_rad):
+    row = replace(ROW, roll_deg=0.0, pitch_deg=0.0, heading_deg=yaw_rad % 360.0)
+    expected = math.degrees(yaw_rad) % 360.0
+    assert corrected(row, angles="radians").heading_deg == pytest.approx(expected)
+    assert corrected(row, columns=("heading_deg=57.29577951*heading_deg",)).heading_deg == pytest.approx(expected)
 
 
 def test_facts_are_read_as_they_were_written():

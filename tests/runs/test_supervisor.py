@@ -54,7 +54,6 @@ def test_a_worker_that_is_killed_is_replaced_at_once_and_starts_at_the_last_fix(
     assert position == "48"
     assert float(begun_s) - killed_s < 1.0
     supervisor.kill()
-    os.kill(int(other), signal.SIGKILL)
 
 
 def test_sigterm_ends_both_with_the_workers_exit_code(supervisor):

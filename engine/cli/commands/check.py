@@ -83,4 +83,4 @@ def check(
     if as_json:
         console.print_json(asdict(found))
     else:
-        console.print_pairs(f"check of {frames}", as_rows(found))
+        console.print_pairs(f"check of {frames}", as_rows(found, corrected=not files.corrections.changes_nothing))
