@@ -20,6 +20,9 @@ from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Reason, Result, Window
 
 
+_HEIGHT_GATE = 16.0  # chi-square of one degree of freedom
+
+
 class Auto(Method):
     """NCC where height and heading are known, then SIFT where there is time; two fixes must agree.
 
@@ -82,6 +85,8 @@ class Auto(Method):
                 return _vaguer(second, apart_m)
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
+        if not _agree_in_height(first, second):
+            return _vaguer(second, apart_m)
         fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
         # Both compare one picture with one map under one prior, so their odds are not multiplied.
         stated = [fix.confidence for fix in fixes if fix.confidence is not None]
@@ -91,6 +96,15 @@ class Auto(Method):
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
+
+
+def _agree_in_height(first: Fix, second: Fix) -> bool:
+    """Whether two poses are equally high; refinement may stay at a wrong height that the telemetry holds it to."""
+    if first.up_m is None or second.up_m is None:
+        return True
+    variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
+    variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # one error, of both
+    return (first.up_m - second.up_m) ** 2 <= _HEIGHT_GATE * variance_m2
 
 
 def _vaguer(second: Fix, apart_m: NDArray[np.float64]) -> Fix:
