@@ -29,7 +29,7 @@ _FROZEN_SHARE = 0.1
 
 
 class Telemetry(Protocol):
-    """What is said of one picture: a :class:`~engine.values.Frame` or a row of telemetry.csv."""
+    """What is said of one picture: a :class:`engine.values.Frame` or a row of telemetry.csv."""
 
     @property
     def timestamp_ns(self) -> int | None:

@@ -19,7 +19,6 @@ from engine.methods.sift import Sift
 from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Reason, Result, Window
 
-
 _HEIGHT_GATE = 16.0  # chi-square of one degree of freedom
 
 

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from engine import OrthoMap
+from engine import EngineError, OrthoMap
 from engine.adapters.vehicle import NedOrigin, north_east_m
-from engine.errors import EngineError
 
 MODEL = """<?xml version="1.0"?>
 <sdf version="{sdf}">
