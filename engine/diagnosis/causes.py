@@ -190,7 +190,7 @@ def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
     cost = _cost(measured, angles + np.array([0.0, 0.0, off_deg])) + _PENALTY["offset"]
     text = f"the heading reads {abs(off_deg):.1f} degrees too {'low' if off_deg > 0 else 'high'}"
     if abs(off_deg) < 30.0:
-        text += ": a magnetic heading, or a compass that is not calibrated?"
+        text += " (a magnetic heading, or a compass that is not calibrated)"
     return cost, Finding("heading", text, f"--heading-offset-deg {off_deg:+.1f}", off_deg, sigma_deg)
 
 
