@@ -42,7 +42,8 @@ class Cell:
         rms_m: over all fixes; None without one.
         nees: mean over the fixes, 1 where covariances are true.
         largest_m: the largest error.
-        named: what the diagnosis made of the fault: "right", "silent", "wrong", "false alarm"; "" was not asked.
+        named: what the diagnosis made of the fault: "right", "silent", "misfit" where it says that
+            something does not fit and not what, "wrong", "false alarm"; "" was not asked.
     """
 
     flight: str
@@ -107,6 +108,8 @@ def diagnosed(told: Told, fault: Fault) -> tuple[str, str]:
         verdict = "silent"
     elif found[0].cause in fault.causes:
         verdict = "right"
+    elif fault.causes and not found[0].cure.startswith("--"):
+        verdict = "misfit"
     else:
         verdict = "wrong" if fault.causes else "false alarm"
     return verdict, "; ".join(f"{finding.cause}: {finding.text}" for finding in found)

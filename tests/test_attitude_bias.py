@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -18,6 +19,14 @@ from engine.navigator_options import ACCEPT_ALL
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 IMAGE = np.zeros((8, 8), np.uint8)
+_NUMBERS = itertools.count()
+
+
+def new_image():
+    """A picture like no other: one that repeats is refused."""
+    return np.full((8, 8), next(_NUMBERS) % 256, np.uint8)
+
+
 INTERVAL_S = 0.1
 
 
@@ -150,7 +159,11 @@ class Measuring:
 
     def __init__(self, off_deg, *, has_surface=True):
         self.site = SimpleNamespace(
-            is_searchable=True, has_surface=has_surface, gsd_m_per_px=1.0, georeference_sigma_m=0.0
+            is_searchable=True,
+            has_surface=has_surface,
+            gsd_m_per_px=1.0,
+            georeference_sigma_m=0.0,
+            ground_at=lambda _: 0.0,
         )
         self.off_deg, self.frames, self.refuses = off_deg, [], False
 
@@ -162,7 +175,9 @@ class Measuring:
 
 
 def level_at(time_s):
-    return Frame(IMAGE, round(time_s * 1e9), 100.0, 0.0, 0.0, 0.0, east_velocity_mps=0.0, north_velocity_mps=0.0)
+    return Frame(
+        new_image(), round(time_s * 1e9), 100.0, 0.0, 0.0, 0.0, east_velocity_mps=0.0, north_velocity_mps=0.0
+    )
 
 
 def flown_by_navigator(matcher, options=None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +12,14 @@ import pytest
 from engine import Fix, Frame, Navigator, NoFix, Prior, Reason, Timings, Window
 from engine.hypotheses import MAX_HYPOTHESES
 
-IMAGE = np.zeros((8, 8), np.uint8)
+_NUMBERS = itertools.count()
+
+
+def new_image():
+    """A picture like no other: one that repeats is refused."""
+    return np.full((8, 8), next(_NUMBERS) % 256, np.uint8)
+
+
 SECOND = 1_000_000_000
 
 
@@ -43,7 +51,12 @@ def fly(frames, speed_mps, seconds=1.0):
     for k in range(len(frames)):
         given = Prior(east_m=speed_mps * seconds * k + 9.0, north_m=-6.0, sigma_m=20.0)
         frame = Frame(
-            IMAGE, round(k * seconds * SECOND), 100.0, 0.0, east_velocity_mps=speed_mps, north_velocity_mps=0.0
+            new_image(),
+            round(k * seconds * SECOND),
+            100.0,
+            0.0,
+            east_velocity_mps=speed_mps,
+            north_velocity_mps=0.0,
         )
         results.append(navigator.update(frame, given))
     return results, navigator
@@ -98,4 +111,4 @@ def test_candidates_with_a_broken_covariance_are_left_out():
     broken = replace(fix_at(0.0, 0.0, 0.9), covariance_m2=np.full((3, 3), np.nan))
     matcher = Doubting([])
     matcher.locate = lambda frame, *_: NoFix(reason=Reason.AMBIGUOUS, candidates=(broken,))
-    assert isinstance(Navigator(matcher).update(Frame(IMAGE, 0, 100.0, 0.0)), NoFix)
+    assert isinstance(Navigator(matcher).update(Frame(new_image(), 0, 100.0, 0.0)), NoFix)

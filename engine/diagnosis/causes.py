@@ -27,7 +27,7 @@ _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0
 _FEET = 0.3048
 _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": _FEET}
 _MAX_LEG_S, _MIN_LEG_M = 12.0, 4.0
-_VELOCITY_SIGMA_MPS, _LEG_SIGMA_M = 0.7, 2.0
+_VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,8 +325,8 @@ def _velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
     known = [leg for leg in legs if leg is not None]
     if len(known) < _LEAST:
         return None
-    moved, reckoned, seconds = (np.array(column) for column in zip(*known, strict=True))
-    sigma = np.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds)[:, None]
+    moved, reckoned, sigma = (np.array(column) for column in zip(*known, strict=True))
+    sigma = sigma[:, None]
 
     def cost(expected: Array) -> float:
         return float(np.minimum(((moved - expected) / sigma) ** 2, _OUTLIER).mean())
@@ -362,7 +362,7 @@ def _velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
 
 
 def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
-    """The movement between two sightings, the one that the velocity says, and the seconds between them."""
+    """The movement between two sightings, the one that the velocity says, and the standard deviation of both."""
     between = slice(a.index, b.index + 1)
     time_s, velocity = told.time_s[between], told.velocity_mps[between]
     seconds = float(time_s[-1] - time_s[0])
@@ -372,7 +372,8 @@ def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | N
     moved = b.en_m - a.en_m
     if seconds > _MAX_LEG_S * 10 or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
         return None
-    return moved, reckoned, seconds
+    coarse_m = _ACCELERATION_MPS2 / 12.0 * float((np.diff(time_s) ** 2).sum())  # of the trapezoids
+    return moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m)
 
 
 def _place(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:
