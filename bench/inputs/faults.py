@@ -308,7 +308,7 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
     "heading off by": ("heading", {"3": _added(0, 0, 3), "8": _added(0, 0, 8), "20": _added(0, 0, 20)}),
     "heading counted": ("heading_convention", {
         "counter-clockwise": _times(1, 1, -1), "from east": _angles(lambda a: a * [1, 1, -1] + [0, 0, 90])}),
-    "roll and pitch off by": ("tilt mount", {"2": _added(2, 2, 0), "5": _added(5, -5, 0)}),
+    "roll and pitch off by": ("mount", {"2": _added(2, 2, 0), "5": _added(5, -5, 0)}),
     "height off by": ("height", {
         "10 m": _height(lambda h: h + 10), "20 m": _height(lambda h: h + 20), "-20 m": _height(lambda h: h - 20)}),
     "height above sea level, ground at": ("height", {
@@ -325,10 +325,10 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
 _CAMERA: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
     "focal length off by": ("focal height", {
         "-20 %": _lens(0.8), "-5 %": _lens(0.95), "5 %": _lens(1.05), "20 %": _lens(1.2)}),
-    "principal point off by": ("mount tilt", {"10 px": _lens(principal_px=10), "30 px": _lens(principal_px=30)}),
+    "principal point off by": ("mount", {"10 px": _lens(principal_px=10), "30 px": _lens(principal_px=30)}),
     "distortion missing, k1": ("focal height", {"-0.05": _distorted(-0.05), "-0.2": _distorted(-0.2)}),
     "mount turned by": ("mount heading", {"90": _mounted(90), "180": _mounted(180), "3": _mounted(3)}),
-    "mount tilted by": ("mount tilt", {"3": _mounted(tilt_deg=3), "10": _mounted(tilt_deg=10)}),
+    "mount tilted by": ("mount", {"3": _mounted(tilt_deg=3), "10": _mounted(tilt_deg=10)}),
     "pictures mirrored": ("mirrored", {
         "left to right": _pictures(lambda i: i[:, ::-1]), "top to bottom": _pictures(lambda i: i[::-1])}),
     "pictures turned by EXIF": ("mount", {

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from pathlib import Path
 
 from engine.adapters.parameters import MAX_DELAY_MS
+from engine.cache_folder import cache_folder
 
 
 def remember_delay(least_age_ms: float | None) -> None:
@@ -24,12 +24,6 @@ def measured_delay_ms() -> int | None:
         return min(int(_file().read_text(encoding="ascii")), round(MAX_DELAY_MS))
     except (OSError, ValueError):
         return None
-
-
-def cache_folder() -> Path:
-    """Where what one run leaves for the next is kept."""
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(folder) / "scenematch"
 
 
 def _file() -> Path:

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from engine.formats.corrections import Corrections
 
 MapOption = Annotated[Path, typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.")]
+FramesOption = Annotated[
+    Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
+]
 SurfaceOption = Annotated[
     Path | None, typer.Option("--surface", metavar="FILE", help="Surface model, a GeoTIFF of heights.")
 ]

@@ -26,7 +26,7 @@ _LEAST = 3
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
 _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": _FEET}
-_MAX_LEG_S, _MIN_LEG_M = 12.0, 4.0
+_MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
 _VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
 
 
@@ -35,7 +35,7 @@ class Finding:
     """Something that does not fit, and the change that would make it fit.
 
     Attributes:
-        cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "tilt", "mount",
+        cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "mount",
             "height", "height_feet", "focal", "clock", "velocity", "stamps", "frozen", "mirrored", "map"; or
             "attitude" where none of the changes explains what does not fit.
         text: a sentence with the figures.
@@ -370,7 +370,7 @@ def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | N
         return None
     reckoned = np.asarray(np.trapezoid(velocity, time_s, axis=0), np.float64)
     moved = b.en_m - a.en_m
-    if seconds > _MAX_LEG_S * 10 or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
+    if seconds > _MAX_LEG_S or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
         return None
     coarse_m = _ACCELERATION_MPS2 / 12.0 * float((np.diff(time_s) ** 2).sum())  # of the trapezoids
     return moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -116,15 +117,12 @@ def _by_correlation(
     probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
     best: tuple[int, float, float] = (0, 1.0, 0.0)
     until_s = time.monotonic() + _MOST_S
-    for factor in _HEIGHT_FACTORS:
-        for turn_deg in _TURNS_DEG:
-            hits = 0
-            for k in probed:
-                result = matcher.locate(_changed(frames[k], factor, turn_deg), priors[k])
-                hits += isinstance(result, Fix) and result.stage == "refined"
-            best = max(best, (hits, factor, float(turn_deg)), key=lambda row: row[0])
-            if 2 * best[0] > len(probed) or time.monotonic() > until_s:
-                break
+    for factor, turn_deg in product(_HEIGHT_FACTORS, _TURNS_DEG):
+        hits = 0
+        for k in probed:
+            result = matcher.locate(_changed(frames[k], factor, turn_deg), priors[k])
+            hits += isinstance(result, Fix) and result.stage == "refined"
+        best = max(best, (hits, factor, float(turn_deg)), key=lambda row: row[0])
         if 2 * best[0] > len(probed) or time.monotonic() > until_s:
             break
     if best[0] < 2:

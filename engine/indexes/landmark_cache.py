@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.cache_folder import cache_folder
+
 NamedArrays = dict[str, NDArray[Any]]
 Kinds = Mapping[str, tuple[type[Any], tuple[int, ...]]]
 """Element type of each array, and the shape of one of its N elements."""
@@ -43,8 +45,7 @@ def cache_key(settings: object, content: Iterable[NDArray[Any]]) -> str:
 
 def cache_path(key: str) -> Path:
     """The cache file of a key, in ``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``."""
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(folder) / "scenematch" / f"{key}.npz"
+    return cache_folder() / f"{key}.npz"
 
 
 def load_arrays(key: str, kinds: Kinds) -> NamedArrays | None:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from engine.cache_folder import cache_folder
 from engine.errors import MapError
 from engine.maps.grids import Grid, Warp, apply_affine, wgs84
 from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
@@ -152,8 +153,7 @@ def open_metric_copy(
         on_progress: called while a copy is created, and not where there is one already.
     """
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
-    default = os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenematch")
-    cache = Path(cache_dir if cache_dir is not None else default)
+    cache = cache_folder() if cache_dir is None else Path(cache_dir)
     name = _key(source, cache)
     build, name = (_tiled, name) if is_large(grid) else (_single, f"{name}.tif")
     try:

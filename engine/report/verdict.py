@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from engine.report.metrics import WRONG_M
@@ -47,13 +47,21 @@ class Verdict:
 
 
 def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
-    """The verdict on a track.
+    """The verdict on a track, after what a diagnosis of the inputs found, where there was one.
 
     Args:
         summary: figures of merit by :func:`engine.report.metrics.summarise`.
         sigma_m: median of the sigmas that the fixes state, or None without fixes.
         budget_ms: latency budget of each frame, or None.
     """
+    verdict = _judged(summary, sigma_m, budget_ms)
+    found = summary.get("settings", {}).get("diagnosis") or {}
+    said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in found.values()]
+    return replace(verdict, accuracy=" ".join([*said, verdict.accuracy]))
+
+
+def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
+    """The verdict by the figures of merit alone."""
     frames, fixes = summary["frames"], summary["fixes"]
     fixed = f"{fixes} of {frames} frames fixed"
     late = _latency(summary, budget_ms)
@@ -61,11 +69,11 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
         return Verdict("bad", "The track has no frames.", late)
     if not fixes:
         text = f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}."
-        return Verdict("bad", _with_diagnosis(text, summary), late)
+        return Verdict("bad", text, late)
     if not summary.get("scored_fixes"):
         stated = "" if sigma_m is None else f"; half of them state a sigma below {metres(sigma_m)}"
         text = f"{fixed}{stated}. Without truth their accuracy is unknown, and whether the map is where it says."
-        return Verdict("open", _with_diagnosis(text, summary), late)
+        return Verdict("open", text, late)
     spread = f"half of the fixes within {metres(summary['median_m'])} of the truth, the worst "
     spread += f"{metres(summary['max_m'])} off"
     if summary["scored_fixes"] < fixes:
@@ -73,25 +81,18 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
     if summary["false_fixes"]:
         false = _count(summary["false_fixes"], "fix is", "fixes are")
         text = f"{false} false: more than {WRONG_M:g} m off and beyond three of their own sigmas"
-        return Verdict("bad", _with_diagnosis(f"{text}; {fixed}, {spread}.", summary), late)
+        return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
     beyond, nees = summary["beyond_3_sigma"], summary["nees_mean"]
     if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or (nees is not None and nees > _MOST_NEES):
         text = f"{beyond} of {summary['scored_fixes']} fixes are off by more than three of their own sigmas"
         text += f" (mean NEES {nees:.0f}, 2 is expected): something is off by more than it states"
-        return Verdict("bad", _with_diagnosis(f"{text}; {fixed}, {spread}.", summary), late)
+        return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
     if summary["wrong_over_10m"]:
         wrong = _count(summary["wrong_over_10m"], "of them is", "of them are")
         text = f"{fixed}; {wrong} more than {WRONG_M:g} m off, though within what the stated sigma allows"
-        return Verdict("mixed", _with_diagnosis(f"{text}; {spread}.", summary), late)
+        return Verdict("mixed", f"{text}; {spread}.", late)
     grade = "good" if fixes >= 0.9 * frames and not summary["deadlines_missed"] else "mixed"
-    return Verdict(grade, _with_diagnosis(f"{fixed}, none of them wrong; {spread}.", summary), late)
-
-
-def _with_diagnosis(text: str, summary: Mapping[str, Any]) -> str:
-    """The text after what a diagnosis of the inputs found, where there was one."""
-    found = summary.get("settings", {}).get("diagnosis") or {}
-    said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in found.values()]
-    return " ".join([*said, text])
+    return Verdict(grade, f"{fixed}, none of them wrong; {spread}.", late)
 
 
 def _latency(summary: Mapping[str, Any], budget_ms: float | None) -> str:

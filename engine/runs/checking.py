@@ -72,13 +72,10 @@ def as_rows(found: Diagnosis, *, corrected: bool = False) -> list[tuple[str, str
     """
     seen = f"{found.seen} of {found.looked_at} pictures were placed on the map without the telemetry"
     more = ", on top of the corrections that were given" if corrected else ""
-    out = [
-        (
-            one.cause.replace("_", " "),
-            f"{one.text}; " + (f"try {one.cure}{more}" if one.cure[:2] == "--" else one.cure),
-        )
-        for one in found.findings
-    ]
+    out = []
+    for one in found.findings:
+        cure = f"try {one.cure}{more}" if one.cure.startswith("--") else one.cure
+        out.append((one.cause.replace("_", " "), f"{one.text}; {cure}"))
     if found.seen < _LEAST_SEEN:
         seen += ", too few to say more: is it the map of this place and season, the calibration of this camera?"
     elif not out and found.compared:

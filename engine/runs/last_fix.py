@@ -10,7 +10,7 @@ import time
 import zlib
 from pathlib import Path
 
-from engine.adapters.delay_memory import cache_folder
+from engine.cache_folder import cache_folder
 from engine.values import Fix, Prior
 
 _MAX_AGE_S = 60.0  # of a position with which a bridge starts

@@ -13,6 +13,7 @@ from engine.cli.options import (
     AnglesOption,
     CameraPitchOption,
     ColumnOption,
+    FramesOption,
     FrameStampsOption,
     HeadingOffsetOption,
     HeightOffsetOption,
@@ -37,9 +38,7 @@ from engine.cli.options import (
 
 def check(
     map_path: MapOption,
-    frames: Annotated[
-        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
-    ],
+    frames: FramesOption,
     camera: OptionalCameraOption = None,
     hfov_deg: HfovOption = None,
     mount: MountOption = None,

@@ -12,6 +12,7 @@ from engine.cli.options import (
     BudgetOption,
     CameraPitchOption,
     ForceOption,
+    FramesOption,
     FrameStampsOption,
     HfovOption,
     ImageTopicOption,
@@ -35,9 +36,7 @@ from engine.cli.options import (
 
 def compare(
     map_path: MapOption,
-    frames: Annotated[
-        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
-    ],
+    frames: FramesOption,
     out: OutOption,
     camera: OptionalCameraOption = None,
     hfov_deg: HfovOption = None,

@@ -14,6 +14,7 @@ from engine.cli.options import (
     CameraPitchOption,
     ColumnOption,
     ForceOption,
+    FramesOption,
     FrameStampsOption,
     HeadingOffsetOption,
     HeightOffsetOption,
@@ -44,9 +45,7 @@ from engine.cli.options import (
 
 def track(
     map_path: MapOption,
-    frames: Annotated[
-        Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
-    ],
+    frames: FramesOption,
     out: OutOption,
     camera: OptionalCameraOption = None,
     hfov_deg: HfovOption = None,
