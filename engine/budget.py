@@ -16,7 +16,8 @@ class Budget:
 
     Attributes:
         total_ms: of a frame with a prior.
-        search_ms: of a frame without a prior, which searches the whole map; None is ``total_ms``.
+        search_ms: of a frame that searches the whole map, for it has no prior, or headings and heights
+            (:attr:`engine.Frame.is_doubted`); None is ``total_ms``.
 
     Raises:
         OptionError: one is not above 0.
@@ -38,18 +39,18 @@ class Deadline:
     Args:
         budget: limits.
         clock_ns: monotonic nanoseconds; tests pass their own.
-        whole_map: whether the frame searches the whole map, which may have a budget of its own.
+        searches: whether the frame searches the whole map, or headings and heights.
     """
 
     __slots__ = ("_budget_ms", "_clock_ns", "_start_ns")
 
     def __init__(
-        self, budget: Budget, clock_ns: Callable[[], int] = time.perf_counter_ns, *, whole_map: bool = False
+        self, budget: Budget, clock_ns: Callable[[], int] = time.perf_counter_ns, *, searches: bool = False
     ) -> None:
         self._clock_ns = clock_ns
         self._start_ns = clock_ns()
         search_ms = budget.total_ms if budget.search_ms is None else budget.search_ms
-        self._budget_ms = search_ms if whole_map else budget.total_ms
+        self._budget_ms = search_ms if searches else budget.total_ms
 
     @property
     def elapsed_ms(self) -> float:

@@ -130,7 +130,7 @@ class SceneMatcher:
         Raises:
             CalibrationError: the frame is not of the camera's resolution.
         """
-        deadline = Deadline(budget or Budget(), whole_map=prior is None)
+        deadline = Deadline(budget or Budget(), searches=prior is None or frame.is_doubted)
         query = self._query(frame, prior, deadline)
         if query.prior_px is not None and not np.isfinite(query.prior_px).all():
             return query.refuse_outside(self.method)  # nowhere in the map's coordinate system

@@ -185,7 +185,7 @@ class Navigator:
             self._note_loss(now)
             return repeated
         sources = self._sources(now, prior, late=late)
-        shown = self._errors.corrected(frame, now.time_s, late=late)
+        shown = self._errors.corrected(frame, now.time_s, late=late, refusals=self._refusals)
         result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from engine.attitude_bias import AttitudeBias, Bias
 from engine.attitude_lag import AttitudeLag
@@ -13,6 +13,8 @@ from engine.values import Fix, Frame
 # Standard deviations of a height against the telemetry's: by refinement or features, as a share of it.
 _HEIGHT_SHARE, _HEIGHT_M = 0.01, 1.0
 _FIRST_SHARE = 0.2  # of the height, by which it may be off while no picture measured it
+_LEAST_SHARE, _LEAST_SIGMAS, _LEAST_FIXES = 0.03, 3.0, 3  # of an error of the height that is taken off
+_FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before heading and height are searched for, and again
 _WALK_SHARE = 1e-3  # of the height, by which its error changes in a second
 
 
@@ -39,7 +41,7 @@ class Calibration:
 
 
 class TelemetryErrors:
-    """Learns what a vehicle's telemetry is off by, and takes the attitude's share off.
+    """Learns what a vehicle's telemetry is off by, and takes it off.
 
     Args:
         options: of the navigator; how far off attitudes may be.
@@ -53,6 +55,8 @@ class TelemetryErrors:
         self._off_m = self._variance_m2 = 0.0
         self._time_s: float | None = None
         self._heights = 0
+        self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched for
+        self._settling = False  # whether they were, and what was found is not taken off yet
 
     @property
     def lag_s(self) -> float:
@@ -75,16 +79,20 @@ class TelemetryErrors:
             math.sqrt(self._variance_m2) if known else None,
         )  # fmt: skip
 
-    def corrected(self, frame: Frame, time_s: float, *, late: bool) -> Frame:
-        """The frame with the attitude at its capture.
+    def corrected(self, frame: Frame, time_s: float, *, late: bool, refusals: int = 0) -> Frame:
+        """The frame with the attitude at its capture and the height that pictures showed.
+
+        Where frames are refused, heading and height may be off by more than a match bears: then both are searched
+        for, ever more rarely as that does not help, and after a fix until enough of them settled what they are.
 
         Args:
             frame: the newest, or a late one.
             time_s: of the newest on any one clock.
             late: whether it is one.
+            refusals: in a row before it.
         """
         if late:
-            return self._bias.corrected(frame)
+            return self._at_its_height(self._bias.corrected(frame))
         self._height_m = frame.height_agl_m
         if self._time_s is not None and self._height_m is not None:
             walk_m = _WALK_SHARE * self._height_m
@@ -92,7 +100,25 @@ class TelemetryErrors:
         self._time_s = time_s
         shown = self._lag.corrected(frame)
         self._bias.follow(shown, time_s)
-        return self._bias.corrected(shown)
+        shown = self._at_its_height(self._bias.corrected(shown))
+        if frame.heading_deg is None or self._height_m is None:
+            return shown
+        if refusals >= self._next_search:
+            self._next_search = math.ceil(_SEARCH_GROWTH * refusals)
+            self._settling = True
+            return replace(shown, is_doubted=True)
+        self._settling &= not refusals and self._heights < _LEAST_FIXES
+        return replace(shown, is_doubted=True) if self._settling else shown
+
+    def _at_its_height(self, frame: Frame) -> Frame:
+        """The frame at the height that pictures showed, where that differs by more than a match bears."""
+        if frame.height_agl_m is None or self._heights < _LEAST_FIXES:
+            return frame
+        least_m = max(_LEAST_SHARE * frame.height_agl_m, _LEAST_SIGMAS * math.sqrt(self._variance_m2))
+        height_m = frame.height_agl_m + self._off_m
+        if abs(self._off_m) < least_m or height_m <= 0.0:
+            return frame
+        return replace(frame, height_agl_m=height_m, height_correction_m=self._off_m)
 
     def note(self, fix: Fix, ground_m: float | None) -> None:
         """Learn from an accepted fix of the newest frame.
@@ -102,6 +128,7 @@ class TelemetryErrors:
             ground_m: height of the ground below it; None over ground that is taken for flat, where a slope passes
                 for a tilt.
         """
+        self._next_search = _FIRST_SEARCH
         self._lag.note(fix, self._bias.bias)
         if ground_m is None:
             return

@@ -44,7 +44,8 @@ class Attitude:
 
 
 # Fields of a frame that are finite or None.
-_FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
+_FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps",
+           "height_correction_m")  # fmt: skip
 _SIGMAS = ("height_sigma_m", "heading_sigma_deg", "tilt_sigma_deg")
 
 
@@ -67,6 +68,9 @@ class Frame:
         tilt_lag_deg: by how much roll and pitch may have changed since they were measured; adds to their
             standard deviation.
         heading_lag_deg: the same of the heading.
+        height_correction_m: what was added to the vehicle's own height because pictures showed another one. The
+            focal length may be what is wrong, so that a fix is less certain by it.
+        is_doubted: heading and height may be far off, so that NCC searches for both; a navigator sets it.
 
     Raises:
         ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
@@ -87,6 +91,8 @@ class Frame:
     tilt_sigma_deg: float | None = None
     tilt_lag_deg: float | None = None
     heading_lag_deg: float | None = None
+    height_correction_m: float | None = None
+    is_doubted: bool = False
 
     def __post_init__(self) -> None:
         shape = tuple(self.image.shape)

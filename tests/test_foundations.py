@@ -110,6 +110,13 @@ def test_the_clock_of_a_deadline_is_monotonic():
     assert seen[0] >= 0.0
 
 
+def test_a_frame_that_searches_has_a_budget_of_its_own():
+    budget = Budget(total_ms=40.0, search_ms=500.0)
+    assert Deadline(budget, lambda: 0).remaining_ms == 40.0
+    assert Deadline(budget, lambda: 0, searches=True).remaining_ms == 500.0
+    assert Deadline(Budget(total_ms=40.0), lambda: 0, searches=True).remaining_ms == 40.0
+
+
 # Device
 
 

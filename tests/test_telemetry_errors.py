@@ -8,9 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from engine import Navigator, Prior, SceneMatcher
 from engine.navigator_options import NavigatorOptions
+from engine.sim import plan_flight
 from engine.telemetry_errors import TelemetryErrors
 from engine.values import Attitude, Fix, Frame, Timings, Window
+from tests.support.towns import drawn_town
 
 IMAGE = np.zeros((4, 4), np.uint8)
 GROUND_M, HEIGHT_M = 30.0, 150.0
@@ -50,11 +53,45 @@ def test_what_is_off_is_recovered_within_three_sigma(seed):
     assert found.height_factor == pytest.approx(150.0 / 160.0, abs=0.01)
 
 
-def test_the_attitude_is_corrected_and_the_height_is_not():
+def test_attitude_and_height_are_corrected_and_the_height_says_by_how_much():
     """A height that contradicts the pictures stays a contradiction: the focal length may be what is wrong."""
     _, shown = flown((0.0, 0.0, 8.0), 20.0)
     assert math.remainder(shown.heading_deg - 79.0, 360.0) == pytest.approx(0.0, abs=0.6)
-    assert shown.height_agl_m == HEIGHT_M + 20.0
+    assert shown.height_agl_m == pytest.approx(HEIGHT_M, abs=1.0)
+    assert shown.height_agl_m - shown.height_correction_m == pytest.approx(HEIGHT_M + 20.0)
+
+
+def test_an_error_of_the_height_that_a_match_bears_is_left():
+    _, shown = flown(off_m=3.0)
+    assert (shown.height_agl_m, shown.height_correction_m) == (HEIGHT_M + 3.0, None)
+
+
+def refused(frames, frame=None):
+    """In which of so many frames that are all refused heading and height are doubted."""
+    errors = TelemetryErrors(NavigatorOptions())
+    frame = frame or Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0)
+    shown = [errors.corrected(frame, 0.2 * k, late=False, refusals=k) for k in range(frames)]
+    return errors, [k for k, one in enumerate(shown) if one.is_doubted]
+
+
+def test_refused_frames_are_doubted_ever_more_rarely():
+    assert refused(100)[1] == [3, 5, 8, 12, 18, 27, 41, 62, 93]
+
+
+def test_a_frame_without_heading_or_height_has_nothing_to_doubt():
+    assert refused(20, Frame(IMAGE, None, HEIGHT_M))[1] == []
+    assert refused(20, Frame(IMAGE, None, None, 40.0))[1] == []
+
+
+def test_after_a_fix_frames_are_doubted_until_three_fixes_settled_what_is_off():
+    errors, _ = refused(4)
+    doubted = []
+    for k in range(6):
+        errors.note(fix_of(Attitude(0.0, 0.0, 30.0)), GROUND_M)
+        shown = errors.corrected(Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0), 1.0 + 0.2 * k, late=False)
+        doubted.append(shown.is_doubted)
+    assert doubted == [True, True, False, False, False, False]
+    assert math.remainder(shown.heading_deg - 30.0, 360.0) == pytest.approx(0.0, abs=0.6)
 
 
 def test_nothing_is_known_before_a_fix_nor_after_a_jump():
@@ -78,3 +115,25 @@ def test_a_late_frame_is_corrected_and_teaches_nothing():
     shown = errors.corrected(late, 0.0, late=True)
     assert math.remainder(shown.heading_deg - 40.0, 360.0) == pytest.approx(0.0, abs=0.6)
     assert errors.calibration == before
+
+
+@pytest.mark.slow
+def test_ncc_finds_a_heading_and_a_height_that_are_far_off():
+    """Three refused frames, then the place, the heading and the height, which later frames are matched by."""
+    plan = plan_flight(1, frames=10, town=drawn_town(1))
+    site, first = plan.town.site(), plan.truth_rows()[0]
+    navigator = Navigator(
+        SceneMatcher(site, plan.camera, "ncc", "cpu"),
+        Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=10.0),
+    )
+    results = [
+        navigator.update(replace(f, heading_deg=(f.heading_deg + 9.0) % 360.0, height_agl_m=1.12 * f.height_agl_m))
+        for f in plan.iter_frames()
+    ]
+    fixes = [one for one in results if isinstance(one, Fix)]
+    assert fixes == results[3:]
+    for fix, there in zip(fixes, plan.truth.position_m[3:], strict=True):
+        assert math.hypot(fix.east_m - there[0], fix.north_m - there[1]) < min(1.0, 3.0 * fix.sigma_m)
+    found = navigator.calibration
+    assert abs(found.attitude.heading_deg + 9.0) < 3.0 * found.attitude.sigma_deg[2]
+    assert found.height_factor == pytest.approx(1.0 / 1.12, abs=0.02)

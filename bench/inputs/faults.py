@@ -102,7 +102,7 @@ def _each(change: Callable[[Frame], Frame]) -> Callable[[Told], Told]:
     return lambda told: replace(told, frames=[change(frame) for frame in told.frames])
 
 
-def _height(change: Callable[[float], float]) -> Callable[[Told], Told]:
+def raised(change: Callable[[float], float]) -> Callable[[Told], Told]:
     def one(frame: Frame) -> Frame:
         if frame.height_agl_m is None:
             return frame
@@ -111,7 +111,7 @@ def _height(change: Callable[[float], float]) -> Callable[[Told], Told]:
     return _each(one)
 
 
-def _late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callable[[Told], Told]:
+def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callable[[Told], Told]:
     """Telemetry of some time ago; of its parts, the attitude or the rest."""
 
     def spoil(told: Told) -> Told:
@@ -164,7 +164,7 @@ def _stamps(factor: float) -> Callable[[Told], Told]:
 # ------------------------------------------------------------------------------------------------- camera
 
 
-def _lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[Told], Told]:
+def lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[Told], Told]:
     def spoil(told: Told) -> Told:
         matrix = told.camera.matrix.copy()
         matrix[[0, 1], [0, 1]] *= focal
@@ -174,7 +174,7 @@ def _lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[Told], Tol
     return spoil
 
 
-def _mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Callable[[Told], Told]:
+def mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Callable[[Told], Told]:
     """The calibration's mount turned about the optical axis, and tilted about the body's right axis."""
 
     def spoil(told: Told) -> Told:
@@ -285,7 +285,7 @@ class Fault:
     spoil: Callable[[Told], Told]
 
 
-def _added(*offsets_deg: float) -> Callable[[Told], Told]:
+def turned(*offsets_deg: float) -> Callable[[Told], Told]:
     return _angles(lambda angles: angles + np.array(offsets_deg))
 
 
@@ -305,17 +305,17 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
     "angles converted twice": ("degrees", {"": _angles(np.degrees)}),
     "roll and pitch swapped": ("swapped", {"": _angles(lambda a: a[:, [1, 0, 2]])}),
     "sign turned:": ("sign", {"both": _times(-1, -1, 1), "roll": _times(-1, 1, 1), "pitch": _times(1, -1, 1)}),
-    "heading off by": ("heading", {"3": _added(0, 0, 3), "8": _added(0, 0, 8), "20": _added(0, 0, 20)}),
+    "heading off by": ("heading", {"3": turned(0, 0, 3), "8": turned(0, 0, 8), "20": turned(0, 0, 20)}),
     "heading counted": ("heading_convention", {
         "counter-clockwise": _times(1, 1, -1), "from east": _angles(lambda a: a * [1, 1, -1] + [0, 0, 90])}),
-    "roll and pitch off by": ("mount", {"2": _added(2, 2, 0), "5": _added(5, -5, 0)}),
+    "roll and pitch off by": ("mount", {"2": turned(2, 2, 0), "5": turned(5, -5, 0)}),
     "height off by": ("height", {
-        "10 m": _height(lambda h: h + 10), "20 m": _height(lambda h: h + 20), "-20 m": _height(lambda h: h - 20)}),
+        "10 m": raised(lambda h: h + 10), "20 m": raised(lambda h: h + 20), "-20 m": raised(lambda h: h - 20)}),
     "height above sea level, ground at": ("height", {
-        "50 m": _height(lambda h: h + 50), "200 m": _height(lambda h: h + 200)}),
-    "height in feet": ("height height_feet", {"": _height(lambda h: h * FEET)}),
-    "telemetry late by": ("clock", {"0.1 s": _late(0.1), "0.5 s": _late(0.5), "2 s": _late(2.0)}),
-    "attitude alone late by": ("clock", {"0.1 s": _late(0.1, rest=False), "0.3 s": _late(0.3, rest=False)}),
+        "50 m": raised(lambda h: h + 50), "200 m": raised(lambda h: h + 200)}),
+    "height in feet": ("height height_feet", {"": raised(lambda h: h * FEET)}),
+    "telemetry late by": ("clock", {"0.1 s": late(0.1), "0.5 s": late(0.5), "2 s": late(2.0)}),
+    "attitude alone late by": ("clock", {"0.1 s": late(0.1, rest=False), "0.3 s": late(0.3, rest=False)}),
     "velocity": ("velocity", {
         "swapped": _velocity(lambda e, n: (n, e)), "in km/h": _velocity(lambda e, n: (3.6 * e, 3.6 * n)),
         "reversed": _velocity(lambda e, n: (-e, -n))}),
@@ -324,11 +324,11 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
 }  # fmt: skip
 _CAMERA: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
     "focal length off by": ("focal height", {
-        "-20 %": _lens(0.8), "-5 %": _lens(0.95), "5 %": _lens(1.05), "20 %": _lens(1.2)}),
-    "principal point off by": ("mount", {"10 px": _lens(principal_px=10), "30 px": _lens(principal_px=30)}),
+        "-20 %": lens(0.8), "-5 %": lens(0.95), "5 %": lens(1.05), "20 %": lens(1.2)}),
+    "principal point off by": ("mount", {"10 px": lens(principal_px=10), "30 px": lens(principal_px=30)}),
     "distortion missing, k1": ("focal height", {"-0.05": _distorted(-0.05), "-0.2": _distorted(-0.2)}),
-    "mount turned by": ("mount heading", {"90": _mounted(90), "180": _mounted(180), "3": _mounted(3)}),
-    "mount tilted by": ("mount", {"3": _mounted(tilt_deg=3), "10": _mounted(tilt_deg=10)}),
+    "mount turned by": ("mount heading", {"90": mounted(90), "180": mounted(180), "3": mounted(3)}),
+    "mount tilted by": ("mount", {"3": mounted(tilt_deg=3), "10": mounted(tilt_deg=10)}),
     "pictures mirrored": ("mirrored", {
         "left to right": _pictures(lambda i: i[:, ::-1]), "top to bottom": _pictures(lambda i: i[::-1])}),
     "pictures turned by EXIF": ("mount", {

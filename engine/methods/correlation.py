@@ -48,6 +48,10 @@ class Aligned:
     patch: Patch
     template: torch.Tensor
 
+    def work_px(self, window: Window) -> float:
+        """Pixels of a window on this level."""
+        return float(window.area_px >> 2 * self.level)
+
 
 @dataclass(frozen=True, slots=True)
 class Correlator:

@@ -94,6 +94,7 @@ class Ncc(Method):
             return
         for coarser in expected_window_px(query, self.options):
             self.refine(query, self.correlate(query, coarser))
+        self.correlate(replace(query, frame=replace(query.frame, is_doubted=True)))
         found = self.find(query)
         if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
             self._costed_second_look(query, found, found.fix.window)
@@ -120,6 +121,8 @@ class Ncc(Method):
             step, works = "ncc", expected_window_px(query, self.options)
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
+        if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
+            return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, step)
         with query.scheduler.costed(step, works[coarser]):
@@ -131,6 +134,8 @@ class Ncc(Method):
                 result = self._look_turned(query, coarser, works[coarser], result)
             if isinstance(result, NoFix):
                 result = replace(result, candidates=self._candidates(query, found))
+        if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
+            return self.refine(query.with_pose(found.aligned.pose, result), result)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def refine(self, query: Query, result: Result) -> Result:
@@ -153,14 +158,14 @@ class Ncc(Method):
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The correlation surface of a window at the frame's own height and heading."""
-        return explain_correlation(Correlator(query, self.prepared, self.options), window)
+        return explain_correlation(self._correlator(query), window)
 
     def find(self, query: Query, *, coarser: int = 0) -> PeakCandidate | NoFix:
         """The highest peak of one frame, or a refusal where there is none; see :meth:`correlate`."""
         refusal = self._refuse_unusable(query)
         if refusal is not None:
             return refusal
-        correlator = Correlator(query, self.prepared, self.options)
+        correlator = self._correlator(query)
         aligned = self._align(correlator, coarser)
         if isinstance(aligned, NoFix):
             return aligned
@@ -217,7 +222,7 @@ class Ncc(Method):
         """
         if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
             return ()
-        correlator, aligned = Correlator(query, self.prepared, self.options), found.aligned
+        correlator, aligned = self._correlator(query), found.aligned
         with query.scheduler.stage("candidates"):
             surface = correlator.surface(aligned, found.fix.window)
         if surface is None:
@@ -264,7 +269,7 @@ class Ncc(Method):
         if not self.options.second_look:
             return refusal
         window = self._looked_at(query, found)
-        if not query.scheduler.can_afford(_SECOND_LOOK, _level_px(window, found.aligned)):
+        if not query.scheduler.can_afford(_SECOND_LOOK, found.aligned.work_px(window)):
             return refusal
         again = self._costed_second_look(query, found, window)
         return refusal if again is None else self.judge_again(query, again)
@@ -274,11 +279,11 @@ class Ncc(Method):
         if found.features is not None:
             return found.fix.window
         place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
-        correlator = Correlator(replace(query, prior=place), self.prepared, self.options)
+        correlator = self._correlator(replace(query, prior=place))
         return correlator.window(found.aligned) or found.fix.window
 
     def _costed_second_look(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
-        work_px = _level_px(window, found.aligned)
+        work_px = found.aligned.work_px(window)
         with query.scheduler.costed(_SECOND_LOOK, work_px), query.scheduler.stage("second look"):
             return self.find_again(query, found, window)
 
@@ -290,7 +295,7 @@ class Ncc(Method):
             found: at the first look.
             window: that is looked at; None takes that of the first look, which the fix names in any case.
         """
-        correlator, window = Correlator(query, self.prepared, self.options), window or found.fix.window
+        correlator, window = self._correlator(query), window or found.fix.window
         looked = second_look(correlator, found.aligned, window)
         if looked is None:
             return None
@@ -313,7 +318,10 @@ class Ncc(Method):
         return found.fix
 
     def _trusts(self, query: Query) -> bool:
-        return self.options.trusts(query.telemetry.grid_heading_deg)
+        return self.options.of_frame(query.frame).trusts(query.telemetry.grid_heading_deg)
+
+    def _correlator(self, query: Query) -> Correlator:
+        return Correlator(query, self.prepared, self.options.of_frame(query.frame))
 
     def _refuse_without_height(self, query: Query) -> NoFix:
         return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
@@ -389,8 +397,3 @@ class Ncc(Method):
             grid_attitude=pose.grid_attitude if searched else None,
             map_sigma_m=errors.map_m,
         )
-
-
-def _level_px(window: Window, aligned: Aligned) -> float:
-    """Pixels of a window on the level that is matched."""
-    return float(window.area_px >> 2 * aligned.level)

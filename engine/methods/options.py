@@ -12,11 +12,14 @@ from engine.learned import PairMatcher
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions
 from engine.scores import check_score
+from engine.values import Frame
 
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")
 MIN_HEIGHT_M = 1.0
 """The lowest height that is searched where the height is unknown."""
+# How far compasses and altimeters are off at most: a declination, a motor's current, another ground.
+_DOUBTED_HEADING_DEG, _DOUBTED_HEIGHT_SHARE = 24.0, 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +69,16 @@ class NccOptions:
         check_score(self.score)
         if self.enhance_radius_px < 0:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
+
+    def of_frame(self, frame: Frame) -> NccOptions:
+        """The same with what is searched for a frame whose heading and height are doubted."""
+        if not frame.is_doubted:
+            return self
+        return replace(
+            self,
+            heading_search_deg=max(self.heading_search_deg, _DOUBTED_HEADING_DEG),
+            height_search_share=max(self.height_search_share, _DOUBTED_HEIGHT_SHARE),
+        )
 
     def trusts(self, heading_deg: float | None) -> bool:
         """Whether a frame's own heading and height are the only hypothesis."""

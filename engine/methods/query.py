@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 _AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
 _MOST_TURNED = math.radians(60.0)
+_FOUND_HEADING_DEG, _FOUND_HEIGHT_SHARE = 2.0, 0.03  # standard deviations of what a search found
 _ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
 
 
@@ -146,9 +147,10 @@ class Query:
         Returns:
             One standard deviation per axis, 0 where the two heights agree to two of theirs.
         """
-        told_m = self.telemetry.height_agl_m
-        if told_m is None:
+        known_m = self.telemetry.height_agl_m
+        if known_m is None:
             return 0.0
+        told_m = known_m - (self.frame.height_correction_m or 0.0)
         measured_m = up_m - float(self.site.ground_at(nadir_px))
         off_m = abs(measured_m - told_m)
         if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
@@ -160,6 +162,34 @@ class Query:
             told_down = self.camera.enu_from_camera(told)[:, 2]
             turned = math.acos(min(1.0, float(told_down @ camera_down)))
         return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MOST_TURNED)))
+
+    # ------------------------------------------------------------------------------- heading and height searched
+
+    @property
+    def undoubted(self) -> Query:
+        """The same by the frame's own heading and height."""
+        return replace(self, frame=replace(self.frame, is_doubted=False))
+
+    def with_pose(self, pose: GridPose, fix: Fix) -> Query:
+        """The same by the heading and the height that a search found, known as well as its steps are fine.
+
+        Args:
+            pose: that was found.
+            fix: with its heading from true north.
+        """
+        frame, height_m = self.frame, pose.height_agl_m
+        assert fix.attitude is not None  # a search measures the heading
+        assert frame.height_agl_m is not None
+        assert height_m is not None
+        found = replace(
+            self.undoubted.frame,
+            heading_deg=fix.attitude.heading_deg,
+            heading_sigma_deg=_FOUND_HEADING_DEG,
+            height_agl_m=height_m,
+            height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
+            height_correction_m=(frame.height_correction_m or 0.0) + height_m - frame.height_agl_m,
+        )
+        return replace(self, frame=found)
 
     # --------------------------------------------------------------------------------------------- answers
 

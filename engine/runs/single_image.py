@@ -89,7 +89,9 @@ def locate_image(
     check_position("near", prior, site, OptionError)
     pixels = read_image(image)
     calibration.check_size(pixels.shape)
-    frame = Frame(pixels, None, **known)
+    frame = Frame(
+        pixels, height_agl_m=height_agl_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg
+    )
     return SceneMatcher(site, calibration, method, device, options).locate(frame, prior)
 
 
