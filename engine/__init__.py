@@ -22,8 +22,9 @@ from engine.errors import (
 from engine.live import Answer, Live, LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods.options import LearnedOptions, MatcherOptions, NccOptions, SiftOptions
-from engine.navigator import Navigator, NavigatorState
+from engine.navigator import Navigator
 from engine.navigator_options import NavigatorOptions
+from engine.navigator_state import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import replace
 from typing import Protocol
@@ -34,10 +33,12 @@ from engine.motion import (
     is_valid,
 )
 from engine.navigator_options import NavigatorOptions
+from engine.navigator_state import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.repeats import Repeats
 from engine.telemetry_errors import Calibration, TelemetryErrors
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
+from engine.velocity_check import VelocityCheck
 
 Array = NDArray[np.float64]
 
@@ -49,19 +50,6 @@ class Matcher(Protocol):
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """Where the camera was when the frame was taken."""
-
-
-class NavigatorState(enum.Enum):
-    """How much a navigator knows.
-
-    ``SEARCHING`` before the first fix, ``TRACKING`` where the newest frame gave a fix, ``COASTING`` on dead
-    reckoning since the last one, ``LOST`` where that leads nowhere any more.
-    """
-
-    SEARCHING = "searching"
-    TRACKING = "tracking"
-    COASTING = "coasting"
-    LOST = "lost"
 
 
 class Navigator:
@@ -90,7 +78,7 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._errors = TelemetryErrors(o)
-        self._repeats = Repeats()
+        self._repeats, self._velocity = Repeats(), VelocityCheck()
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
@@ -176,7 +164,8 @@ class Navigator:
             TelemetryError: the frame came before, or is older than ``late_s``.
             CalibrationError: the frame is not of the camera's resolution.
         """
-        late = self._odometry.is_late(frame)
+        late, told = self._odometry.is_late(frame), frame
+        frame = self._velocity.shown(frame)
         now = self._odometry.sample(frame, self._recent.velocity)
         repeated = None if late else self._repeats.refusal(frame, now)
         if repeated is not None:
@@ -191,6 +180,8 @@ class Navigator:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
         if isinstance(result, Fix):
+            if not late and self._velocity.note(result, told, now.time_s):
+                self._forget_way(now)
             result = self._judge(result, now, sources, frame.height_agl_m, late=late)
             if isinstance(result, Fix) and sources.given is not None:
                 self._map_offset.add(result, sources.given, now.time_s)
@@ -219,6 +210,16 @@ class Navigator:
             odds = min(odds, log_odds(RELIABILITY))
         place_m = anchor.position.en_m + now.moved_m - anchor.sample.moved_m
         return PositionEstimate(place_m, sigma_m, odds, anchor.position.on_map)
+
+    def _forget_way(self, now: OdometrySample) -> None:
+        """The way since the last fix was measured by a velocity that is wrong: nothing is known of it."""
+        anchor = self._anchor
+        if anchor is not None and anchor.sample is not None:
+            unknown_s = now.time_s - anchor.sample.time_s
+            start = OdometrySample(anchor.sample.time_s, now.moved_m, now.blind_s - unknown_s)
+            self._anchor = replace(anchor, sample=start)
+        self._recent = RecentAnchors(self._drift)
+        self._hypotheses.clear()
 
     def _sources(self, now: OdometrySample, prior: Prior | None, *, late: bool) -> Sources:
         """What is known of the position, and where the matcher looks for it."""

@@ -281,6 +281,16 @@ def test_without_measured_velocities_fixes_that_agree_move_the_track():
     assert reasons(results) == ["fix"] * 20 + ["inconsistent"] * 2 + ["fix"]
 
 
+def test_a_velocity_that_contradicts_a_smooth_way_loses_its_say():
+    """5 frames a second northwards at 7 m/s, and a velocity that says southwards."""
+    script = Script(*[(10.0, 20.0 + 1.4 * k) for k in range(60)], sigma_m=0.3)
+    navigator = Navigator(script, START)
+    fixed = [isinstance(navigator.update(at(0.2 * k, (0.0, -7.0))), Fix) for k in range(60)]
+    assert fixed[0]
+    assert not all(fixed[:10])
+    assert all(fixed[15:])
+
+
 def shifted_map(velocity, seconds):
     """Twenty seconds on the right map, then one that is shifted by 40 m, at 5 frames a second."""
     places = [(10.0, 20.0)] * 100 + [(50.0, 20.0)] * round(5 * seconds)

@@ -24,7 +24,8 @@ from engine.formats.track import track_row
 from engine.live import Answer
 from engine.matcher import SceneMatcher
 from engine.methods.explanation import Explanation
-from engine.navigator import Navigator, NavigatorState
+from engine.navigator import Navigator
+from engine.navigator_state import NavigatorState
 from engine.report.explain import (
     SIDE_PX,
     draw_matches,

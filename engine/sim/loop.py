@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
-from engine.navigator import Matcher, Navigator, NavigatorState
+from engine.navigator import Matcher, Navigator
+from engine.navigator_state import NavigatorState
 from engine.sim.ekf import (
     START_TILT_DEG,
     FilterState,
