@@ -111,37 +111,24 @@ class _Projection:
     """All samples projected by a pose.
 
     Attributes:
+        rotation: (3, 3) of the pose.
+        correlation: of picture and map at the visible samples.
         differences: (N,) of picture and map.
         points: (3, N) samples in the camera's axes.
-        offsets_m: (2, N) of the samples from the slope's pivot.
-        rotation: (3, 3) of the pose.
         shown: (3, N) derivatives of the differences by the points, from the picture's gradients.
         expected: (3, N) the same, from the map's gradients.
         weights: (N,) robust weights, 0 where a sample is not visible.
         cells: (N,) cell of the picture.
-        correlation: of picture and map at the visible samples.
     """
 
+    rotation: Array
+    correlation: float
     differences: Array
     points: Array
-    offsets_m: Array
-    rotation: Array
     shown: Array
     expected: Array
     weights: Array
     cells: NDArray[np.intp]
-    correlation: float
-
-    @property
-    def variance(self) -> float:
-        """Weighted variance of the differences."""
-        return max(float(self.weights @ self.differences**2 / self.weights.sum()), 1e-12)
-
-    def derivatives(self, by_points: Array) -> Array:
-        """(8, N) derivatives of the differences by the parameters, from those by the points (3, N)."""
-        from engine.kernels import dense_loops
-
-        return np.asarray(dense_loops.derivatives(by_points, self.points, self.offsets_m, self.rotation))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +140,14 @@ class DenseFit:
         correlation: of picture and map at the samples, before the last step.
         converged: whether the last step was small.
         projection: of the samples before the last step.
+        offsets_m: (3, N) of the samples from the slope's pivot.
     """
 
     pose: Pose
     correlation: float
     converged: bool
     projection: _Projection
+    offsets_m: Array
 
 
 def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> float:
@@ -172,9 +161,14 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
     Returns:
         In [-1, 1]; 0 where fewer than :data:`MIN_SAMPLES` are visible.
     """
+    from engine.kernels import dense_loops  # numba takes a while to import
+
     offset_m = np.ascontiguousarray((samples.points_m - pose.center_m).T)
-    projection = _project(picture, samples, offset_m, pose, pose)
-    return 0.0 if projection is None else projection.correlation
+    levels, _, _, _, weights, _, count = dense_loops.project(
+        picture.levels, picture.matrix, np.ascontiguousarray(pose.rotation), pose.center_m, pose.slope,
+        offset_m, pose.center_m, samples.gradients, samples.weights, _EDGE_PX, _CELLS,
+    )  # fmt: skip
+    return float(dense_loops.compare_levels(levels, samples.values, weights)[2]) if count >= MIN_SAMPLES else 0.0
 
 
 def refine(
@@ -192,19 +186,21 @@ def refine(
     Returns:
         The pose, or None where too few samples are visible or the pose is not determined.
     """
+    from engine.kernels.gauss_newton import gauss_newton  # numba takes a while to import
+
     offset_m = np.ascontiguousarray((samples.points_m - prior.pose.center_m).T)
-    pose = start
-    for remaining in reversed(range(_STEPS)):
-        projection = _project(picture, samples, offset_m, pose, prior.pose)
-        solved = None if projection is None else _step(projection, pose, prior)
-        if projection is None or solved is None:
-            return None
-        step, sigmas_squared = solved
-        pose = _updated(pose, step)
-        converged = sigmas_squared < last_step_sigmas**2
-        if converged or not remaining:
-            return DenseFit(pose, projection.correlation, converged, projection)
-    return None
+    # The loops are compiled for one memory layout of the matrices.
+    rotation, prior_rotation = (np.ascontiguousarray(pose.rotation) for pose in (start, prior.pose))
+    found, converged, rotation, center_m, slope, *seen = gauss_newton(
+        picture.levels, picture.matrix, rotation, start.center_m, start.slope,
+        prior_rotation, prior.pose.center_m, prior.pose.slope, prior.precision,
+        offset_m, samples.values, samples.gradients, samples.weights,
+        _EDGE_PX, _CELLS, MIN_SAMPLES, _STEPS, _EXCESS, last_step_sigmas**2,
+    )  # fmt: skip
+    if not found:
+        return None
+    projection = _Projection(*seen)
+    return DenseFit(Pose(rotation, center_m, slope), projection.correlation, converged, projection, offset_m)
 
 
 def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
@@ -221,11 +217,15 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
     Returns:
         (8, 8) in the order of the parameters, or None where the pose is not determined.
     """
-    projection = fit.projection
-    shown, expected = projection.derivatives(projection.shown), projection.derivatives(projection.expected)
-    weighted = shown * projection.weights
-    information = weighted @ shown.T
-    reference = _inverse(information / projection.variance + prior.precision)
+    from engine.kernels import gauss_newton
+
+    seen = fit.projection
+    own, common, of_map, by_cell = gauss_newton.information(
+        seen.shown, seen.expected, seen.points, fit.offsets_m, seen.rotation, seen.weights, seen.differences,
+        seen.cells, _CELLS**2,
+    )  # fmt: skip
+    variance = max(float(seen.weights @ seen.differences**2 / seen.weights.sum()), 1e-12)
+    reference = _inverse(own / variance + prior.precision)
     if reference is None:
         return None
 
@@ -233,58 +233,14 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
         """Trace in units of the covariance of samples and prior."""
         return float(np.sum(reference * matrix))
 
-    in_common, of_map = size(weighted @ expected.T), size((expected * projection.weights) @ expected.T)
-    scores = 0.5 * (shown + expected) * (projection.weights * projection.differences)
-    by_cell = np.array([np.bincount(projection.cells, score, _CELLS**2) for score in scores], np.float64)
-    scatter = size(by_cell @ by_cell.T) / size(information)
+    in_common = size(common)
+    scatter = size(by_cell @ by_cell.T) / size(own)
     if in_common <= 0.0 or scatter <= 0.0:
         return None
-    share = min(1.0, in_common**2 / (size(information) * of_map))
-    return _inverse(information * (share / (_EXCESS * scatter)) + prior.precision)
-
-
-def _step(projection: _Projection, pose: Pose, prior: GaussianPrior) -> tuple[Array, float] | None:
-    """The Gauss-Newton step (8,), and in standard deviations, squared."""
-    # The mean of both gradients converges from farther than that of the picture alone (Benhimane and Malis).
-    derivatives = projection.derivatives(0.5 * (projection.shown + projection.expected))
-    weighted = derivatives * (projection.weights / (_EXCESS * projection.variance))
-    inverse = _inverse(weighted @ derivatives.T + prior.precision)
-    if inverse is None:
-        return None
-    gradient = -weighted @ projection.differences - prior.precision @ _difference(pose, prior.pose)
-    step = inverse @ gradient
-    return step, float(step @ gradient)
+    share = min(1.0, in_common**2 / (size(own) * size(of_map)))
+    return _inverse(own * (share / (_EXCESS * scatter)) + prior.precision)
 
 
 def _inverse(matrix: Array) -> Array | None:
     found, inverse = cv2.invert(matrix, flags=cv2.DECOMP_CHOLESKY)
     return np.asarray(inverse, np.float64) if found else None
-
-
-def _updated(pose: Pose, step: Array) -> Pose:
-    turned = cv2.Rodrigues(step[3:6])[0] @ pose.rotation
-    return Pose(turned, pose.center_m + step[:3], pose.slope + step[6:])
-
-
-def _difference(pose: Pose, other: Pose) -> Array:
-    """The parameters (8,) of the step from another pose to this one."""
-    turn = cv2.Rodrigues(pose.rotation @ other.rotation.T)[0][:, 0]
-    return np.concatenate([pose.center_m - other.center_m, turn, pose.slope - other.slope])
-
-
-def _project(
-    picture: EnhancedFrame, samples: Samples, offset_m: Array, pose: Pose, pivot: Pose
-) -> _Projection | None:
-    """Project the samples, (3, N) metres from the slope's pivot, and compare the picture with the map there."""
-    from engine.kernels import dense_loops  # numba takes a while to import
-
-    rotation = np.ascontiguousarray(pose.rotation)  # the memory layout that the loops are compiled for
-    levels, points, shown, expected, weights, cells, count = dense_loops.project(
-        picture.levels, picture.matrix, rotation, pose.center_m, pose.slope,
-        offset_m, pivot.center_m, samples.gradients, samples.weights, _EDGE_PX, _CELLS,
-    )  # fmt: skip
-    if count < MIN_SAMPLES:
-        return None
-    differences, weights, correlation, gain = dense_loops.compare_levels(levels, samples.values, weights)
-    expected *= gain
-    return _Projection(differences, points, offset_m[:2], rotation, shown, expected, weights, cells, correlation)

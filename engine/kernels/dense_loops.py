@@ -129,30 +129,6 @@ def compare_levels(levels, values, weights):
 
 
 @compiled
-def derivatives(by_points, points, offset_m, rotation):
-    """Derivatives of the differences by the pose's parameters.
-
-    Args:
-        by_points: (3, N) derivatives by the points in the camera.
-        points: (3, N) in the camera.
-        offset_m: (2, N) of the samples from the slope's pivot.
-        rotation: (3, 3) of cam_from_map.
-
-    Returns:
-        (8, N) in the order of the parameters of :mod:`engine.dense`.
-    """
-    out = np.empty((8, by_points.shape[1]))
-    for n in range(by_points.shape[1]):
-        a, b, c = by_points[0, n], by_points[1, n], by_points[2, n]
-        x, y, z = points[0, n], points[1, n], points[2, n]
-        for k in range(3):
-            out[k, n] = -(rotation[0, k] * a + rotation[1, k] * b + rotation[2, k] * c)
-        out[3, n], out[4, n], out[5, n] = y * c - z * b, z * a - x * c, x * b - y * a
-        out[6, n], out[7, n] = -out[2, n] * offset_m[0, n], -out[2, n] * offset_m[1, n]
-    return out
-
-
-@compiled
 def _up_to_gain(levels, values, weights):
     """Differences, correlation, gain."""
     total = level = value = 0.0

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from engine.kernels import dense_loops
+from engine.kernels.gauss_newton import by_parameters
 from engine.kernels.lower_plane import lower_plane
 
 SIDE_PX, CELLS, EDGE_PX, HEIGHT_M = 120, 8, 2.0, 80.0
@@ -51,12 +52,22 @@ def test_samples_are_seen_where_opencv_projects_them(scene):
         assert number == int(v / (SIDE_PX - 3) * CELLS) * CELLS + int(u / (SIDE_PX - 3) * CELLS)
 
 
+def derivatives(by_points, points, offset_m, rotation):
+    """(8, N) of the differences by the pose's parameters."""
+    out = np.empty((8, by_points.shape[1]))
+    for n, (a, b, c) in enumerate(by_points.T):
+        row = np.empty(8)
+        by_parameters(row, a, b, c, points, offset_m, rotation, n)
+        out[:, n] = row
+    return out
+
+
 @pytest.mark.parametrize("parameter", range(8))
 def test_derivatives_foretell_what_a_moved_pose_sees(scene, parameter):
     """Central differences of the picture are its slope up to its curvature, so a small share may be missed."""
     _, offset_m, rotation, center_m, slope = scene
     _, places, shown, _, weights, _, _ = look(scene)
-    foretold = dense_loops.derivatives(shown, places, offset_m[:2], rotation)[parameter]
+    foretold = derivatives(shown, places, offset_m[:2], rotation)[parameter]
     step = 1e-3 * np.eye(8)[parameter] / (1.0 if parameter < 3 else HEIGHT_M)
     seen = []
     for sign in (-1.0, 1.0):
@@ -75,7 +86,7 @@ def test_the_maps_gradients_let_expect_what_a_picture_of_the_map_shows(scene):
     _, offset_m, rotation, _, _ = scene
     gradients = np.random.default_rng(6).normal(0, 2, (offset_m.shape[1], 2))
     _, places, _, expected, weights, _, _ = look(scene, gradients=gradients, slope=np.zeros(2))
-    moved = dense_loops.derivatives(expected, places, offset_m[:2], rotation)
+    moved = derivatives(expected, places, offset_m[:2], rotation)
     seen = weights > 0
     np.testing.assert_allclose(moved[:2, seen], -gradients[seen].T, atol=1e-9)
     away = rotation.T @ places  # along its own ray a sample stays where it is in the picture
