@@ -46,17 +46,14 @@ class Warp:
         nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev nodes spread the error evenly
         terms = (_powers(nodes[:, 0])[:, :, None] * _powers(nodes[:, 1])[:, None, :]).reshape(len(nodes), 36)
         values = exact(self._centre + self._half * nodes)
-        self._coefficients: Array = np.zeros((6, 12))
+        self._coefficients: Array = np.zeros((6, 6, 2))
         self.fitted = bool(np.isfinite(values).all())
         if self.fitted:
-            self._coefficients[:] = np.linalg.lstsq(terms, values, rcond=None)[0].reshape(6, 12)
-            check = _lattice(np.linspace(-1.0, 1.0, 17))
-            error = self._polynomial(check) - exact(self._centre + self._half * check)
+            self._coefficients[:] = np.linalg.lstsq(terms, values, rcond=None)[0].reshape(6, 6, 2)
+            step = np.linspace(-1.0, 1.0, 17)
+            x, y = (middle + half * step for middle, half in zip(self._centre, self._half, strict=True))
+            error = self.on_grid(x, y) - exact(np.stack(np.meshgrid(x, y), axis=-1))
             self.fitted = bool(np.abs(error).max() <= tolerance)  # NaN compares as not fitted
-
-    def _polynomial(self, unit: Array) -> Array:
-        over_y = (_powers(unit[..., 0]) @ self._coefficients).reshape(*unit.shape[:-1], 6, 2)
-        return np.asarray((over_y * _powers(unit[..., 1])[..., None]).sum(axis=-2))
 
     def __call__(self, points: Array) -> Array:
         """Transform points.
@@ -67,9 +64,13 @@ class Warp:
         Returns:
             (..., 2).
         """
-        unit = (points - self._centre) / self._half
-        if self.fitted and (np.abs(unit) <= 1.0).all():
-            return self._polynomial(unit)
+        from engine.kernels.map_points import polynomials  # numba takes a while to import
+
+        if self.fitted:
+            flat = np.ascontiguousarray(points, np.float64).reshape(-1, 2)
+            out = np.empty_like(flat)
+            if polynomials(flat, self._centre, self._half, self._coefficients, out):
+                return out.reshape(points.shape)
         return self._exact(points)
 
     def on_grid(self, x: Array, y: Array) -> Array:
@@ -85,13 +86,12 @@ class Warp:
         if not self.fitted:
             return self._exact(np.stack(np.meshgrid(x, y), axis=-1))
         in_x, in_y = (_powers((v - c) / h) for v, c, h in zip((x, y), self._centre, self._half, strict=True))
-        cubes = self._coefficients.reshape(6, 6, 2)
-        return np.stack([in_y @ cubes[..., k].T @ in_x.T for k in (0, 1)], axis=-1)
+        return np.stack([in_y @ self._coefficients[..., k].T @ in_x.T for k in (0, 1)], axis=-1)
 
 
 def _powers(x: Array) -> Array:
     powers = np.ones((*np.shape(x), 6))
-    for k in range(1, 6):  # products: ten times as fast as ** on some hundred points, a little slower on one
+    for k in range(1, 6):  # products: ten times as fast as ** on some hundred points
         np.multiply(powers[..., k - 1], x, out=powers[..., k])
     return powers
 

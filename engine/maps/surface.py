@@ -109,8 +109,14 @@ class SurfaceModel:
         Returns:
             (...,) metres, NaN outside and next to nodata.
         """
-        height, width = self._heights_m.shape
         at = self._from_map(map_xy)
+        if isinstance(self._heights_m, np.ndarray):
+            from engine.kernels.map_points import bilinear_heights  # numba takes a while to import
+
+            out = np.empty(at.shape[:-1])
+            bilinear_heights(self._heights_m, np.ascontiguousarray(at).reshape(-1, 2), out.reshape(-1))
+            return out
+        height, width = self._heights_m.shape
         x0, x1, u, in_x = _neighbours(at[..., 0], width)
         y0, y1, v, in_y = _neighbours(at[..., 1], height)
         grid = self._heights_m
