@@ -1,33 +1,37 @@
 """scenematch: position fixes from a downward camera and a georeferenced map, where GNSS is gone."""
 
-from engine import features, ncc_fft
-from engine.acceptance import PeakRule
-from engine.budget import Budget
-from engine.camera import Camera
-from engine.covariance import AssumedErrors
-from engine.device import set_threads
-from engine.errors import (
-    BackendError,
-    CalibrationError,
-    DeviceError,
-    DtypeError,
-    EngineError,
-    MapError,
-    MissingExtraError,
-    OptionError,
-    ShapeError,
-    StateError,
-    TelemetryError,
-)
-from engine.live import Answer, Live, LiveOptions
-from engine.matcher import SceneMatcher
-from engine.methods.options import LearnedOptions, MatcherOptions, NccOptions, SiftOptions
-from engine.navigator import Navigator
-from engine.navigator_options import NavigatorOptions
-from engine.navigator_state import NavigatorState
-from engine.orthomap import OrthoMap
-from engine.pose import PoseOptions
-from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from engine import features, ncc_fft
+    from engine.acceptance import PeakRule
+    from engine.budget import Budget
+    from engine.camera import Camera
+    from engine.covariance import AssumedErrors
+    from engine.device import set_threads
+    from engine.errors import (
+        BackendError,
+        CalibrationError,
+        DeviceError,
+        DtypeError,
+        EngineError,
+        MapError,
+        MissingExtraError,
+        OptionError,
+        ShapeError,
+        StateError,
+        TelemetryError,
+    )
+    from engine.live import Answer, Live, LiveOptions
+    from engine.matcher import SceneMatcher
+    from engine.methods.options import LearnedOptions, MatcherOptions, NccOptions, SiftOptions
+    from engine.navigator import Navigator
+    from engine.navigator_options import NavigatorOptions
+    from engine.navigator_state import NavigatorState
+    from engine.orthomap import OrthoMap
+    from engine.pose import PoseOptions
+    from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 __all__ = [
     "Answer",
@@ -70,3 +74,37 @@ __all__ = [
     "ncc_fft",
     "set_threads",
 ]
+
+_NAMES = {
+    "engine.acceptance": "PeakRule",
+    "engine.budget": "Budget",
+    "engine.camera": "Camera",
+    "engine.covariance": "AssumedErrors",
+    "engine.device": "set_threads",
+    "engine.errors": "BackendError CalibrationError DeviceError DtypeError EngineError MapError MissingExtraError "
+    "OptionError ShapeError StateError TelemetryError",
+    "engine.live": "Answer Live LiveOptions",
+    "engine.matcher": "SceneMatcher",
+    "engine.methods.options": "LearnedOptions MatcherOptions NccOptions SiftOptions",
+    "engine.navigator": "Navigator",
+    "engine.navigator_options": "NavigatorOptions",
+    "engine.navigator_state": "NavigatorState",
+    "engine.orthomap": "OrthoMap",
+    "engine.pose": "PoseOptions",
+    "engine.values": "Attitude Fix Frame NoFix Prior Reason Timings Window",
+}
+"""The public names by module. A module is imported when one of its names is used: torch alone takes seconds."""
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
+
+    def __getattr__(name: str) -> Any:
+        if name in ("features", "ncc_fft"):  # public modules
+            return import_module(f"engine.{name}")
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

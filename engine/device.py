@@ -1,4 +1,7 @@
-"""Selection of the device, number of threads, and synchronisation."""
+"""Selection of the device, number of threads, and synchronisation.
+
+torch is imported by what uses it: arguments are checked, and live frames queued, without.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import TypeVar
-
-import torch
+from typing import TYPE_CHECKING, TypeVar
 
 from engine.errors import DeviceError, OptionError
+
+if TYPE_CHECKING:
+    import torch
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,6 +31,8 @@ def resolve(device: str | torch.device = "auto") -> torch.device:
         DeviceError: the device was requested by name and is missing; only "auto" falls back.
         OptionError: the name is not a device.
     """
+    import torch
+
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -45,6 +51,8 @@ def resolve(device: str | torch.device = "auto") -> torch.device:
 def synchronise(device: torch.device) -> None:
     """Wait until all work queued on ``device`` is done, for instance before reading a clock."""
     if device.type == "cuda":
+        import torch
+
         torch.cuda.synchronize(device)
 
 
@@ -55,6 +63,7 @@ def set_threads(count: int) -> None:
         OptionError: ``count`` is below 1.
     """
     import cv2
+    import torch
 
     if count < 1:
         raise OptionError(f"threads: expected 1 or more, got {count}")
@@ -64,6 +73,8 @@ def set_threads(count: int) -> None:
 
 def parts(size: int, max_count: int) -> list[tuple[int, int]]:
     """Divide a range of ``size`` into at most ``max_count`` parts (begin, end), and at most one per thread."""
+    import torch
+
     count = max(1, min(max_count, torch.get_num_threads()))
     return [(size * i // count, size * (i + 1) // count) for i in range(count)]
 
@@ -74,6 +85,8 @@ def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
     It is faster only where the function releases Python's global lock. A call inside a worker runs in that worker,
     so that no worker waits for another.
     """
+    import torch
+
     threads = torch.get_num_threads()
     if len(pieces) == 1 or threads == 1 or threading.current_thread().name.startswith(_WORKER):
         return [work(piece) for piece in pieces]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 
 import numpy as np
-import torch
 
 from engine.motion import OdometrySample
 from engine.values import Frame, NoFix, Reason
@@ -38,5 +37,5 @@ def _digest(frame: Frame) -> tuple[object, ...]:
     image, shape = frame.image, tuple(frame.image.shape)
     step = max(1, int(np.prod(shape)) // _SAMPLES) | 1  # odd, so that all columns and channels take part
     flat = image.reshape(-1)[::step]
-    values = flat.cpu().numpy() if isinstance(flat, torch.Tensor) else np.ascontiguousarray(flat)
+    values = np.ascontiguousarray(flat) if isinstance(flat, np.ndarray) else flat.cpu().numpy()
     return shape, zlib.crc32(values.tobytes())

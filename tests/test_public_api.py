@@ -89,60 +89,69 @@ UNUSED = (
     "scipy",
     "skimage",
 )
+HEAVY = {"torch", "cv2", "numpy", *UNUSED}
+WITHOUT_TORCH = (
+    "AssumedErrors",
+    "Budget",
+    "Camera",
+    "EngineError",
+    "Fix",
+    "Frame",
+    "LiveOptions",
+    "MatcherOptions",
+    "NavigatorOptions",
+    "OrthoMap",
+    "PeakRule",
+    "Prior",
+)
 
 
 @pytest.fixture(scope="module")
 def fresh():
-    """A new interpreter that imports the engine: what it loaded and what it printed."""
+    """A new interpreter that imports the engine, then uses it: what it had loaded by then and what it printed."""
     report = (
-        "import json, sys, warnings; warnings.simplefilter('error'); import engine; import torch; "
-        "loaded = sorted({name.split('.')[0] for name in sys.modules}); "
-        "reach = [callable(engine.ncc_fft.ncc), callable(engine.features.sift)]; "
-        "print('REPORT', json.dumps([loaded, reach, torch.cuda.is_initialized(), "
-        "sorted(n for n in sys.modules if n.startswith('engine.'))])); "
-        "import engine.features, engine.orthomap; "
-        "print('LATER', json.dumps([n for n in ('kornia', 'rasterio', 'pyproj') if n in sys.modules])); "
+        "import json, sys, warnings; warnings.simplefilter('error'); import engine; "
+        "top = lambda: sorted({name.split('.')[0] for name in sys.modules}); found = {'bare': top()}; "
+        f"[getattr(engine, name) for name in {WITHOUT_TORCH}]; found['values'] = top(); "
+        "found['reach'] = [callable(engine.ncc_fft.ncc), callable(engine.features.sift)]; "
+        "[getattr(engine, name) for name in engine.__all__]; found['loaded'] = top(); import torch; "
+        "found['cuda'] = torch.cuda.is_initialized(); "
+        "found['modules'] = sorted(n for n in sys.modules if n.startswith('engine.')); "
         "import engine.runs.tracking, engine.runs.closed_loop, engine.runs.mavlink_bridge; "
-        "print('RUNS', json.dumps('rerun' in sys.modules))"
+        "found['rerun'] = 'rerun' in sys.modules; print('REPORT', json.dumps(found))"
     )
     done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)
-    before, _, rest = done.stdout.partition("REPORT ")
-    rest, _, later = rest.partition("LATER ")
-    later, _, rerun = later.partition("RUNS ")
-    loaded, reach, cuda, modules = json.loads(rest)
-    return {
-        "later": json.loads(later),
-        "rerun": json.loads(rerun),
-        "printed": before + done.stderr,
-        "loaded": loaded,
-        "reach": reach,
-        "cuda": cuda,
-        "modules": modules,
-    }
+    before, _, found = done.stdout.partition("REPORT ")
+    return {"printed": before + done.stderr, **json.loads(found)}
 
 
 def test_importing_the_engine_prints_nothing(fresh):
     assert fresh["printed"] == ""
 
 
+def test_importing_the_engine_alone_loads_no_package(fresh):
+    assert not HEAVY.intersection(fresh["bare"])
+
+
+def test_values_options_cameras_and_maps_need_no_torch(fresh):
+    assert "numpy" in fresh["values"]
+    assert not {"torch", *UNUSED}.intersection(fresh["values"])
+
+
 @pytest.mark.parametrize("package", UNUSED)
-def test_importing_the_engine_does_not_load(fresh, package):
+def test_the_public_names_do_not_load(fresh, package):
     assert package not in fresh["loaded"]
-
-
-def test_maps_and_features_load_neither_rasters_nor_projections_nor_kornia(fresh):
-    assert fresh["later"] == []
 
 
 def test_nothing_of_rerun_is_loaded_where_nobody_watches(fresh):
     assert fresh["rerun"] is False
 
 
-def test_importing_the_engine_does_not_touch_the_gpu(fresh):
+def test_the_public_names_do_not_touch_the_gpu(fresh):
     assert fresh["cuda"] is False
 
 
-def test_importing_the_engine_loads_no_upper_floor(fresh):
+def test_the_public_names_load_no_upper_floor(fresh):
     floors = ("adapters", "cli", "formats", "report", "sim")
     assert not [name for name in fresh["modules"] if name.split(".")[1] in floors]
 
@@ -158,12 +167,9 @@ def test_the_public_names_are_these():
 def test_the_public_names_are_sorted_and_there_is_nothing_else():
     assert engine.__all__ == sorted(engine.__all__)
     assert all(hasattr(engine, name) for name in engine.__all__)
-    others = {
-        name
-        for name, value in vars(engine).items()
-        if not name.startswith("_") and not inspect.ismodule(value) and name not in engine.__all__
-    }
-    assert not others
+    assert dir(engine) == engine.__all__
+    with pytest.raises(AttributeError, match="'engine' has no attribute 'Matcher'"):
+        engine.Matcher  # noqa: B018
 
 
 @pytest.mark.parametrize("name", PUBLIC)

@@ -1,6 +1,6 @@
 """The latency budget: whether an answer comes on time, every time, what it is worth, and what it costs to start.
 
-    python -m bench.live.latency [budgets|hogs|slow|queue|soak|tradeoff|startup|all] [--quick] [--docs DIR]
+    python -m bench.live.latency [budgets|hogs|slow|queue|soak|tradeoff|startup|entries|all] [--quick] [--docs DIR]
 
 Figures go to .benchmarks/latency.json, section by section; ``all`` writes docs/latency.md from its own as well.
 """
@@ -21,7 +21,7 @@ from bench import DOCS, ROOT
 from bench.live.burden import PERIOD_S, hogs, throttle
 from bench.live.endless import Course, draw, fly, summary, warm
 from bench.live.soak import Growth, queue, soak
-from bench.live.startup import startup
+from bench.live.startup import entries, startup
 from bench.live.tradeoff import tradeoff
 from bench.pages import latency
 from engine.device import set_threads
@@ -104,6 +104,7 @@ SECTIONS: dict[str, Callable[..., Any]] = {
     "soak": soak,
     "tradeoff": tradeoff,
     "startup": lambda _, **sizes: startup(**sizes),
+    "entries": lambda _, **sizes: entries(**sizes),
 }
 QUICK: dict[str, dict[str, Any]] = {
     "budgets": {"auto_frames": 60, "other_frames": 20},
@@ -113,6 +114,7 @@ QUICK: dict[str, dict[str, Any]] = {
     "soak": {"frames": 120},
     "tradeoff": {"frames": 20, "table_frames": 40, "paper_frames": 5},
     "startup": {"methods": ("ncc",), "rounds": 1},
+    "entries": {"rounds": 1},
 }
 QUICK_DRAWN = 24
 

@@ -1,4 +1,4 @@
-"""From the start of the process to the first fix: each part, with kept caches and without.
+"""What a start takes: help and imports alone, and from the start of the process to the first fix, part by part.
 
 ``python -m bench.live.startup FOLDER METHOD STARTED_S`` is the measured process; it prints one JSON object.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -18,6 +19,40 @@ from typing import Any
 
 Row = dict[str, Any]
 PARTS = ("Python", "import torch", "import engine", "open map and flight", "warm-up", "first frame")
+ENTRIES = {
+    "scenematch --help": ("-m", "engine.cli", "--help"),
+    "scenematch track --help": ("-m", "engine.cli", "track", "--help"),
+    "import engine": ("-c", "import engine"),
+    "from engine import Camera, Frame, OrthoMap": ("-c", "from engine import Camera, Frame, OrthoMap"),
+    "from engine import SceneMatcher": ("-c", "from engine import SceneMatcher"),
+}
+"""What is waited for before anything is asked of the engine: arguments of Python."""
+
+
+def entries(rounds: int = 5) -> list[Row]:
+    """Medians of the seconds that each takes, of those on a core, and of the most memory that was resident.
+
+    The first start of each is left out: it compiles Python's bytecode, which an installation brings along.
+    """
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    rows = []
+    for what, arguments in ENTRIES.items():
+        starts = [_entry([sys.executable, *arguments], environment) for _ in range(rounds + 1)][1:]
+        seconds, core_s, resident_mb = (statistics.median(values) for values in zip(*starts, strict=True))
+        rows.append({"what": what, "seconds": seconds, "core_s": core_s, "resident_mb": resident_mb})
+    return rows
+
+
+def _entry(command: list[str], environment: dict[str, str]) -> tuple[float, float, float]:
+    """Seconds, seconds on a core and megabytes of one process."""
+    begin = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
+    _, status, used = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - begin
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0
 
 
 def startup(methods: tuple[str, ...] = ("ncc", "sift", "auto"), rounds: int = 1) -> list[Row]:
@@ -54,6 +89,7 @@ def _row(root: Path, method: str, kept: str, maps: Path, compiled: Path, rounds:
         "kept": kept,
         "parts_s": medians,
         "total_s": sum(medians.values()),
+        "resident_mb": statistics.median(start["resident_mb"] for start in starts),
         "fixed": all(start["fixed"] for start in starts),
     }
 
@@ -82,7 +118,8 @@ def measured() -> Row:
     result = matcher.locate(first.frame, first.prior)
     marks.append(time.time())
     spent = [end - begin for begin, end in itertools.pairwise(marks)]
-    return {**dict(zip(PARTS, spent, strict=True)), "fixed": isinstance(result, Fix)}
+    resident_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return {**dict(zip(PARTS, spent, strict=True)), "fixed": isinstance(result, Fix), "resident_mb": resident_mb}
 
 
 if __name__ == "__main__":

@@ -59,6 +59,11 @@ STARTUP = (
     "start after the first on a machine: compiled code and the map's features lie in caches. An interpreter "
     "that has torch loaded already spares the first two parts."
 )
+ENTRIES = (
+    "Help, completion and `import engine` alone load neither torch nor any other large package; cameras, frames "
+    "and maps need NumPy. Each is a process of its own, the median of five; *on a core* leaves out what it waited "
+    "for, and memory is the most that was resident."
+)
 
 
 def write(docs: Path, results: dict[str, Any]) -> None:
@@ -91,6 +96,7 @@ def write(docs: Path, results: dict[str, Any]) -> None:
     lines += [*_curve_table(results["tradeoff"]["curve"]), "## Table I with its tails", "", *_wrapped(TABLE_ONE)]
     lines += [*_table_one(results["tradeoff"]["table"]), "## From start to first fix", ""]
     lines += [*_startup(results["startup"]), "![seconds by part](img/latency-startup.png)", ""]
+    lines += ["## Before the first fix is asked for", "", *_entries(results["entries"])]
     (docs / "latency.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
@@ -253,12 +259,21 @@ def _startup(rows: list[Row]) -> list[str]:
             *(shown(row["parts_s"][part]) for part in PARTS),
             shown(row["total_s"]),
             max(PARTS, key=row["parts_s"].__getitem__),
+            shown(row.get("resident_mb"), ".0f"),
             "yes" if row["fixed"] else "no",
         ]
         for row in rows
     ]
-    columns = ["method", "caches", *(f"{part} s" for part in PARTS), "total s", "most of it", "fix"]
+    columns = ["method", "caches", *(f"{part} s" for part in PARTS), "total s", "most of it", "memory MB", "fix"]
     return [*_wrapped(STARTUP), *table(columns, cells)]
+
+
+def _entries(rows: list[Row]) -> list[str]:
+    cells = [
+        [f"`{row['what']}`", shown(row["seconds"]), shown(row["core_s"]), shown(row["resident_mb"], ".0f")]
+        for row in rows
+    ]
+    return [*_wrapped(ENTRIES), *table(["what", "seconds", "on a core s", "memory MB"], cells)]
 
 
 # ---------------------------------------------------------------------------------------------------- pictures

@@ -33,6 +33,7 @@ app = typer.Typer(
     help="Position fixes for a drone without GNSS: a downward camera matched against a georeferenced map.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},  # commands inherit it
 )
 map_app = typer.Typer(help="Facts about a map.")
 dataset_app = typer.Typer(help="Published data sets.")

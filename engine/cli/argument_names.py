@@ -10,7 +10,7 @@ from typing import Any
 from typer.core import TyperCommand
 
 from engine.errors import CalibrationError, EngineError, MapError
-from engine.runs.arguments import rename_arguments, rename_quoted
+from engine.runs.renaming import rename_arguments, rename_quoted
 
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 _typed: ContextVar[Mapping[str, str]] = ContextVar("typed", default=_NOTHING)

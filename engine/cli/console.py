@@ -1,28 +1,37 @@
-"""How results look: tables for people on a terminal, JSON for programs. Everything but results goes to stderr."""
+"""How results look: tables for people on a terminal, JSON for programs. Everything but results goes to stderr.
+
+rich is imported by what draws with it: neither help nor a pipe of JSON does.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
-
-from rich import box
-from rich.console import Console
-from rich.progress import Progress as Bars
-from rich.table import Table
-from rich.text import Text
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from engine.cli.argument_names import as_typed
 from engine.runs.progress import Progress
 
-_errors = Console(stderr=True, highlight=False)
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bars
+    from rich.table import Table
+
 _PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
 
 
 def say(text: str) -> None:
     """One line for a person, on standard error; never folded."""
     print(" ".join(text.split()), file=sys.stderr, flush=True)
+
+
+@cache
+def _errors() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
 
 
 class _ConsoleProgress(Progress):
@@ -35,11 +44,13 @@ class _ConsoleProgress(Progress):
         say(as_typed(text))
 
     def update(self, description: str, done: int, total: int) -> None:
-        if not _errors.is_terminal:
+        if not _errors().is_terminal:
             return
         bars = self._bars.get(description)
         if bars is None:
-            bars = self._bars[description] = Bars(console=_errors, transient=True)
+            from rich.progress import Progress as Bars
+
+            bars = self._bars[description] = Bars(console=_errors(), transient=True)
             bars.add_task(description)
             bars.start()
         bars.update(bars.task_ids[0], completed=done, total=total)
@@ -62,6 +73,10 @@ def print_json(value: Any) -> None:
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """A titled table for people on standard output; the first column is words, the others are figures."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="")
     for index, name in enumerate(columns):
         table.add_column(name, justify="left" if index == 0 else "right", no_wrap=True)
@@ -72,6 +87,9 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
 
 def print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:
     """Names and values for people on standard output, one a line; a long value is folded under itself."""
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
@@ -81,6 +99,9 @@ def print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:
 
 
 def _print(title: str, table: Table) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
     console = Console(highlight=False)
     if console.is_terminal:
         console.print(Text(title, style="bold"), soft_wrap=True)

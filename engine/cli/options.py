@@ -164,7 +164,7 @@ def corrections(
 ) -> Corrections:
     """What is done to the telemetry, by the options above."""
     from engine.formats.corrections import Corrections
-    from engine.runs.arguments import renamed_in_errors
+    from engine.runs.renaming import renamed_in_errors
 
     with renamed_in_errors(columns="column", offset_s="telemetry_offset_s"):
         return Corrections(

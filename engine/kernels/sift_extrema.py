@@ -72,7 +72,7 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
     lines = np.zeros((dogs + 1, up, source.shape[1] + 2 * _padding(across[1])), np.float32)
     sizes = np.zeros((3, dogs, width), np.float32)  # |DoG| of the last three rows
     work = np.empty((dogs + 1, width), np.float32), np.zeros((width + 7) // 8 * 8, np.uint8)
-    found, count = np.empty((256, 3), np.int64), 0
+    found, count = np.empty((256, 3), np.int64), np.int64(0)  # by a literal 0, the callee compiles twice
     for y in range(first, end):
         for level in range(dogs + 1):
             at = layout[0] + level * layout[1] + y * layout[2]
@@ -92,7 +92,10 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
 
 @compiled
 def _padding(reach):
-    return reach.max() + TAPS
+    largest = reach[0]
+    for level in range(1, reach.size):
+        largest = max(largest, reach[level])
+    return largest + TAPS
 
 
 @compiled
@@ -102,7 +105,9 @@ def _between_zeros(source, reach, first, end):
     start = first - _padding(reach)
     tall = np.zeros((end + _padding(reach) - start) * width, np.float32)
     for y in range(max(start, 0), min(end + _padding(reach), height)):
-        tall[(y - start) * width : (y - start + 1) * width] = source[y]
+        row = tall[(y - start) * width : (y - start + 1) * width]
+        for x in range(width):  # an assignment of slices would compile its message of unequal shapes
+            row[x] = source[y, x]
     return tall, start
 
 
@@ -132,7 +137,8 @@ def _across_row(out, line, level, across, gain):
     up, width = weights.shape[1], out.size
     start, taps = _padding(reach) - reach[level], _taps(reach[level], up)
     if up == 1 and reach[level] == 0:
-        out[:] = line[start : start + width]
+        for x in range(width):
+            out[x] = line[start + x]
     elif up == 1:
         _slide(out, line, start, 1, weights[level, 0], taps)
     else:

@@ -4,9 +4,14 @@ LoFTR alone, or DISK, ALIKED or SuperPoint with LightGlue; :func:`load_matcher` 
 tensors what a file holds. A weights file is opened as tensors only: a pickle that would run code is refused.
 """
 
-from engine.learned.keypoints import Extractor, Keypoints
-from engine.learned.loading import load_disk_lightglue, load_loftr, load_matcher
-from engine.learned.matchers import KeypointMatcher, Loftr, PairMatcher
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from engine.learned.keypoints import Extractor, Keypoints
+    from engine.learned.loading import load_disk_lightglue, load_loftr, load_matcher
+    from engine.learned.matchers import KeypointMatcher, Loftr
+    from engine.learned.pairs import PairMatcher
 
 __all__ = [
     "Extractor",
@@ -18,3 +23,23 @@ __all__ = [
     "load_loftr",
     "load_matcher",
 ]
+
+_NAMES = {
+    "engine.learned.keypoints": "Extractor Keypoints",
+    "engine.learned.loading": "load_disk_lightglue load_loftr load_matcher",
+    "engine.learned.matchers": "KeypointMatcher Loftr",
+    "engine.learned.pairs": "PairMatcher",
+}
+"""The public names by module. A module is imported when one of its names is used: networks need torch."""
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

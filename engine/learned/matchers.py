@@ -1,4 +1,4 @@
-"""Matchers of two pictures: what one is, LoFTR, and LightGlue on the keypoints of an extractor.
+"""Matchers of two pictures: LoFTR, and LightGlue on the keypoints of an extractor.
 
 Convention:
     Pixel centres are integers, the origin is the centre of the top-left pixel. LoFTR's cells lie on pixels 8x and
@@ -14,7 +14,6 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -24,26 +23,9 @@ from engine.errors import DtypeError, ShapeError
 from engine.learned.keypoints import Extractor, Keypoints
 
 
-class PairMatcher(Protocol):
-    """Finds the points that two pictures share."""
-
-    def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
-        """Match two pictures.
-
-        Args:
-            frame: (1, 1, H, W) float, values in [0, 1].
-            crop: (1, 1, H', W') likewise, of the map.
-
-        Returns:
-            The matched points, (M, 2) in the frame's pixels and (M, 2) in the crop's, both (x, y) with centres
-            at integers. Row by row they belong together; M may be 0.
-        """
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Loftr:
-    """LoFTR as a :class:`PairMatcher`; see :func:`engine.learned.load_loftr`.
+    """LoFTR as a :class:`engine.learned.PairMatcher`; see :func:`engine.learned.load_loftr`.
 
     Attributes:
         network: takes image0 and image1, gives keypoints0, keypoints1 and confidence.
@@ -54,7 +36,7 @@ class Loftr:
     min_confidence: float = 0.5
 
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
-        """Match two pictures; see :class:`PairMatcher`."""
+        """Match two pictures; see :class:`engine.learned.PairMatcher`."""
         _check(frame, crop)
         device = _device_of(self.network)
         with torch.inference_mode():
@@ -68,7 +50,7 @@ class Loftr:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeypointMatcher:
-    """Keypoints matched by LightGlue, as a :class:`PairMatcher`; see :func:`engine.learned.load_matcher`.
+    """A :class:`engine.learned.PairMatcher` of keypoints by LightGlue; see :func:`engine.learned.load_matcher`.
 
     Attributes:
         extractor: finds the keypoints of a picture.
@@ -81,7 +63,7 @@ class KeypointMatcher:
     max_keypoints: int = 2048
 
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
-        """Match two pictures; see :class:`PairMatcher`."""
+        """Match two pictures; see :class:`engine.learned.PairMatcher`."""
         _check(frame, crop)
         first, second = (self.extract(image, self.max_keypoints) for image in (frame, crop))
         pairs = self.match(first, _size(frame), second, _size(crop)).to(frame.device)

@@ -7,19 +7,19 @@ A method is a class derived from :class:`engine.methods.method.Method`. A new on
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from engine.errors import OptionError
-from engine.methods.auto import Auto
-from engine.methods.learned import Learned
-from engine.methods.method import Method
-from engine.methods.ncc import Ncc
-from engine.methods.paper import PaperNcc, PaperSift
-from engine.methods.sift import Sift
 
-BY_PROFILE: Mapping[str, Mapping[str, type[Method]]] = {
-    "engine": {"ncc": Ncc, "sift": Sift, "auto": Auto, "learned": Learned},
-    "paper": {"ncc": PaperNcc, "sift": PaperSift},
+if TYPE_CHECKING:
+    from engine.methods.method import Method
+
+BY_PROFILE: Mapping[str, Mapping[str, str]] = {
+    "engine": {"ncc": "ncc.Ncc", "sift": "sift.Sift", "auto": "auto.Auto", "learned": "learned.Learned"},
+    "paper": {"ncc": "paper.PaperNcc", "sift": "paper.PaperSift"},
 }
+"""The class of each method, in its module. It is imported when a matcher is made: options need no torch."""
 METHODS = tuple(BY_PROFILE["engine"])
 CLASSICAL = tuple(name for name in METHODS if name != "learned")
 """Those that need no file of weights."""
@@ -36,4 +36,6 @@ def method_type(name: str, profile: str) -> type[Method]:
     methods = BY_PROFILE[profile]
     if name not in methods:
         raise OptionError(f"method: the {profile}'s profile has {' and '.join(methods)}, got {name!r}")
-    return methods[name]
+    module, _, of_module = methods[name].partition(".")
+    found: type[Method] = getattr(import_module(f"engine.methods.{module}"), of_module)
+    return found

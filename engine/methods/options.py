@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from engine.acceptance import PeakRule
 from engine.covariance import AssumedErrors, with_map_accuracy
 from engine.errors import OptionError
-from engine.learned import PairMatcher
+from engine.learned.pairs import PairMatcher
 from engine.orthomap import OrthoMap
 from engine.pose import PoseOptions
 from engine.scores import check_score

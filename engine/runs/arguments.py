@@ -1,23 +1,17 @@
-"""Arguments of runs: positions and numbers that are read, choices that are checked; messages name the argument.
-
-The argument that a message is about stands first, before a colon; others stand in backquotes.
-"""
+"""Arguments of runs: positions and numbers that are read, choices that are checked; messages name the argument."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 
 from engine import device as devices
 from engine.budget import Budget
-from engine.errors import EngineError, OptionError
+from engine.errors import OptionError
 from engine.values import MAX_SIGMA_M, Prior
 
 START_SIGMA_M = 15.0
 """Uncertainty of a position that was given without one."""
-_QUOTED = re.compile(r"`(\w+)`")
 
 
 def parse_position(name: str, text: str | None) -> Prior | None:
@@ -128,40 +122,5 @@ def check_device(device: str) -> None:
     Raises:
         OptionError, DeviceError: see :func:`engine.device.resolve`.
     """
-    devices.resolve(device)
-
-
-@contextmanager
-def renamed_in_errors(**arguments: str) -> Iterator[None]:
-    """Within it, an error about a field of a lower object names the argument that the field came from.
-
-    Args:
-        arguments: argument by field.
-    """
-    try:
-        yield
-    except EngineError as error:
-        renamed = rename_arguments(str(error), arguments)
-        if renamed == str(error):
-            raise
-        raise type(error)(renamed) from None
-
-
-def rename_arguments(message: str, names: Mapping[str, str], quote: str = "`") -> str:
-    """A message with other names for its arguments: those before the first colon, and those in backquotes.
-
-    Args:
-        message: of an error.
-        names: new name by old one.
-        quote: around the new names of those in backquotes.
-    """
-    subject, colon, rest = message.partition(":")
-    parts = subject.split(", ")
-    if colon and all(part in names for part in parts):
-        message = f"{', '.join(names[part] for part in parts)}:{rest}"
-    return rename_quoted(message, names, quote)
-
-
-def rename_quoted(text: str, names: Mapping[str, str], quote: str = "`") -> str:
-    """A text with other names for the arguments that stand in backquotes; see :func:`rename_arguments`."""
-    return _QUOTED.sub(lambda found: f"{quote}{names[found[1]]}{quote}" if found[1] in names else found[0], text)
+    if device not in ("auto", "cpu"):  # these always are, and torch need not be asked
+        devices.resolve(device)

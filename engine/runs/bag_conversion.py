@@ -10,10 +10,11 @@ from engine.errors import OptionError
 from engine.formats.flight import open_flight
 from engine.formats.ros.bag_writer import BAG_KINDS, check_replaceable, write_bag
 from engine.formats.truth import read_truth
-from engine.runs.arguments import check_choice, renamed_in_errors
+from engine.runs.arguments import check_choice
 from engine.runs.folders import StrPath
 from engine.runs.inputs import FOLDER_LAYOUT
 from engine.runs.progress import SILENT, Progress
+from engine.runs.renaming import renamed_in_errors
 
 
 def convert_to_bag(

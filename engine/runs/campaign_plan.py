@@ -17,10 +17,11 @@ from engine.formats.datasets.sequence import MANIFEST
 from engine.formats.logs.readers import LogClock
 from engine.formats.settings import read_settings
 from engine.maps.rasters import GEOREFERENCE_TAG, stated_sigma
-from engine.runs.arguments import check_choice, renamed_in_errors
+from engine.runs.arguments import check_choice
 from engine.runs.comparison import parse_runs
 from engine.runs.inputs import FOLDER_LAYOUT, FlightFiles
 from engine.runs.jobs import Job, SimulateTask, TrackTask
+from engine.runs.renaming import renamed_in_errors
 from engine.runs.settings import TrackSettings
 from engine.runs.simulation import WorldSettings
 from engine.sim import CONDITIONS

@@ -14,13 +14,13 @@ from engine.formats.flight import Flight, open_flight, subtitles_beside
 from engine.formats.frames import VIDEO_SUFFIXES
 from engine.formats.logs.readers import LogClock, is_log, open_truth
 from engine.formats.ros.bags import is_bag
-from engine.learned import load_matcher
 from engine.orthomap import OrthoMap
-from engine.runs.arguments import is_in_degrees, parse_bounds, parse_position, renamed_in_errors
+from engine.runs.arguments import is_in_degrees, parse_bounds, parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_gimbal, check_needs, check_pictures, check_position, check_start
 from engine.runs.folders import StrPath
 from engine.runs.progress import SILENT, Progress
+from engine.runs.renaming import renamed_in_errors
 from engine.runs.settings import TrackSettings
 from engine.values import MAX_SIGMA_M, Truth
 
@@ -212,6 +212,8 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     for settings in runs:
         check_needs(flight, settings.method, settings.profile)
         if settings.method == "learned":
+            from engine.learned import load_matcher
+
             load_matcher(settings.learned.weights, device="cpu")
         start = parse_position("start", settings.start)
         check_position("start", start, site, OptionError)

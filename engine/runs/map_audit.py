@@ -18,10 +18,11 @@ from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
 from engine.orthomap import SEARCH_LIMIT_PX, OrthoMap
-from engine.runs.arguments import parse_circle, renamed_in_errors
+from engine.runs.arguments import parse_circle
 from engine.runs.folders import StrPath, check_folder, prepare_folder
 from engine.runs.inputs import open_map
 from engine.runs.progress import SILENT, Progress
+from engine.runs.renaming import renamed_in_errors
 
 OWNED = ("matchability.tif", "audit.png", "summary.json")
 NODATA = -1.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import re
-from importlib import metadata
 from typing import Any
 
 import typer
@@ -54,6 +53,8 @@ def examine() -> tuple[dict[str, Any], bool]:
 
 def requirements() -> tuple[list[str], dict[str, list[str]]]:
     """The packages that the engine needs, and by extra those that it can use, as its installation states them."""
+    from importlib import metadata
+
     needed: list[str] = []
     extras: dict[str, list[str]] = {}
     for text in metadata.requires(_DISTRIBUTION) or ():
@@ -68,6 +69,8 @@ def requirements() -> tuple[list[str], dict[str, list[str]]]:
 
 
 def _version(name: str) -> str | None:
+    from importlib import metadata
+
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

@@ -1,0 +1,77 @@
+"""Help and completion: for every command, and without the packages that only its work needs."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.main import get_command
+
+from engine.cli.app import app, run
+from engine.formats.geotiff import write_geotiff
+from tests.support.paths import ROOT
+
+HEAVY = ("torch", "numba", "numpy", "cv2", "rasterio", "pyproj", "matplotlib", "kornia", "PIL", "rich")
+MATCHING = ("torch", "numba", "kornia", "matplotlib")
+
+
+def commands(group, path=()):
+    """Every command by its words, groups too."""
+    yield path
+    for name, command in getattr(group, "commands", {}).items():
+        yield from commands(command, (*path, name))
+
+
+COMMANDS = list(commands(get_command(app)))
+
+
+def loaded_after(lines):
+    """What a new interpreter printed by these commands, and the packages that it has loaded by then."""
+    program = (
+        "import json, sys; from engine.cli.app import run; "
+        f"codes = [run(line) for line in {lines}]; assert not any(codes), codes; "
+        "print('LOADED', json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True)
+    printed, _, loaded = done.stdout.partition("LOADED ")
+    return printed, set(json.loads(loaded))
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda words: " ".join(words) or "scenematch")
+def test_h_is_help(command, capsys):
+    assert run([*command, "-h"]) == 0
+    short = capsys.readouterr().out
+    assert run([*command, "--help"]) == 0
+    assert capsys.readouterr().out == short
+    assert "-h, --help" in short
+
+
+def test_help_of_every_command_loads_nothing_that_only_its_work_needs():
+    printed, loaded = loaded_after([[*command, "--help"] for command in COMMANDS])
+    assert printed.count("Usage: scenematch") == len(COMMANDS)
+    assert not loaded.intersection(HEAVY)
+
+
+def test_completion_loads_nothing_that_only_work_needs():
+    program = (
+        "import atexit, sys; atexit.register(lambda: print('HEAVY', "
+        f"[name for name in {HEAVY} if name in sys.modules])); "
+        "sys.argv[0] = 'scenematch'; from engine.cli import main; main()"
+    )
+    asked = {"_SCENEMATCH_COMPLETE": "complete_bash", "COMP_WORDS": "scenematch bridge mavl", "COMP_CWORD": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True, text=True, cwd=ROOT, check=True, env=os.environ | asked,
+    )  # fmt: skip
+    assert done.stdout.split("HEAVY")[0].split() == ["mavlink", "mavlink-params"]
+    assert done.stdout.endswith("HEAVY []\n")
+
+
+def test_commands_that_match_nothing_load_no_torch(tmp_path):
+    site, affine = tmp_path / "m.tif", [[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_000_000.0]]
+    write_geotiff(site, np.full((500, 500), 9, np.uint8), affine, 32633)
+    printed, loaded = loaded_after([["init", f"--out={tmp_path / 's.toml'}"], ["map", "info", str(site)]])
+    assert "gsd_m_per_px" in printed
+    assert not loaded.intersection(MATCHING)
