@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from engine import kernels
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.kernels import ncc as kernels
 from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit
 from engine.values import Peak
 

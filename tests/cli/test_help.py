@@ -14,7 +14,7 @@ from engine.formats.geotiff import write_geotiff
 from tests.support.paths import ROOT
 
 HEAVY = ("torch", "numba", "numpy", "cv2", "rasterio", "pyproj", "matplotlib", "kornia", "PIL", "rich")
-MATCHING = ("torch", "numba", "kornia", "matplotlib")
+MATCHING = ("torch", "kornia", "matplotlib")
 
 
 def commands(group, path=()):

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine import kernels
 from engine.kernels import eager, reference
+from engine.kernels import ncc as kernels
 
 KERNELS = {"dispatch": kernels.ncc_surface, "eager": eager.ncc_surface}
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}

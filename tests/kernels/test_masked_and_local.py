@@ -9,7 +9,8 @@ import pytest
 import torch
 from skimage.registration._masked_phase_cross_correlation import cross_correlate_masked
 
-from engine import DtypeError, OptionError, ShapeError, kernels
+from engine import DtypeError, OptionError, ShapeError
+from engine.kernels import ncc as kernels
 from engine.kernels import reference
 from engine.ncc_fft import ncc
 

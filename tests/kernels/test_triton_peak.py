@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-from engine import kernels
 from engine.errors import ShapeError
 from engine.kernels import eager
+from engine.kernels import ncc as kernels
 from engine.ncc_fft import _peak_on_device, match_template, prepare, surface
 from engine.peaks import find_peak
 
