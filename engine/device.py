@@ -5,6 +5,7 @@ torch is imported by what uses it: arguments are checked, and live frames queued
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 _WORKER = "scenematch-worker"
+_chosen = threading.Event()  # whether the number of threads was chosen, for the whole process as torch's is
 
 
 def resolve(device: str | torch.device = "auto") -> torch.device:
@@ -57,7 +59,10 @@ def synchronise(device: torch.device) -> None:
 
 
 def set_threads(count: int) -> None:
-    """Set the number of threads of torch and of OpenCV.
+    """Set the number of threads of torch and of OpenCV, before or after a matcher is made.
+
+    Without it, and without ``OMP_NUM_THREADS``, the first matcher sets one: where other work shares the processor,
+    several threads wait for each other, and frames come late.
 
     Raises:
         OptionError: ``count`` is below 1.
@@ -67,8 +72,15 @@ def set_threads(count: int) -> None:
 
     if count < 1:
         raise OptionError(f"threads: expected 1 or more, got {count}")
+    _chosen.set()
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
+
+
+def default_threads() -> None:
+    """One thread, unless somebody chose otherwise; see :func:`set_threads`."""
+    if not _chosen.is_set() and "OMP_NUM_THREADS" not in os.environ:
+        set_threads(1)
 
 
 def parts(size: int, max_count: int) -> list[tuple[int, int]]:

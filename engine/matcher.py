@@ -70,6 +70,7 @@ class SceneMatcher:
         self.camera = camera
         self.method = method
         self.device = devices.resolve(device)
+        devices.default_threads()
         self._method: Method = build(site, self.device, self.options)
         self._costs = Costs()
         # What an undistorted picture obeys; the mount stays.

@@ -4,14 +4,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from engine import Camera, Navigator, OrthoMap, Prior, SceneMatcher, set_threads
+from engine import Camera, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions, NedOrigin, parse_connection
 from engine.adapters.pictures import capture, replay
 
 if not 5 <= len(sys.argv) <= 6:
     sys.exit(__doc__)
 firmware, link, lat, lon, *cameras = sys.argv[1:]  # ardupilot, udpin:127.0.0.1:14550, where it takes off, 0
-set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()

@@ -3,12 +3,11 @@
 import sys
 from importlib import import_module
 
-from engine import Camera, Navigator, OrthoMap, SceneMatcher, set_threads
+from engine import Camera, Navigator, OrthoMap, SceneMatcher
 from engine.adapters.ros import RosBridge, RosOptions, RosTopics
 
 if sys.argv[1:2] not in (["1"], ["2"]):
     sys.exit(__doc__)
-set_threads(1)  # more threads wait for each other on a busy processor
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()

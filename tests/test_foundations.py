@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
+import os
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -320,3 +323,32 @@ def test_the_tree_of_errors_is_whole():
     for name, value in vars(engine.errors).items():
         if isinstance(value, type) and issubclass(value, engine.errors.EngineError):
             assert name in drawn
+
+
+def test_a_matcher_takes_one_thread_unless_somebody_chose():
+    """In processes of their own: the number of threads is the process's."""
+    program = """
+import numpy as np, torch, cv2, sys
+from engine import Camera, OrthoMap, SceneMatcher, set_threads
+if "before" in sys.argv:
+    set_threads(2)
+gray = np.zeros((200, 200), np.uint8)
+site = OrthoMap.from_arrays(gray, [[0.5, 0.0, 500000.0], [0.0, -0.5, 5000000.0]], "EPSG:32633")
+SceneMatcher(site, Camera.from_fov(100, 100, 60.0), "ncc", "cpu")
+if "after" in sys.argv:
+    set_threads(2)
+SceneMatcher(site, Camera.from_fov(100, 100, 60.0), "ncc", "cpu")
+print(torch.get_num_threads(), cv2.getNumThreads())
+"""
+    bare = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+
+    def threads(*words, **environment):
+        done = subprocess.run(
+            [sys.executable, "-c", program, *words],
+            capture_output=True, text=True, check=True, env=bare | environment,
+        )  # fmt: skip
+        return done.stdout.split()
+
+    assert threads() == ["1", "1"]
+    assert threads("before") == threads("after") == ["2", "2"]
+    assert threads(OMP_NUM_THREADS="2")[0] == "2"
