@@ -9,7 +9,8 @@ import pytest
 
 from engine.camera import mount_rotation
 from engine.diagnosis import diagnose
-from engine.diagnosis.causes import Told, findings, is_known
+from engine.diagnosis.causes import findings, is_known
+from engine.diagnosis.findings import Told
 from engine.diagnosis.sightings import Sighting
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.sim import plan_flight
@@ -29,7 +30,8 @@ PLACES = np.concatenate([[[0.0, 0.0]], np.cumsum(0.5 * (VELOCITY[1:] + VELOCITY[
 def told(**changes):
     nothing = np.full((N, 2), np.nan)
     return replace(
-        Told(TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, nothing, np.full(N, np.nan), mount_rotation()), **changes
+        Told(TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, nothing, np.full(N, np.nan), mount_rotation(), 260.0),
+        **changes,
     )
 
 
@@ -53,6 +55,22 @@ def cause_of(**changes):
 def test_what_fits_is_not_doubted():
     for _ in range(50):
         assert findings(told(), seen(), 1.0) == []
+
+
+@pytest.mark.parametrize(("forward_m", "right_m"), [(-6.0, 7.0), (0.0, 9.0), (14.0, 3.0)])
+def test_an_optical_centre_that_is_off_is_named_with_its_pixels(forward_m, right_m):
+    """Places are off with the heading: by focal length over height it is so many pixels of the picture."""
+    off = []
+    for one in seen(outliers=0):
+        heading = np.radians(one.attitude.heading_deg)
+        ahead, aside = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
+        off.append(replace(one, en_m=one.en_m + forward_m * ahead + right_m * aside))
+    (found,) = findings(told(), off, 1.0)
+    assert found.cause == "mount"
+    assert found.value == pytest.approx(np.degrees(np.arctan2(np.hypot(forward_m, right_m), 120.0)), abs=1.0)
+    column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
+    assert column == pytest.approx(-right_m * 260.0 / 120.0, abs=4.0)
+    assert row == pytest.approx(forward_m * 260.0 / 120.0, abs=4.0)
 
 
 @pytest.mark.parametrize(

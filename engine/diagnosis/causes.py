@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import MOUNTS, mount_rotation
+from engine.diagnosis.findings import Array, Finding, Told
 from engine.diagnosis.sightings import Sighting
+from engine.diagnosis.ways import optical_centre, velocity
 from engine.geo import enu_from_body
-
-Array = NDArray[np.float64]
 
 _SIGMA_DEG = np.array([1.2, 1.2, 1.5])  # of an attitude by features alone, against the telemetry's
 _OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
@@ -25,70 +23,6 @@ _HEIGHT_SHARE, _HEIGHT_M = 0.02, 1.5  # of a height by features alone
 _LEAST = 3
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
-_VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": _FEET}
-_MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
-_VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something that does not fit, and the change that would make it fit.
-
-    Attributes:
-        cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "mount",
-            "height", "height_feet", "focal", "clock", "velocity", "stamps", "frozen", "mirrored", "map"; or
-            "attitude" where none of the changes explains what does not fit.
-        text: a sentence with the figures.
-        cure: the option to try, or what to look at.
-        value: of the error in the unit of the text; None where it has none.
-        sigma: standard deviation of the value.
-    """
-
-    cause: str
-    text: str
-    cure: str
-    value: float | None = None
-    sigma: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """What was found of a flight's inputs.
-
-    Attributes:
-        findings: the strongest first; empty where everything fits.
-        looked_at: pictures that were looked at.
-        seen: of them, those whose pose the picture showed by itself.
-        compared: what of the telemetry was known and held against them.
-    """
-
-    findings: list[Finding]
-    looked_at: int
-    seen: int
-    compared: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Told:
-    """What the telemetry says at every picture of a flight; NaN where it says nothing.
-
-    Attributes:
-        time_s: (N,) of the pictures.
-        angles_deg: (N, 3) roll, pitch and heading.
-        height_m: (N,) above the ground.
-        velocity_mps: (N, 2) east and north.
-        reference_m: (N, 2) positions of another source, on the map's axes.
-        reference_sigma_m: (N,) of them.
-        mount: (3, 3) of the calibration.
-    """
-
-    time_s: Array
-    angles_deg: Array
-    height_m: Array
-    velocity_mps: Array
-    reference_m: Array
-    reference_sigma_m: Array
-    mount: Array = field(repr=False)
 
 
 def findings(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
@@ -101,7 +35,11 @@ def findings(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> list[F
     """
     if len(seen) < _LEAST:
         return []
-    tries = (_attitude(told, seen), _height(told, seen), _velocity(told, seen), _place(told, seen, map_sigma_m))
+    turning = optical_centre(told, seen)
+    tries = (
+        _attitude(told, seen), _height(told, seen), turning or velocity(told, seen),
+        _place(told, seen, map_sigma_m),
+    )  # fmt: skip
     return [found for found in tries if found is not None]
 
 
@@ -317,63 +255,7 @@ def _height(told: Told, seen: Sequence[Sighting]) -> Finding | None:
     return Finding("height", text, f"--height-offset-m {off_m:+.1f}", off_m, sigma_m)
 
 
-# ------------------------------------------------------------------------------------- velocity, position
-
-
-def _velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
-    legs = [_leg(told, a, b) for a, b in pairwise(seen)]
-    known = [leg for leg in legs if leg is not None]
-    if len(known) < _LEAST:
-        return None
-    moved, reckoned, sigma = (np.array(column) for column in zip(*known, strict=True))
-    sigma = sigma[:, None]
-
-    def cost(expected: Array) -> float:
-        return float(np.minimum(((moved - expected) / sigma) ** 2, _OUTLIER).mean())
-
-    tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
-              "--column east_velocity_mps=north_velocity_mps --column north_velocity_mps=east_velocity_mps"),
-             (cost(-reckoned), "the velocity has the other sign",
-              "--column east_velocity_mps=-east_velocity_mps "
-              "--column north_velocity_mps=-north_velocity_mps")]  # fmt: skip
-    tried += [
-        (cost(factor * reckoned), f"the velocity is in {unit}",
-         " ".join(f'--column "{n}_velocity_mps={factor:.4g}*{n}_velocity_mps"' for n in ("east", "north")))
-        for unit, factor in _VELOCITY_FACTORS.items()
-    ]  # fmt: skip
-    square = float((reckoned**2).sum())
-    factor = float(np.median((moved * reckoned).sum(axis=1) / np.maximum((reckoned**2).sum(axis=1), 1e-9)))
-    if square > 0.0 and factor > 0.0:
-        text = f"the vehicle moves {factor:.2f} times as far between pictures as velocity and stamps say"
-        tried.append(
-            (
-                cost(factor * reckoned) + 0.1,
-                text,
-                "look at the frame rate, the stamps and the unit of the velocity",
-            )
-        )
-    best, text, cure = min(tried, key=lambda row: row[0])
-    if cost(reckoned) < _MISFIT:
-        return None
-    if best > cost(reckoned) - _GAIN:
-        text = "velocity and stamps do not fit the ways between the pictures, and no single change would make them"
-        return Finding("velocity", text, "look at the velocity and the stamps")
-    return Finding("velocity", text, cure, factor)
-
-
-def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
-    """The movement between two sightings, the one that the velocity says, and the standard deviation of both."""
-    between = slice(a.index, b.index + 1)
-    time_s, velocity = told.time_s[between], told.velocity_mps[between]
-    seconds = float(time_s[-1] - time_s[0])
-    if not (np.isfinite(velocity).all() and np.isfinite(time_s).all()) or not seconds > 0.0:
-        return None
-    reckoned = np.asarray(np.trapezoid(velocity, time_s, axis=0), np.float64)
-    moved = b.en_m - a.en_m
-    if seconds > _MAX_LEG_S or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
-        return None
-    coarse_m = _ACCELERATION_MPS2 / 12.0 * float((np.diff(time_s) ** 2).sum())  # of the trapezoids
-    return moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m)
+# ---------------------------------------------------------------------------------------------- position
 
 
 def _place(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.covariance import map_sigma_of
-from engine.diagnosis.causes import Diagnosis, Finding, Told, findings, is_known
+from engine.diagnosis.causes import findings, is_known
+from engine.diagnosis.findings import Diagnosis, Finding, Told
 from engine.diagnosis.sightings import sight
 from engine.evidence import position_of
 from engine.orthomap import OrthoMap
@@ -114,6 +115,7 @@ def _told(
         reference_m=np.array([[np.nan, np.nan] if place is None else place.en_m for place in places], np.float64),
         reference_sigma_m=np.array([np.nan if place is None else place.sigma_m for place in places], np.float64),
         mount=camera.mount,
+        focal_px=camera.focal_px,
     )
 
 

@@ -39,17 +39,18 @@ class SampleMap:
         self.created = 0
         """Cells sampled so far."""
 
-    def find(self, window: Window, level: int) -> Samples:
-        """At most about :data:`MAX_SAMPLES` samples of a window.
+    def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
+        """Samples of a window.
 
         Args:
             window: in pixels of the level, inside it, at least :data:`BLOCK_PX` wide and high.
             level: of the map's pyramid.
+            max_samples: about as many at most.
 
         Returns:
             Samples: in metres east, north and up.
         """
-        step = math.ceil(window.area_px / BLOCK_PX**2 / MAX_SAMPLES)
+        step = math.ceil(window.area_px / BLOCK_PX**2 / max_samples)
         parts = []
         for cell in self._cells_under(window, level):
             samples, shape = self._cell(cell, level)

@@ -14,7 +14,7 @@ from engine.acceptance import are_consistent
 from engine.align import shrink
 from engine.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, correlation_at, covariance_of, refine
 from engine.geo import attitude_from_rotation
-from engine.indexes.samples import BLOCK_PX, SampleMap
+from engine.indexes.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
 from engine.scores import enhance
@@ -37,6 +37,7 @@ _UNCONFIRMED_TILT_DEG = 1.5
 # Standard deviations of an attitude that the picture does not confirm.
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
+_COARSE_SAMPLES = 800  # of a coarser level
 _LAST_STEP, _LAST_STEP_COARSE = 0.2, 0.5  # in standard deviations: a coarser level only has to come near
 
 
@@ -130,7 +131,8 @@ class Refinement:
             if window is None:
                 fit = None
                 continue
-            picture, ground = self._enhanced_frame(height_m, level), self.samples.find(window, level)
+            picture = self._enhanced_frame(height_m, level)
+            ground = self.samples.find(window, level, MAX_SAMPLES if level == own else _COARSE_SAMPLES)
             if level == own:
                 min_correlation = max(correlation_at(picture, ground, prior.pose), min_correlation)
             if not has_tilt and fit is None:

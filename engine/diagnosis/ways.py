@@ -1,0 +1,139 @@
+"""Ways between sightings, against the velocity: its unit and axes, and places that move with the heading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from engine.diagnosis.findings import Array, Finding, Told
+from engine.diagnosis.sightings import Sighting
+
+_OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
+_MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
+_GAIN = 0.6  # by which a change must lessen it
+_LEAST = 3
+_VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048}
+# Of places that move with the heading: by how much they lessen the cost, to which share, and what is named at all.
+_TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_LEAST_DEG = 0.35, 2.5, 4.0, 1.2
+_LEAST_COST = 0.1
+_MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
+_VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
+
+
+def velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+    """The unit, the axes and the sign of a velocity that does not fit the ways between sightings."""
+    legs = _legs(told, seen)
+    if legs is None:
+        return None
+    moved, reckoned, sigma, _ = legs
+    sigma = sigma[:, None]
+
+    def cost(expected: Array) -> float:
+        return float(np.minimum(((moved - expected) / sigma) ** 2, _OUTLIER).mean())
+
+    tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
+              "--column east_velocity_mps=north_velocity_mps --column north_velocity_mps=east_velocity_mps"),
+             (cost(-reckoned), "the velocity has the other sign",
+              "--column east_velocity_mps=-east_velocity_mps "
+              "--column north_velocity_mps=-north_velocity_mps")]  # fmt: skip
+    tried += [
+        (cost(factor * reckoned), f"the velocity is in {unit}",
+         " ".join(f'--column "{n}_velocity_mps={factor:.4g}*{n}_velocity_mps"' for n in ("east", "north")))
+        for unit, factor in _VELOCITY_FACTORS.items()
+    ]  # fmt: skip
+    square = float((reckoned**2).sum())
+    factor = float(np.median((moved * reckoned).sum(axis=1) / np.maximum((reckoned**2).sum(axis=1), 1e-9)))
+    if square > 0.0 and factor > 0.0:
+        text = f"the vehicle moves {factor:.2f} times as far between pictures as velocity and stamps say"
+        tried.append(
+            (
+                cost(factor * reckoned) + 0.1,
+                text,
+                "look at the frame rate, the stamps and the unit of the velocity",
+            )
+        )
+    best, text, cure = min(tried, key=lambda row: row[0])
+    if cost(reckoned) < _MISFIT:
+        return None
+    if best > cost(reckoned) - _GAIN:
+        text = "velocity and stamps do not fit the ways between the pictures, and no single change would make them"
+        return Finding("velocity", text, "look at the velocity and the stamps")
+    return Finding("velocity", text, cure, factor)
+
+
+def _legs(told: Told, seen: Sequence[Sighting]) -> tuple[Array, Array, Array, Array] | None:
+    """The legs between sightings: movements (N, 2), the velocity's, sigmas (N,), and what turned (N, 2, 2)."""
+    known = [(a, b, leg) for a, b in pairwise(seen) if (leg := _leg(told, a, b)) is not None]
+    if len(known) < _LEAST:
+        return None
+    moved, reckoned, sigma = (np.array(column) for column in zip(*(leg for _, _, leg in known), strict=True))
+    turned = np.array([_heading_rotation(b) - _heading_rotation(a) for a, b, _ in known])
+    return moved, reckoned, sigma, turned
+
+
+def _heading_rotation(seen: Sighting) -> Array:
+    """(2, 2) from forward and right to east and north."""
+    heading = math.radians(seen.attitude.heading_deg)
+    sine, cosine = math.sin(heading), math.cos(heading)
+    return np.array([[sine, cosine], [cosine, -sine]])
+
+
+def optical_centre(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+    """Places that are off forwards or to the right: at every turn of the vehicle they move."""
+    legs = _legs(told, seen)
+    if legs is None:
+        return None
+    moved, reckoned, sigma, turned = legs
+    rows = (turned / sigma[:, None, None]).reshape(-1, 2)
+    off = ((moved - reckoned) / sigma[:, None]).ravel()
+    near = np.abs(off) < 3.0 * _OUTLIER**0.5
+    information = rows[near].T @ rows[near]
+    if float(np.linalg.eigvalsh(information)[0]) <= 0.0:
+        return None
+    aside_m = np.linalg.solve(information, rows[near].T @ off[near])
+
+    def cost(left: Array) -> float:
+        return float(np.minimum(left**2, _OUTLIER).mean())
+
+    as_told, best = cost(off), cost(off - rows @ aside_m)
+    height_m = float(np.median([one.height_agl_m for one in seen]))
+    # Legs are mostly better known than is assumed of them.
+    sigma_m = math.sqrt(max(best, _LEAST_COST) * float(np.trace(np.linalg.inv(information))))
+    size_m = float(np.hypot(*aside_m))
+    aside_deg = math.degrees(math.atan2(size_m, height_m))
+    if as_told - best < _TURNING_GAIN or best > as_told / _TURNING_RATIO:
+        return None
+    if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
+        return None
+    return _named(aside_m, sigma_m, height_m, told)
+
+
+def _named(aside_m: Array, sigma_m: float, height_m: float, told: Told) -> Finding:
+    size_m = float(np.hypot(*aside_m))
+    off_px = told.focal_px / height_m * (told.mount.T @ [*aside_m, 0.0])[:2]
+    text = (
+        f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of where they are, whichever way "
+        "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
+    )
+    cure = f"look at the calibration: cx and cy would be {-off_px[0]:+.0f} and {-off_px[1]:+.0f} px other"
+    return Finding(
+        "mount", text, cure, math.degrees(math.atan2(size_m, height_m)), math.degrees(sigma_m / height_m)
+    )
+
+
+def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
+    """The movement between two sightings, the one that the velocity says, and the standard deviation of both."""
+    between = slice(a.index, b.index + 1)
+    time_s, velocity = told.time_s[between], told.velocity_mps[between]
+    seconds = float(time_s[-1] - time_s[0])
+    if not (np.isfinite(velocity).all() and np.isfinite(time_s).all()) or not seconds > 0.0:
+        return None
+    reckoned = np.asarray(np.trapezoid(velocity, time_s, axis=0), np.float64)
+    moved = b.en_m - a.en_m
+    if seconds > _MAX_LEG_S or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
+        return None
+    coarse_m = _ACCELERATION_MPS2 / 12.0 * float((np.diff(time_s) ** 2).sum())  # of the trapezoids
+    return moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m)
