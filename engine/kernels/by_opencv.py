@@ -1,6 +1,6 @@
 """NCC on the CPU: OpenCV's transforms in blocks that fit the cache, and compiled loops around them.
 
-In float32 OpenCV's transforms take half the time of MKL's, and less than those of its own ``matchTemplate``, most
+In float32 OpenCV's transforms take as little as half of MKL's time, and less than those of ``matchTemplate``, most
 of which are in float64. Weak patches in a window of strong contrast need float64, and their blocks get it.
 """
 
