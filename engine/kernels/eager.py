@@ -6,6 +6,7 @@ that wrap around are never returned. The denominator comes from running sums in 
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import cv2
@@ -13,16 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from engine.errors import OptionError
+
 # A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
 # norm of a patch: where a patch's norm is smaller than the window's by this factor, the transform is in float64.
-_FLOAT32_NORM_RATIO = 16.0
+FLOAT32_NORM_RATIO = 16.0
 # A patch is flat where its sum of squares is below this share of the window's, which is rounding.
 _FLAT_SHARE = 1e-12
 # Windows of more pixels than this are processed in blocks where the templates are much smaller.
 _MIN_BLOCKED_PX = 1 << 21
 # Least side of these blocks.
 _MIN_BLOCK_PX = 256
-_SMALL_PX = 1 << 16
 # Lower bound on a template's norm; a template of zeros scores 0.
 _TINY = 1e-12
 # Upper bound on the numbers in the product spectra of a group of templates, which bounds the memory.
@@ -42,6 +44,12 @@ def fast_length(n: int) -> int:
             three *= 3
         five *= 5
     return best
+
+
+def check_finite(name: str, tensor: Tensor) -> None:
+    """Raise an OptionError where a value is NaN or infinity; a finite sum implies none, and is faster."""
+    if not (math.isfinite(float(tensor.detach().sum())) or bool(torch.isfinite(tensor).all())):
+        raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 
 
 def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
@@ -70,7 +78,7 @@ def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
     window_energy = float(sums[1, -1, -1])
     flat = energy <= _FLAT_SHARE * window_energy
     energy.masked_fill_(flat, torch.inf)
-    single = search.dtype != torch.float64 and window_energy <= _FLOAT32_NORM_RATIO**2 * float(energy.min())
+    single = search.dtype != torch.float64 and window_energy <= FLOAT32_NORM_RATIO**2 * float(energy.min())
     work = torch.float32 if single else torch.float64
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
     normal = (templates / norm.clamp_min(_TINY)).to(work)  # a flat template is all zeros, and scores 0 everywhere
@@ -154,18 +162,6 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
     Returns:
         (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    # On small surfaces on the CPU the overhead of a torch call exceeds its work.
-    if sums.device.type == "cpu" and sums[0].numel() <= _SMALL_PX:
-        s = sums.numpy()
-        boxes = s[:, h:, w:] - s[:, :-h, w:]
-        boxes -= s[:, h:, :-w]
-        boxes += s[:, :-h, :-w]
-        total, square = boxes
-        square -= np.square(total, out=total) * (1.0 / (h * w))
-        floor = _FLAT_SHARE * (s[1, -1, -1] - s[1, 0, 0])
-        if square.min() <= floor:
-            square[square <= floor] = np.inf
-        return torch.from_numpy(np.reciprocal(np.sqrt(square, out=square), out=square).astype(np.float32))
     energy = box_energy(sums, h, w)
     floor = _FLAT_SHARE * (sums[1, -1, -1] - sums[1, 0, 0])  # no less than the window's own energy
     return energy.masked_fill_(energy <= floor, torch.inf).float().rsqrt_()

@@ -1,0 +1,256 @@
+"""NCC on the CPU: OpenCV's transforms in blocks that fit the cache, and compiled loops around them.
+
+In float32 OpenCV's transforms take as little as half of MKL's time, and less than those of ``matchTemplate``, most
+of which are in float64. Weak patches in a window of strong contrast need float64, and their blocks get it.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from engine.device import in_parallel
+from engine.errors import OptionError
+from engine.kernels import surface_loops
+from engine.kernels.eager import FLOAT32_NORM_RATIO, fast_length
+
+FloatImage = NDArray[np.float32]
+
+# Transforms of longer sides leave the cache, and cost twice as much per pixel.
+_CACHED_SIDE = 1152
+_MAX_BLOCKS = 16  # along one axis
+# Numbers per array that a thread keeps for the next call: those of a whole block.
+_MAX_KEPT = 2 * _CACHED_SIDE**2
+
+
+def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
+    """NCC by equation 1.
+
+    Args:
+        search: (B, H, W) float32.
+        templates: (B, T, h, w) float32.
+        zero_mean: subtract the means first.
+
+    Returns:
+        (B, T, H-h+1, W-w+1) float32 in [-1, 1]; 0 where patch or template is flat.
+
+    Raises:
+        OptionError: NaN or infinity, which show in sums that are needed anyway.
+    """
+    (B, H, W), (T, h, w) = search.shape, templates.shape[1:]
+    windows, pictures = np.ascontiguousarray(search.numpy()), np.ascontiguousarray(templates.numpy())
+    out = np.empty((B, T, H - h + 1, W - w + 1), np.float32)
+    (ny, rows), (nx, columns) = _division(H - h + 1, h), _division(W - w + 1, w)
+
+    def one_pair(b: int) -> None:
+        _one_pair(out[b, 0], windows[b], pictures[b, 0], zero_mean, (rows, columns))
+
+    def one_window(b: int) -> None:
+        mean, energy = surface_loops.moments(windows[b], zero_mean)
+        models = [surface_loops.unit(picture, zero_mean) for picture in pictures[b]]
+        _check_finite("search", energy)
+        _check_finite("templates", sum(energy for _, energy in models))
+        inverse_norms = surface_loops.inverse_norms(windows[b], mean, energy, h, w, zero_mean)
+        _correlate(out[b], windows[b], (mean, energy), inverse_norms, [model for model, _ in models])
+
+    in_parallel(one_pair if ny == nx == T == 1 else one_window, range(B))
+    return torch.from_numpy(out)
+
+
+def _check_finite(name: str, energy: float) -> None:
+    if not math.isfinite(energy):
+        raise OptionError(f"{name}: expected finite values, got NaN or infinity")
+
+
+def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
+    """Reciprocal norm about the mean of every patch (h, w): (H-h+1, W-w+1) float32, 0 where flat."""
+    return torch.from_numpy(surface_loops.inverse_norms_of(sums.numpy(), h, w))
+
+
+def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
+    """Zero-mean NCC with a picture whose patches' norms are known.
+
+    Args:
+        image: (H, W) float32, its mean small against its standard deviation.
+        inverse_norms: (H-h+1, W-w+1) float32, 0 where a patch is flat.
+        templates: (T, h, w) float32 of zero mean.
+
+    Returns:
+        (T, H-h+1, W-w+1) float32 in [-1, 1].
+    """
+    out = np.empty((len(templates), *inverse_norms.shape), np.float32)
+    models = [surface_loops.unit(picture, False)[0] for picture in np.ascontiguousarray(templates.numpy())]
+    window = image.numpy()
+    _correlate(out, window, surface_loops.moments(window, False), inverse_norms.numpy(), models)
+    return torch.from_numpy(out)
+
+
+class _Block(NamedTuple):
+    """Part of a window and where its scores lie on the surface."""
+
+    values: FloatImage
+    is_spectrum: bool
+    rows: slice
+    columns: slice
+
+
+def _correlate(
+    out: FloatImage,
+    window: FloatImage,
+    moments: tuple[float, float],
+    inverse_norms: FloatImage,
+    models: list[FloatImage],
+) -> None:
+    """Write the scores of all templates to ``out`` (T, H-h+1, W-w+1)."""
+    (height, width), (h, w) = out.shape[1:], models[0].shape
+    (ny, rows), (nx, columns) = _division(height, h), _division(width, w)
+    size, mean = (rows, columns), moments[0]
+    if ny == nx == len(models) == 1:
+        packed, energy = _scratch("packed", (*size, 2)), moments[1]
+        surface_loops.pack(packed, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, models[0])
+        _finish_pair(out[0], packed, window, moments, inverse_norms, float(inverse_norms.max()), models[0])
+        return
+
+    def prepared(index: int) -> _Block:
+        y, x = index // nx * (rows - h + 1), index % nx * (columns - w + 1)
+        part = slice(y, min(y + rows - h + 1, height)), slice(x, min(x + columns - w + 1, width))
+        return _block(window[y : y + rows, x : x + columns], mean, size, inverse_norms[part], part)
+
+    blocks = in_parallel(prepared, range(ny * nx))
+
+    def one_template(t: int) -> None:
+        spectrum = _spectrum(models[t], size) if any(block.is_spectrum for block in blocks) else None
+
+        def one_block(block: _Block) -> None:
+            part = block.rows, block.columns
+            _write_scores(out[t][part], block, models[t], spectrum, inverse_norms[part])
+
+        in_parallel(one_block, blocks)
+
+    in_parallel(one_template, range(len(models)))
+
+
+def _one_pair(
+    out: FloatImage, window: FloatImage, template: FloatImage, zero_mean: bool, size: tuple[int, int]
+) -> None:
+    """Write the scores of one template in a window of one block to ``out`` (H-h+1, W-w+1)."""
+    packed = _scratch("packed", (*size, 2))
+    moments, squares, model, inverse_norms, largest = surface_loops.packed_pair(
+        packed, window, template, zero_mean
+    )
+    _check_finite("search", moments[1])
+    _check_finite("templates", squares)
+    _finish_pair(out, packed, window, moments, inverse_norms, largest, model)
+
+
+def _finish_pair(
+    out: FloatImage,
+    packed: FloatImage,
+    window: FloatImage,
+    moments: tuple[float, float],
+    inverse_norms: FloatImage,
+    largest: float,
+    model: FloatImage,
+) -> None:
+    """The scores of what :func:`surface_loops.pack` wrote: both pictures in one transform, of equal norm."""
+    mean, energy = moments
+    if energy * largest**2 > FLOAT32_NORM_RATIO**2:
+        _write_exactly(out, window - np.float32(mean), model, inverse_norms)
+        return
+    products = _scratch("products", packed.shape[:2])
+    cv2.dft(packed, packed)
+    surface_loops.packed_product(products, packed)
+    _transform(products, cv2.DFT_INVERSE, out.shape[0])
+    surface_loops.normalise(out, products, inverse_norms, np.float32(math.sqrt(energy) / products.size))
+
+
+def _is_weak(energy: float, inverse_norms: FloatImage) -> bool:
+    return energy * float(inverse_norms.max()) ** 2 > FLOAT32_NORM_RATIO**2
+
+
+def _write_exactly(out: FloatImage, window: FloatImage, model: FloatImage, inverse_norms: FloatImage) -> None:
+    """By transforms in float64; OpenCV's ``matchTemplate`` is no more exact than float32 on small templates."""
+    size = _side(window.shape[0]), _side(window.shape[1])
+    values, spectrum = np.zeros(size), np.zeros(size)
+    values[: window.shape[0], : window.shape[1]] = window
+    spectrum[: model.shape[0], : model.shape[1]] = model
+    _transform(values, 0, window.shape[0])
+    _transform(spectrum, 0, model.shape[0])
+    cv2.mulSpectrums(values, spectrum, 0, values, True)
+    _transform(values, cv2.DFT_INVERSE, out.shape[0])
+    products = (values[: out.shape[0], : out.shape[1]] / values.size).astype(np.float32)
+    surface_loops.normalise(out, products, inverse_norms, np.float32(1.0))
+
+
+@lru_cache(maxsize=1024)
+def _division(count: int, model: int) -> tuple[int, int]:
+    """Number and side of the blocks along an axis that give ``count`` scores at the least cost."""
+    sides = [_side(-(-count // n) + model - 1) for n in range(1, _MAX_BLOCKS + 1)]
+    costs = [n * side * (1 if side <= _CACHED_SIDE else 2) for n, side in enumerate(sides, 1)]
+    best = costs.index(min(costs))
+    return -(-count // (sides[best] - model + 1)), sides[best]
+
+
+def _side(n: int) -> int:
+    """The next side that is transformed fast: without prime factors above 5, and even, for the packed orders."""
+    step = 16 if n >= 64 else 2
+    return step * fast_length(-(-n // step))
+
+
+def _block(
+    window: FloatImage, mean: float, size: tuple[int, int], inverse_norms: FloatImage, part: tuple[slice, slice]
+) -> _Block:
+    """The transform of part of a window; the part itself where some patch is too weak for float32."""
+    values = np.empty(size, np.float32)
+    energy = surface_loops.centre(values, window, mean)
+    if _is_weak(energy, inverse_norms):
+        return _Block(values[: window.shape[0], : window.shape[1]], False, *part)
+    _transform(values, 0, window.shape[0])
+    return _Block(values, True, *part)
+
+
+def _spectrum(model: FloatImage, size: tuple[int, int]) -> FloatImage:
+    values = np.zeros(size, np.float32)
+    values[: model.shape[0], : model.shape[1]] = model
+    _transform(values, 0, model.shape[0])
+    return values
+
+
+def _write_scores(
+    out: FloatImage, block: _Block, model: FloatImage, spectrum: FloatImage | None, inverse_norms: FloatImage
+) -> None:
+    if block.is_spectrum:
+        products = _scratch("products", block.values.shape)
+        cv2.mulSpectrums(block.values, spectrum, 0, products, True)
+        _transform(products, cv2.DFT_INVERSE, out.shape[0])
+        surface_loops.normalise(out, products, inverse_norms, np.float32(1.0 / products.size))
+    else:
+        _write_exactly(out, block.values, model, inverse_norms)
+
+
+_kept = threading.local()
+
+
+def _scratch(name: str, shape: tuple[int, ...]) -> FloatImage:
+    """An array that the thread keeps between calls: fresh pages of memory cost as much as a transform."""
+    count = math.prod(shape)
+    memory: FloatImage | None = getattr(_kept, name, None)
+    if memory is None or memory.size < count:
+        memory = np.empty(count, np.float32)
+        if count <= _MAX_KEPT:
+            setattr(_kept, name, memory)
+    return memory[:count].reshape(shape)
+
+
+def _transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
+    """In place, of which only so many rows are not zero, or wanted; powers of 2 are faster as a whole."""
+    power_of_2 = values.shape[0] & (values.shape[0] - 1) == 0
+    cv2.dft(values, values, flags, 0 if power_of_2 else rows)

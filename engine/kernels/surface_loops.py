@@ -1,0 +1,254 @@
+"""What surrounds the transforms of a correlation on the CPU, compiled by numba: one pass, no temporaries.
+
+Sums are in float64 and about the window's mean, so that a large offset costs no digits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from engine.kernels.jit import compiled
+
+# A patch is flat where its sum of squares is below this share of the window's, which is rounding.
+_FLAT_SHARE = 1e-12
+# The same for a template, by the squares that its mean alone would have.
+_FLAT_TEMPLATE = 1e-24
+
+
+@compiled
+def moments(picture, zero_mean):
+    """Mean and sum of squares.
+
+    Args:
+        picture: (H, W) float32.
+        zero_mean: take the squares about the mean; else the mean is taken as 0.
+
+    Returns:
+        Both in float64; not finite where a pixel is not.
+    """
+    # Counted from the first pixel: a picture of one level has sums of exactly 0.
+    start, total, square = np.float64(picture[0, 0]) if zero_mean else 0.0, 0.0, 0.0
+    for y in range(picture.shape[0]):
+        row = picture[y]
+        for x in range(len(row)):
+            value = np.float64(row[x]) - start
+            total += value
+            square += value * value
+    if not zero_mean:
+        return 0.0, square
+    spread = square - total * total / picture.size
+    return start + total / picture.size, 0.0 if spread < 0.0 else spread
+
+
+@compiled
+def unit(template, zero_mean):
+    """A template (h, w) float32 scaled to a norm of 1, zeros where flat, and its sum of squares."""
+    mean, energy = moments(template, zero_mean)
+    flat = energy <= _FLAT_TEMPLATE * template.size * mean * mean
+    scale, model = 0.0 if flat else 1.0 / math.sqrt(energy), np.empty(template.shape, np.float32)
+    for y in range(template.shape[0]):
+        for x in range(template.shape[1]):
+            model[y, x] = (np.float64(template[y, x]) - mean) * scale
+    return model, energy
+
+
+@compiled
+def inverse_norms(window, mean, energy, h, w, zero_mean):
+    """Reciprocal norm of every patch.
+
+    Args:
+        window: (H, W) float32.
+        mean: of the window, see :func:`moments`.
+        energy: its sum of squares.
+        h: rows of a patch.
+        w: columns of a patch.
+        zero_mean: norms about the patches' own means.
+
+    Returns:
+        (H-h+1, W-w+1) float32, 0 where a patch is flat.
+    """
+    columns, height, width = window.shape[1], window.shape[0] - h + 1, window.shape[1] - w + 1
+    out = np.empty((height, width), np.float32)
+    floor, share = _FLAT_SHARE * energy, 1.0 / (1.0 * h * w) if zero_mean else 0.0
+    down, down_squares = np.zeros(columns), np.zeros(columns)  # sums over h rows
+    along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)  # running sums of these
+    spreads, (unit_energy, unit_norm) = np.empty(width, np.float32), _units(energy)
+    for y in range(h):
+        _add(down, down_squares, window[y], mean)
+    for y in range(height):
+        if y > 0:
+            _slide(down, down_squares, window[y + h - 1], window[y - 1], mean)
+        total, square = 0.0, 0.0
+        for x in range(columns):
+            total += down[x]
+            square += down_squares[x]
+            along[x + 1], along_squares[x + 1] = total, square
+        row, ahead, ahead_squares = out[y], along[w:], along_squares[w:]  # an index x + w would not be vectorised
+        for x in range(width):
+            total = ahead[x] - along[x]
+            spread = ahead_squares[x] - along_squares[x] - total * total * share
+            spreads[x] = spread * unit_energy if spread > floor else 0.0
+        for x in range(width):
+            row[x] = unit_norm / np.sqrt(spreads[x]) if spreads[x] > 0.0 else 0.0
+    return out
+
+
+@compiled
+def _units(energy):
+    """Reciprocals of a window's energy and norm: patches are counted in these, for float32 to hold them."""
+    if energy <= 0.0:
+        return 0.0, np.float32(0.0)
+    return 1.0 / energy, np.float32(1.0 / math.sqrt(energy))
+
+
+@compiled
+def _add(down, down_squares, row, mean):
+    for x in range(len(row)):
+        value = row[x] - mean
+        down[x] += value
+        down_squares[x] += value * value
+
+
+@compiled
+def _slide(down, down_squares, after, before, mean):
+    """Add one row and take another away."""
+    for x in range(len(after)):
+        new, old = after[x] - mean, before[x] - mean
+        down[x] += new - old
+        down_squares[x] += (new - old) * (new + old)
+
+
+@compiled
+def inverse_norms_of(sums, h, w):
+    """The same from integral images (2, H+1, W+1) float64, or a crop of a larger picture's."""
+    columns, height, width = sums.shape[2], sums.shape[1] - h, sums.shape[2] - w
+    down, down_squares = np.empty(columns), np.empty(columns)
+    ahead, ahead_squares = down[w:], down_squares[w:]  # an index x + w would not be vectorised
+    energy = sums[1, -1, -1] - sums[1, 0, 0]  # no less than the window's own
+    share, floor, (unit_energy, unit_norm) = 1.0 / (1.0 * h * w), _FLAT_SHARE * energy, _units(energy)
+    out, spreads = np.empty((height, width), np.float32), np.empty(width, np.float32)
+    for y in range(height):
+        row, above, below, above_squares, below_squares = (
+            out[y],
+            sums[0, y],
+            sums[0, y + h],
+            sums[1, y],
+            sums[1, y + h],
+        )
+        for x in range(columns):
+            down[x], down_squares[x] = below[x] - above[x], below_squares[x] - above_squares[x]
+        for x in range(width):
+            total = ahead[x] - down[x]
+            spread = ahead_squares[x] - down_squares[x] - total * total * share
+            spreads[x] = spread * unit_energy if spread > floor else 0.0
+        for x in range(width):
+            row[x] = unit_norm / np.sqrt(spreads[x]) if spreads[x] > 0.0 else 0.0
+    return out
+
+
+@compiled
+def centre(out, picture, mean):
+    """Write a picture less a mean to the top left of ``out``, zeros elsewhere; returns its sum of squares."""
+    (height, width), energy = picture.shape, 0.0
+    for y in range(height):
+        to, row = out[y], picture[y]
+        for x in range(width):
+            value = np.float32(row[x] - mean)
+            energy += np.float64(value) * value
+            to[x] = value
+        to[width:] = 0.0
+    out[height:] = 0.0
+    return energy
+
+
+@compiled
+def pack(out, window, mean, scale, model):
+    """Write a window less its mean, scaled, and a template as real and imaginary part, zeros where they end.
+
+    Args:
+        out: (rows, columns, 2) float32, written to.
+        window: (H, W) float32.
+        mean: of the window.
+        scale: factor of the window.
+        model: (h, w) float32.
+    """
+    (height, width), (h, w) = window.shape, model.shape
+    out[height:], out[:height, width:] = 0.0, 0.0
+    for y in range(height):
+        to, row = out[y], window[y]
+        for x in range(width):
+            to[x, 0] = (row[x] - mean) * scale
+            to[x, 1] = 0.0
+        if y < h:
+            values = model[y]
+            for x in range(w):
+                to[x, 1] = values[x]
+
+
+@compiled
+def packed_pair(out, window, template, zero_mean):
+    """All that one template in one window needs before the transform, at once: on small windows calls cost most.
+
+    Returns:
+        Moments of the window, the template's sum of squares, the template scaled to 1, the patches' reciprocal
+        norms, and the largest of these; ``out`` as by :func:`pack`.
+    """
+    mean, energy = moments(window, zero_mean)
+    model, squares = unit(template, zero_mean)
+    norms, largest = (
+        inverse_norms(window, mean, energy, model.shape[0], model.shape[1], zero_mean),
+        np.float32(0.0),
+    )
+    for y in range(norms.shape[0]):
+        for x in range(norms.shape[1]):
+            largest = max(largest, norms[y, x])
+    pack(out, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, model)
+    return (mean, energy), squares, model, norms, largest
+
+
+@compiled
+def packed_product(out, packed):
+    """Spectrum of the correlation of two real pictures that were transformed as one complex picture.
+
+    Args:
+        out: (rows, columns) float32, written to in the packed order of OpenCV's real transforms.
+        packed: (rows, columns, 2) float32, transform of picture + i template; even rows and columns.
+    """
+    rows, columns = out.shape
+    # Indices that cannot be negative are vectorised.
+    two, full, half = np.uint64(2), np.uint64(columns), np.uint64(columns // 2)
+    for y in range(rows):
+        to, one, other = out[y], packed[y], packed[(rows - y) % rows]
+        for x in range(np.uint64(1), half):
+            back = full - x
+            to[two * x - np.uint64(1)], to[two * x] = _product(
+                one[x, 0], one[x, 1], other[back, 0], other[back, 1]
+            )
+    for x in (0, columns // 2):
+        column = out[:, 0 if x == 0 else columns - 1]
+        for y in range(rows // 2 + 1):
+            one, other = packed[y, x], packed[(rows - y) % rows, x]
+            real, imaginary = _product(one[0], one[1], other[0], other[1])
+            column[max(0, 2 * y - 1)] = real
+            if 0 < y < rows // 2:
+                column[2 * y] = imaginary
+
+
+@compiled
+def _product(a, b, c, d):
+    """One spectrum times the conjugate of the other, from a + ib and c + id at opposite frequencies."""
+    quarter = np.float32(0.25)
+    real, imaginary, across, along = a + c, b - d, a - c, b + d
+    return (real * along - imaginary * across) * quarter, (real * across + imaginary * along) * quarter
+
+
+@compiled
+def normalise(out, products, inverse, factor):
+    """Write ``products * inverse * factor`` to ``out``, in [-1, 1]; all float32, products of at least its size."""
+    for y in range(out.shape[0]):
+        to, numerators, norms = out[y], products[y], inverse[y]
+        for x in range(out.shape[1]):
+            score = numerators[x] * (norms[x] * factor)
+            to[x] = min(max(score, np.float32(-1.0)), np.float32(1.0))

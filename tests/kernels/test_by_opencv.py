@@ -1,0 +1,142 @@
+"""NCC by OpenCV's transforms: every way through it against the reference in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from engine.kernels import by_opencv, eager, reference
+from engine.ncc_fft import ncc, prepare, surface
+
+
+def scores_of(search, templates, zero_mean=True):
+    return ncc(torch.from_numpy(search), torch.from_numpy(templates), zero_mean=zero_mean).numpy()
+
+
+def expected_of(search, templates, zero_mean=True):
+    return np.stack(
+        [
+            [reference.ncc_surface(window, template, zero_mean=zero_mean) for template in group]
+            for window, group in zip(search, templates, strict=True)
+        ]
+    )
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    model=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    more=st.tuples(st.integers(0, 30), st.integers(0, 30)),
+    batch=st.tuples(st.integers(1, 3), st.integers(1, 3)),
+    zero_mean=st.booleans(),
+    offset=st.sampled_from([0.0, 100.0, 20_000.0]),
+)
+def test_surfaces_are_the_references(seed, model, more, batch, zero_mean, offset):
+    """Odd sizes, windows that are larger by nothing or by one pixel, batches of windows and of templates."""
+    rng = np.random.default_rng(seed)
+    size = tuple(n + m for n, m in zip(model, more, strict=True))
+    search = np.rint(rng.normal(offset, 30.0, (batch[0], *size))).astype(np.float32)
+    templates = np.rint(rng.normal(offset, 30.0, (*batch, *model))).astype(np.float32)
+    got = scores_of(search, templates, zero_mean)
+    np.testing.assert_allclose(got, expected_of(search, templates, zero_mean), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("side", [63, 64, 65, 96, 97, 127])
+@pytest.mark.parametrize("more", [0, 1, 2, 33])
+@pytest.mark.parametrize("count", [1, 2])
+def test_templates_from_64_px_up(side, more, count):
+    rng = np.random.default_rng(side)
+    search = rng.normal(50.0, 20.0, (1, side + more, side + more + 1)).astype(np.float32)
+    templates = rng.normal(50.0, 20.0, (1, count, side, side)).astype(np.float32)
+    templates[0, 0] += search[0, :side, :side]
+    np.testing.assert_allclose(scores_of(search, templates), expected_of(search, templates), rtol=0, atol=1e-5)
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.tuples(st.integers(30, 90), st.integers(30, 90)),
+    model=st.tuples(st.integers(2, 20), st.integers(2, 20)),
+    count=st.integers(1, 3),
+    threads=st.integers(1, 2),
+)
+def test_blocks_are_the_window(seed, size, model, count, threads):
+    """A cost that grows past 32 px a side: small windows are divided as large ones are."""
+    rng = np.random.default_rng(seed)
+    search = rng.normal(0.0, 30.0, (1, *size)).astype(np.float32)
+    templates = rng.normal(0.0, 30.0, (1, count, *model)).astype(np.float32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(by_opencv, "_CACHED_SIDE", 32)
+        patch.setattr(by_opencv, "_division", by_opencv._division.__wrapped__)
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            got = scores_of(search, templates)
+        finally:
+            torch.set_num_threads(before)
+    np.testing.assert_allclose(got, expected_of(search, templates), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("divided", [False, True])
+@pytest.mark.parametrize("count", [1, 2])
+def test_weak_patches_beside_strong_ones(divided, count, monkeypatch):
+    """A thousand times the contrast in one corner: float32 transforms would lose the rest."""
+    if divided:
+        monkeypatch.setattr(by_opencv, "_CACHED_SIDE", 32)
+        monkeypatch.setattr(by_opencv, "_division", by_opencv._division.__wrapped__)
+    rng = np.random.default_rng(7)
+    search = rng.normal(0.0, 1.0, (1, 80, 90)).astype(np.float32)
+    search[0, :20, :20] *= 1000.0
+    templates = np.stack([search[0, 50:62, 60:75], rng.normal(0.0, 1.0, (12, 15))])[None, :count]
+    templates = np.ascontiguousarray(templates, np.float32)
+    got = scores_of(search, templates)
+    np.testing.assert_allclose(got, expected_of(search, templates), rtol=0, atol=1e-5)
+    assert got[0, 0, 50, 60] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-15, 1e15])
+def test_dim_and_bright_pictures_score_as_others(scale):
+    rng = np.random.default_rng(8)
+    search = (scale * rng.normal(5.0, 1.0, (1, 40, 50))).astype(np.float32)
+    templates = (scale * rng.normal(5.0, 1.0, (1, 1, 12, 15))).astype(np.float32)
+    got = scores_of(search, templates)
+    np.testing.assert_allclose(got, expected_of(search / scale, templates / scale), rtol=0, atol=1e-5)
+
+
+@given(seed=st.integers(0, 2**32 - 1), model=st.tuples(st.integers(2, 20), st.integers(2, 20)))
+@settings(max_examples=25)
+def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
+    rng = np.random.default_rng(seed)
+    part = prepare(torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))).crop(7, 3, 41, 37)
+    templates = torch.from_numpy(rng.normal(0.0, 1.0, (2, *model)).astype(np.float32))
+    centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
+    norms = eager.inverse_norm(part.sums, *model)
+    for count in (1, 2):
+        expected = eager.prepared_surface(part.image, norms, centred[:count])
+        torch.testing.assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
+
+
+def test_views_are_taken_and_left_as_they_are():
+    search = torch.randn(2, 50, 60, generator=torch.Generator().manual_seed(0)).transpose(1, 2)
+    templates = torch.randn(1, 1, 9, 11, generator=torch.Generator().manual_seed(1)).expand(2, 3, -1, -1)
+    before = search.clone(), templates.clone()
+    torch.testing.assert_close(ncc(search, templates), ncc(search.contiguous(), templates.contiguous()))
+    assert torch.equal(search, before[0])
+    assert torch.equal(templates, before[1])
+
+
+def test_gradients_of_templates_come_from_the_tensor_ops():
+    search = torch.randn(1, 20, 22, generator=torch.Generator().manual_seed(0))
+    templates = torch.randn(1, 1, 8, 9, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    ncc(search, templates).max().backward()
+    assert templates.grad is not None
+
+
+def test_large_windows_are_divided_into_blocks_that_cover_them():
+    for count, model in [(33, 64), (1921, 128), (1537, 512), (9000, 200), (1, 1), (5, 3000)]:
+        blocks, side = by_opencv._division(count, model)
+        assert blocks * (side - model + 1) >= count > (blocks - 1) * (side - model + 1)
+        assert side % 2 == 0
