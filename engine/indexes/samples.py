@@ -64,7 +64,7 @@ class SampleMap:
             inside = np.arange(shape[0])[rows, None] * shape[1] + np.arange(shape[1])[columns]
             index = inside.ravel()[::step]
             arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
-            parts.append([array[index] for array in arrays])
+            parts.append([array.take(index, axis=0) for array in arrays])  # twice as fast as indexing
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _cells_under(self, window: Window, level: int) -> list[Window]:
