@@ -99,6 +99,11 @@ class AttitudeBias:
             heading_lag_deg=math.hypot(frame.heading_lag_deg or 0.0, float(wider[2])),
         )
 
+    def doubt(self, heading_deg: float) -> None:
+        """What was known did not hold, and the heading may be this far off, one standard deviation."""
+        self._mean_deg, self._scatter_deg2, self._fixes = np.zeros(3), np.zeros(3), 0
+        self._variance_deg2 = np.maximum(self._first_deg2, [0.0, 0.0, heading_deg**2])
+
     def note(self, fix: Fix) -> None:
         """Learn from a fix of the newest frame; one without a height did not measure its attitude."""
         known_deg, seen = self._angles_deg, fix.attitude

@@ -233,11 +233,13 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
         """Trace in units of the covariance of samples and prior."""
         return float(np.sum(reference * matrix))
 
-    in_common = size(common)
-    scatter = size(by_cell @ by_cell.T) / size(own)
-    if in_common <= 0.0 or scatter <= 0.0:
+    in_common, of_picture = size(common), size(own)
+    if in_common <= 0.0 or of_picture <= 0.0:
         return None
-    share = min(1.0, in_common**2 / (size(own) * size(of_map)))
+    scatter = size(by_cell @ by_cell.T) / of_picture
+    if scatter <= 0.0:
+        return None
+    share = min(1.0, in_common**2 / (of_picture * size(of_map)))
     return _inverse(own * (share / (_EXCESS * scatter)) + prior.precision)
 
 

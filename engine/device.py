@@ -78,7 +78,7 @@ def set_threads(count: int) -> None:
 
 
 def default_threads() -> None:
-    """One thread, unless somebody chose otherwise; see :func:`set_threads`."""
+    """One thread, unless :func:`set_threads` or ``OMP_NUM_THREADS`` chose otherwise."""
     if not _chosen.is_set() and "OMP_NUM_THREADS" not in os.environ:
         set_threads(1)
 

@@ -78,7 +78,8 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._errors = TelemetryErrors(o)
-        self._repeats, self._velocity = Repeats(), VelocityCheck()
+        self._repeats = Repeats()
+        self._velocity = VelocityCheck(o.measured_velocity_sigma_mps, o.acceleration_mps2)
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
@@ -180,8 +181,9 @@ class Navigator:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
         if isinstance(result, Fix):
-            if not late and self._velocity.note(result, told, now.time_s):
+            if not late and is_valid(result) and self._velocity.note(result, told, now.time_s):
                 self._forget_way(now)
+                sources = replace(sources, own=self._reckoned(now), pending=None)
             result = self._judge(result, now, sources, frame.height_agl_m, late=late)
             if isinstance(result, Fix) and sources.given is not None:
                 self._map_offset.add(result, sources.given, now.time_s)

@@ -15,6 +15,7 @@ _HEIGHT_SHARE, _HEIGHT_M = 0.01, 1.0
 _FIRST_SHARE = 0.2  # of the height, by which it may be off while no picture measured it
 _LEAST_SHARE, _LEAST_SIGMAS, _LEAST_FIXES = 0.03, 3.0, 3  # of an error of the height that is taken off
 _FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before heading and height are searched for, and again
+_SEARCHED_HEADING_DEG = 12.0  # standard deviation of a heading that was searched for
 _WALK_SHARE = 1e-3  # of the height, by which its error changes in a second
 
 
@@ -56,7 +57,8 @@ class TelemetryErrors:
         self._time_s: float | None = None
         self._heights = 0
         self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched for
-        self._settling = False  # whether they were, and what was found is not taken off yet
+        self._settling = 0  # fixes that are missing until what a search found is taken off
+        self._searched = False  # whether the newest frame is the first of a search
 
     @property
     def lag_s(self) -> float:
@@ -103,11 +105,13 @@ class TelemetryErrors:
         shown = self._at_its_height(self._bias.corrected(shown))
         if frame.heading_deg is None or self._height_m is None:
             return shown
-        if refusals >= self._next_search:
-            self._next_search = math.ceil(_SEARCH_GROWTH * refusals)
-            self._settling = True
-            return replace(shown, is_doubted=True)
-        self._settling &= not refusals and self._heights < _LEAST_FIXES
+        self._searched = refusals >= self._next_search
+        if self._searched:
+            self._next_search, self._settling = math.ceil(_SEARCH_GROWTH * refusals), _LEAST_FIXES
+        elif refusals:
+            self._settling = 0
+        else:
+            self._next_search = _FIRST_SEARCH
         return replace(shown, is_doubted=True) if self._settling else shown
 
     def _at_its_height(self, frame: Frame) -> Frame:
@@ -128,7 +132,10 @@ class TelemetryErrors:
             ground_m: height of the ground below it; None over ground that is taken for flat, where a slope passes
                 for a tilt.
         """
-        self._next_search = _FIRST_SEARCH
+        self._settling = max(self._settling - 1, 0)
+        if self._searched:  # what was known before it did not hold
+            self._searched, self._heights = False, 0
+            self._bias.doubt(_SEARCHED_HEADING_DEG)
         self._lag.note(fix, self._bias.bias)
         if ground_m is None:
             return

@@ -23,7 +23,6 @@ _WAY_S, _MAX_LEG_S = 2.0, 5.0  # over which matches are compared; between two of
 _LEAST = 3  # matches of a way that may be called smooth
 _MIN_WAY_M = 5.0  # of either kind: a vehicle that hovers says nothing
 _GATE = 18.4  # chi-square of two degrees of freedom: chance exceeds it once in ten thousand
-_SIGMA_MPS, _ACCELERATION_MPS2 = 0.5, 3.0  # of a velocity that is right, and of the vehicle
 _CONTRADICTIONS = 3  # matches in a row
 _AGREES_S = 10.0  # after which a velocity is believed again
 
@@ -50,9 +49,15 @@ class _Seen:
 
 
 class VelocityCheck:
-    """Counts the matches whose way contradicts the velocity of the telemetry."""
+    """Counts the matches whose way contradicts the velocity of the telemetry.
 
-    def __init__(self) -> None:
+    Args:
+        sigma_mps: of a velocity that is right.
+        acceleration_mps2: of the vehicle.
+    """
+
+    def __init__(self, sigma_mps: float = 0.5, acceleration_mps2: float = 3.0) -> None:
+        self._sigma_mps, self._acceleration_mps2 = sigma_mps, acceleration_mps2
         self._seen: deque[_Seen] = deque()  # of the last seconds
         self._contradictions = 0
         self._agrees_since_s: float | None = None
@@ -76,18 +81,18 @@ class VelocityCheck:
             bool: whether the velocity is not believed any more from this match on.
         """
         known = frame.east_velocity_mps is not None and frame.north_velocity_mps is not None
-        if not known or (fix.confidence is not None and fix.confidence < _MIN_CONFIDENCE):
+        if not known or fix.confidence is None or fix.confidence < _MIN_CONFIDENCE:
             return False
         told_mps = np.array([frame.east_velocity_mps, frame.north_velocity_mps], np.float64)
         leg_s = time_s - self._seen[-1].time_s if self._seen else math.inf
         if not 0.0 < leg_s <= _MAX_LEG_S:
             self._seen.clear()
-            self._contradictions = 0
+            self._contradictions, self._agrees_since_s = 0, None
             self._seen.append(_Seen(time_s, en_m(fix), fix.relative_sigma_m, told_mps, np.zeros(2), 0.0))
             return False
         last = self._seen[-1]
         told_m = last.told_m + 0.5 * (last.told_mps + told_mps) * leg_s
-        coarse_m = last.coarse_m + _ACCELERATION_MPS2 * leg_s**2 / 12.0
+        coarse_m = last.coarse_m + self._acceleration_mps2 * leg_s**2 / 12.0
         self._seen.append(_Seen(time_s, en_m(fix), fix.relative_sigma_m, told_mps, told_m, coarse_m))
         while len(self._seen) > _LEAST and self._seen[1].time_s <= time_s - _WAY_S:
             self._seen.popleft()
@@ -100,10 +105,12 @@ class VelocityCheck:
         if max(float(np.hypot(*moved_m)), float(np.hypot(*told_m))) < _MIN_WAY_M:
             return False
         noise_m = math.hypot(first.sigma_m, last.sigma_m)
-        sigma_m = noise_m + _SIGMA_MPS * elapsed_s + last.coarse_m - first.coarse_m
+        sigma_m = noise_m + self._sigma_mps * elapsed_s + last.coarse_m - first.coarse_m
         off_m = moved_m - told_m
         if float(off_m @ off_m) <= _GATE * sigma_m**2:
             self._contradictions = 0
+            if float(told_m @ told_m) <= _GATE * sigma_m**2:
+                return False  # by matches as vague as these anything agrees
             since_s = self._agrees_since_s = last.time_s if self._agrees_since_s is None else self._agrees_since_s
             self.is_believed |= last.time_s - since_s >= _AGREES_S
             return False
@@ -121,5 +128,5 @@ class VelocityCheck:
         share = np.array([(one.time_s - first.time_s) / elapsed_s for one in self._seen])
         straight_m = first.place_m + share[:, None] * (last.place_m - first.place_m)
         off_m = np.hypot(*(np.array([one.place_m for one in self._seen]) - straight_m).T)
-        most_m = _ACCELERATION_MPS2 * elapsed_s**2 / 8.0 + 3.0 * noise_m
+        most_m = self._acceleration_mps2 * elapsed_s**2 / 8.0 + 3.0 * noise_m
         return len(self._seen) >= _LEAST and bool(off_m.max() <= most_m)

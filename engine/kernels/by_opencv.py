@@ -71,7 +71,16 @@ def _check_finite(name: str, energy: float) -> None:
 
 
 def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
-    """Reciprocal norm about the mean of every patch (h, w): (H-h+1, W-w+1) float32, 0 where flat."""
+    """Reciprocal norm about the mean of every patch.
+
+    Args:
+        sums: (2, H+1, W+1) float64 integrals.
+        h: rows of a patch.
+        w: columns of a patch.
+
+    Returns:
+        (H-h+1, W-w+1) float32, 0 where a patch is flat.
+    """
     return torch.from_numpy(surface_loops.inverse_norms_of(sums.numpy(), h, w))
 
 

@@ -47,7 +47,15 @@ def fast_length(n: int) -> int:
 
 
 def check_finite(name: str, tensor: Tensor) -> None:
-    """Raise an OptionError where a value is NaN or infinity; a finite sum implies none, and is faster."""
+    """Check that no value is NaN or infinity; a finite sum implies that, and is faster.
+
+    Args:
+        name: of the argument.
+        tensor: of any shape.
+
+    Raises:
+        OptionError: one is.
+    """
     if not (math.isfinite(float(tensor.detach().sum())) or bool(torch.isfinite(tensor).all())):
         raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 

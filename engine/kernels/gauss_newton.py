@@ -86,7 +86,7 @@ def normal_equations(shown, expected, points, offset_m, rotation, weights, diffe
     for n in range(weights.size):
         total += weights[n]
         square += weights[n] * differences[n] * differences[n]
-    scale = 1.0 / (excess * max(square / total, 1e-12))
+    scale = 1.0 / (excess * max(square / max(total, 1e-12), 1e-12))
     normal, score, row = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
     for n in range(weights.size):
         weight = weights[n] * scale

@@ -87,6 +87,8 @@ class SurfaceModel:
     def __init__(
         self, heights_m: Heights | HeightTiles, from_map: Warp, decimated: SurfaceModel | None = None
     ) -> None:
+        if isinstance(heights_m, np.ndarray):  # the loops are compiled for one type
+            heights_m = np.ascontiguousarray(heights_m, np.float32)
         self._heights_m, self._from_map, self._decimated = heights_m, from_map, decimated
 
     def overview(self, map_xy: Array) -> Array:
@@ -114,7 +116,7 @@ class SurfaceModel:
             from engine.kernels.map_points import bilinear_heights  # numba takes a while to import
 
             out = np.empty(at.shape[:-1])
-            bilinear_heights(self._heights_m, np.ascontiguousarray(at).reshape(-1, 2), out.reshape(-1))
+            bilinear_heights(self._heights_m, np.ascontiguousarray(at, np.float64).reshape(-1, 2), out.reshape(-1))
             return out
         height, width = self._heights_m.shape
         x0, x1, u, in_x = _neighbours(at[..., 0], width)

@@ -114,14 +114,11 @@ class Ncc(Method):
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
-        if query.prior is None or not self._trusts(query):
-            step = "ncc search" if query.prior is None else "ncc hypotheses"
-            works = {0: float(query.site.width_px * query.site.height_px)}
-        else:
-            step, works = "ncc", expected_window_px(query, self.options)
+        step, works = self._step(query)
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
         if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
+            query.scheduler.note_refusal(step, decay_cost=True)
             return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, step)
@@ -135,8 +132,18 @@ class Ncc(Method):
             if isinstance(result, NoFix):
                 result = replace(result, candidates=self._candidates(query, found))
         if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
-            return self.refine(query.with_pose(found.aligned.pose, result), result)
+            return self.refine(query.with_height(found.aligned.pose), result)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
+
+    def _step(self, query: Query) -> tuple[str, dict[int, float]]:
+        """The name of the step that correlates, and the work of its variants."""
+        doubted, map_px = query.frame.is_doubted, float(query.site.width_px * query.site.height_px)
+        if query.prior is None:
+            return "ncc doubted search" if doubted else "ncc search", {0: map_px}
+        windows = expected_window_px(query, self.options)
+        if doubted:
+            return "ncc doubted", {0: max(windows.values())}
+        return ("ncc", windows) if self._trusts(query) else ("ncc hypotheses", {0: map_px})
 
     def refine(self, query: Query, result: Result) -> Result:
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 _AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
 _MOST_TURNED = math.radians(60.0)
-_FOUND_HEADING_DEG, _FOUND_HEIGHT_SHARE = 2.0, 0.03  # standard deviations of what a search found
+_FOUND_HEIGHT_SHARE = 0.03  # standard deviation of a height that a search found
 _ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
 
 
@@ -170,21 +170,13 @@ class Query:
         """The same by the frame's own heading and height."""
         return replace(self, frame=replace(self.frame, is_doubted=False))
 
-    def with_pose(self, pose: GridPose, fix: Fix) -> Query:
-        """The same by the heading and the height that a search found, known as well as its steps are fine.
-
-        Args:
-            pose: that was found.
-            fix: with its heading from true north.
-        """
-        frame, height_m = self.frame, pose.height_agl_m
-        assert fix.attitude is not None  # a search measures the heading
+    def with_height(self, pose: GridPose) -> Query:
+        """The same by the height that a search found, which is known as well as its steps are fine."""
+        frame, height_m = self.undoubted.frame, pose.height_agl_m
         assert frame.height_agl_m is not None
         assert height_m is not None
         found = replace(
-            self.undoubted.frame,
-            heading_deg=fix.attitude.heading_deg,
-            heading_sigma_deg=_FOUND_HEADING_DEG,
+            frame,
             height_agl_m=height_m,
             height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
             height_correction_m=(frame.height_correction_m or 0.0) + height_m - frame.height_agl_m,

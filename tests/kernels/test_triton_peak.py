@@ -62,6 +62,13 @@ def poisoned(*args, **kwargs):
     return torch.full(*args, math.nan if kwargs["dtype"].is_floating_point else 2**62, **kwargs)
 
 
+def whole_surface(search, template):
+    """The surface by tensor ops, as a device has it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "_by_opencv", lambda *tensors: False)
+        return surface(search, template[None])[0]
+
+
 def fused(name, *args):
     """A function of the kernel's, on poisoned memory."""
     from engine.kernels import triton_peak
@@ -126,7 +133,7 @@ def check_ties(device):
 
 def check_match(device, size, model):
     search, template = picture(size, model, device)
-    expected = find_peak(surface(search, template[None])[0], exclusion_px=5.0)
+    expected = find_peak(whole_surface(search, template), exclusion_px=5.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "_by_triton", lambda tensor: True)
         assert_same(_peak_on_device(search, template, 5.0), expected)
@@ -220,7 +227,7 @@ def test_the_peak_on_a_device_is_that_of_the_whole_surface(size, model, exclusio
     """On the CPU, by the plain torch twins."""
     search, template = picture(size, model)
     found = _peak_on_device(search, template, exclusion_px)
-    assert_same(found, find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px))
+    assert_same(found, find_peak(whole_surface(search, template), exclusion_px=exclusion_px))
 
 
 def test_the_peak_of_a_window_without_texture_is_finite():

@@ -315,7 +315,7 @@ def test_a_copy_that_is_carried_on_begins_where_it_was(picture, tmp_path, tiny_l
 def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tiny_limits, monkeypatch, terminal):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     stream = io.StringIO()
-    monkeypatch.setattr(console, "_errors", Console(file=stream, force_terminal=terminal, width=100))
+    monkeypatch.setattr(console, "_errors", lambda: Console(file=stream, force_terminal=terminal, width=100))
     assert run(["map", "info", str(picture)]) == 0
     assert ("copying the map into the cache" in stream.getvalue()) == terminal
     assert stream.getvalue() == "" or terminal
