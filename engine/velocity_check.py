@@ -81,7 +81,7 @@ class VelocityCheck:
             bool: whether the velocity is not believed any more from this match on.
         """
         known = frame.east_velocity_mps is not None and frame.north_velocity_mps is not None
-        if not known or fix.confidence is None or fix.confidence < _MIN_CONFIDENCE:
+        if not known or (fix.confidence is not None and fix.confidence < _MIN_CONFIDENCE):
             return False
         told_mps = np.array([frame.east_velocity_mps, frame.north_velocity_mps], np.float64)
         leg_s = time_s - self._seen[-1].time_s if self._seen else math.inf
