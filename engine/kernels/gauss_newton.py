@@ -61,12 +61,11 @@ def gauss_newton(
         if found:
             normal, score = normal_equations(shown, expected, points, offset_m, seen, weights, differences, excess)
             normal += precision
-            score -= precision @ parameters_between(
-                rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope
-            )
+            off = parameters_between(rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope)
+            score -= _product(precision, off.reshape(_PARAMETERS, 1))[:, 0]
             found = solve(normal, score, step)
         if found:
-            rotation = rotation_of(step[3:6]) @ rotation
+            rotation = _product(rotation_of(step[3:6]), rotation)
             center_m += step[:3]
             slope += step[6:]
             converged = np.sum(step * score) < last_step
@@ -192,17 +191,28 @@ def rotation_of(vector):
     cosine = 0.5 if angle < 1e-4 else (1.0 - np.cos(angle)) / (angle * angle)
     x, y, z = vector[0], vector[1], vector[2]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + sine * cross + cosine * (cross @ cross)
+    return np.eye(3) + sine * cross + cosine * _product(cross, cross)
 
 
 @compiled
 def parameters_between(rotation, center_m, slope, other_rotation, other_center_m, other_slope):
     """The parameters (8,) of the step from another pose to this one."""
-    turn = rotation @ np.ascontiguousarray(other_rotation.T)
+    turn = _product(rotation, np.ascontiguousarray(other_rotation.T))
     sine = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     size = np.sqrt(np.sum(sine * sine))
     angle = np.arctan2(size, 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0))
     out = np.empty(_PARAMETERS)
     out[:3], out[6:] = center_m - other_center_m, slope - other_slope
     out[3:6] = sine * (1.0 if size < 1e-9 else angle / size)
+    return out
+
+
+@compiled
+def _product(a, b):
+    """Of two small matrices; numba's own needs SciPy."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            for k in range(a.shape[1]):
+                out[i, j] += a[i, k] * b[k, j]
     return out
