@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from engine.lazy_names import imported_on_use
+
 if TYPE_CHECKING:
     from engine import features, ncc_fft
     from engine.acceptance import PeakRule
@@ -94,16 +96,15 @@ _NAMES = {
     "engine.values": "Attitude Fix Frame NoFix Prior Reason Timings Window",
 }
 """The public names by module. A module is imported when one of its names is used: torch alone takes seconds."""
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+_imported = imported_on_use(__name__, _NAMES)
 
 if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
 
     def __getattr__(name: str) -> Any:
         if name in ("features", "ncc_fft"):  # public modules
             return import_module(f"engine.{name}")
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(_MODULES[name]), name)
+        return _imported(name)
 
 
 def __dir__() -> list[str]:

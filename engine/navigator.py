@@ -181,10 +181,7 @@ class Navigator:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
         if isinstance(result, Fix):
-            if not late and is_valid(result) and self._velocity.note(result, told, now.time_s):
-                self._forget_way(now)
-                sources = replace(sources, own=self._reckoned(now), pending=None)
-            result = self._judge(result, now, sources, frame.height_agl_m, late=late)
+            result = self._judge(result, now, sources, told, late=late)
             if isinstance(result, Fix) and sources.given is not None:
                 self._map_offset.add(result, sources.given, now.time_s)
         elif not late and result.reason is not Reason.LATE:
@@ -282,12 +279,13 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
-    def _judge(
-        self, fix: Fix, now: OdometrySample, sources: Sources, height_m: float | None, *, late: bool
-    ) -> Fix | NoFix:
+    def _judge(self, fix: Fix, now: OdometrySample, sources: Sources, told: Frame, *, late: bool) -> Fix | NoFix:
         """The fix where the evidence for it is enough; else it is pending, and refused for now."""
         if not is_valid(fix):
             return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
+        if not late and self._velocity.note(fix, told, now.time_s):
+            self._forget_way(now)
+            sources = replace(sources, own=self._reckoned(now), pending=None)
         required, against = self._options.min_log_odds, self._against(fix, now)
         own, given = (self._vouching(source, fix, sources) for source in (sources.own, sources.given))
         disputed = given < 0.0
@@ -300,7 +298,7 @@ class Navigator:
         if late:
             return self._refuse_match(fix, against, own + others)
         match = Match(fix, others if against is not None else own + others)
-        found = self._hypotheses.add([match], now, sources, self._map_m2(fix), height_m)
+        found = self._hypotheses.add([match], now, sources, self._map_m2(fix), told.height_agl_m)
         return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(
             fix, against, match.log_odds if found is None else found.log_odds
         )

@@ -171,7 +171,7 @@ def _finish_pair(
 ) -> None:
     """The scores of what :func:`surface_loops.pack` wrote: both pictures in one transform, of equal norm."""
     mean, energy = moments
-    if energy * largest**2 > FLOAT32_NORM_RATIO**2:
+    if _is_weak(energy, largest):
         _write_exactly(out, window - np.float32(mean), model, inverse_norms)
         return
     products = _scratch("products", packed.shape[:2])
@@ -181,8 +181,9 @@ def _finish_pair(
     surface_loops.normalise(out, products, inverse_norms, np.float32(math.sqrt(energy) / products.size))
 
 
-def _is_weak(energy: float, inverse_norms: FloatImage) -> bool:
-    return energy * float(inverse_norms.max()) ** 2 > FLOAT32_NORM_RATIO**2
+def _is_weak(energy: float, largest: float) -> bool:
+    """Whether some patch, by the largest of the inverse norms, is too weak in this window for float32."""
+    return energy * largest**2 > FLOAT32_NORM_RATIO**2
 
 
 def _write_exactly(out: FloatImage, window: FloatImage, model: FloatImage, inverse_norms: FloatImage) -> None:
@@ -220,7 +221,7 @@ def _block(
     """The transform of part of a window; the part itself where some patch is too weak for float32."""
     values = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
-    if _is_weak(energy, inverse_norms):
+    if _is_weak(energy, float(inverse_norms.max())):
         return _Block(values[: window.shape[0], : window.shape[1]], False, *part)
     _transform(values, 0, window.shape[0])
     return _Block(values, True, *part)

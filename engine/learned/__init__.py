@@ -4,8 +4,9 @@ LoFTR alone, or DISK, ALIKED or SuperPoint with LightGlue; :func:`load_matcher` 
 tensors what a file holds. A weights file is opened as tensors only: a pickle that would run code is refused.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from engine.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from engine.learned.keypoints import Extractor, Keypoints
@@ -31,14 +32,9 @@ _NAMES = {
     "engine.learned.pairs": "PairMatcher",
 }
 """The public names by module. A module is imported when one of its names is used: networks need torch."""
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
-
-    def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(_MODULES[name]), name)
+    __getattr__ = imported_on_use(__name__, _NAMES)
 
 
 def __dir__() -> list[str]:

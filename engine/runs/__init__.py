@@ -11,8 +11,9 @@ Nothing here prints: a run reports to the :class:`Progress` that it is given. A 
 argument that it is about.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from engine.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from engine.formats.corrections import Corrections
@@ -106,14 +107,9 @@ _NAMES = {
     "engine.runs.tracking": "track",
 }
 """The public names by module. A module is imported when one of its names is used: a run needs few of them."""
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
-
-    def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(_MODULES[name]), name)
+    __getattr__ = imported_on_use(__name__, _NAMES)
 
 
 def __dir__() -> list[str]:

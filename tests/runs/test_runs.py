@@ -128,7 +128,7 @@ def test_errors_name_arguments(flight, tmp_path):
 
 def test_the_public_names_are_sorted_and_there():
     assert engine.runs.__all__ == sorted(engine.runs.__all__)
-    assert set(engine.runs.__all__) == set(engine.runs._MODULES)
+    assert set(engine.runs.__all__) == set(" ".join(engine.runs._NAMES.values()).split())
     for name in engine.runs.__all__:
         assert getattr(engine.runs, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
