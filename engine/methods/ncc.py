@@ -101,7 +101,24 @@ class Ncc(Method):
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
-        return self.refine(query, self.correlate(query))
+        return self._quick(query) or self.refine(query, self.correlate(query))
+
+    def _quick(self, query: Query) -> Fix | None:
+        if query.prior is None or query.frame.is_doubted or not self._trusts(query) or query.telemetry.height_agl_m is None:
+            return None
+        if not self.options.refine or (query.telemetry.has_tilt and not query.site.has_surface):
+            return None
+        works = expected_window_px(query, self.options)
+        coarser = max(works)
+        if not coarser or not query.scheduler.can_afford("ncc", works[coarser]):
+            return None
+        with query.scheduler.costed("ncc", works[coarser]):
+            found = self.find(query, coarser=coarser)
+            result = found if isinstance(found, NoFix) else self.judge(query, found)
+        if isinstance(result, NoFix) or (result.confidence or 0.0) < 0.999:
+            return None
+        refined = self.refine(query, result)
+        return refined if isinstance(refined, Fix) and refined.stage == "refined" else None
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.

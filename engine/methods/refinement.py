@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 # Refinement begins so many levels above the frame's own: one where the tilt is known; two where it is not, or the
 # first try failed.
-_COARSER, _MUCH_COARSER = 1, 2
+_COARSER, _MUCH_COARSER = 0, 2
 _TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes where the tilt is unknown
 # Least correlation of an accepted pose. Without a known tilt true poses over simulated towns reached 0.53 and
 # wrong ones 0.32; with it true poses over a town in snow reached 0.29.
