@@ -19,12 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
+from engine.geo import inverse_2x2
 from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
 
 # Beyond this angle off the vertical a footprint is stretched more than 4 times and relief occludes the ground.
 MAX_RAY_DEG = 75.0
+_MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
 # A frame that is finer than the map by more than this factor is averaged down first, to prevent aliasing.
 _MAX_SHRINK = 0.75
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
@@ -92,17 +94,16 @@ def view_of(
     """
     enu_from_camera = camera.enu_from_camera(attitude)
     rays = camera.frame_rays @ enu_from_camera.T
-    down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
-    if down.min() < np.cos(np.radians(MAX_RAY_DEG)):
+    down = -rays[:, 2] / np.sqrt((rays * rays).sum(axis=1))
+    if down.min() < _MIN_DOWN:
         return None
     slope = np.zeros(2) if slope_m_per_px is None else slope_m_per_px
-    approach = (
-        rays[:, :2] @ np.linalg.solve(enu_jacobian.T, slope) - rays[:, 2]
-    )  # of each ray, along the plane's normal
+    px_from_enu = inverse_2x2(enu_jacobian)
+    approach = rays[:, :2] @ (slope @ px_from_enu) - rays[:, 2]  # of each ray, along the plane's normal
     if approach.min() <= 0.0:
         return None
     ground_m = rays[:, :2] * (height_m / approach)[:, None]
-    ground_px = np.linalg.solve(enu_jacobian, ground_m.T).T
+    ground_px = ground_m @ px_from_enu.T
     extent = np.ptp(ground_px[:4], axis=0)
     plane = np.zeros((3, 3))  # map pixels about the nadir to east, north, up of the ground below the camera
     plane[:2, :2], plane[2, :2], plane[2, 2] = enu_jacobian, slope, -height_m
@@ -267,7 +268,7 @@ def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_ja
         return None
     far = reach > -rays[:, 2] * limit
     along = rays[:, :2] / np.where(far, reach / limit, -rays[:, 2])[:, None]
-    ground_px = np.linalg.solve(enu_jacobian, height_m * along.T).T
+    ground_px = height_m * along @ inverse_2x2(enu_jacobian).T
     return np.stack([np.floor(ground_px.min(axis=0)), np.ceil(ground_px.max(axis=0))])
 
 

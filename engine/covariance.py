@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,11 +75,24 @@ def map_sigma_of(site: OrthoMap) -> float:
 
 def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
     """The errors with what the frame states in place of what is assumed of any telemetry, and with its lag."""
-    stated = {"heading_deg": frame.heading_sigma_deg, "tilt_deg": frame.tilt_sigma_deg}
-    if frame.height_sigma_m is not None:
-        stated |= {"height_m": frame.height_sigma_m, "height_share": _NO_SHARE}
+    sigmas = (frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
+    return _with_accuracy(errors, *sigmas, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0)
+
+
+@lru_cache(maxsize=16)  # a frame asks several times
+def _with_accuracy(
+    errors: AssumedErrors,
+    heading_sigma_deg: float | None,
+    tilt_sigma_deg: float | None,
+    height_sigma_m: float | None,
+    tilt_lag_deg: float,
+    heading_lag_deg: float,
+) -> AssumedErrors:
+    stated = {"heading_deg": heading_sigma_deg, "tilt_deg": tilt_sigma_deg}
+    if height_sigma_m is not None:
+        stated |= {"height_m": height_sigma_m, "height_share": _NO_SHARE}
     known = {name: value for name, value in stated.items() if value is not None}
-    for name, lag_deg in (("tilt_deg", frame.tilt_lag_deg), ("heading_deg", frame.heading_lag_deg)):
+    for name, lag_deg in (("tilt_deg", tilt_lag_deg), ("heading_deg", heading_lag_deg)):
         if lag_deg:
             known[name] = math.hypot(known.get(name, getattr(errors, name)), lag_deg)
     return replace(errors, **known) if known else errors

@@ -120,6 +120,12 @@ def _normalised(picture: NDArray[np.uint8] | FloatImage, radius_px: int, weight:
     """Each pixel less the mean of its neighbourhood, over its standard deviation, weighted."""
     if radius_px == 0:
         return _masked(picture.astype(np.float32), weight)
+    if weight is None and picture.dtype == np.uint8:
+        from engine.kernels import local_normalisation  # numba takes a while to import
+
+        if radius_px <= local_normalisation.MAX_RADIUS_PX:
+            found = local_normalisation.normalised(np.ascontiguousarray(picture), radius_px, _NOISE_VARIANCE)
+            return np.asarray(found, np.float32)
     box = (2 * radius_px + 1, 2 * radius_px + 1)
     if weight is None:
         mean = cv2.boxFilter(picture, cv2.CV_32F, box)

@@ -306,7 +306,10 @@ class Fix:
     @property
     def relative_covariance_m2(self) -> NDArray[np.float64]:
         """(2, 2) east and north against the map, and against other fixes on it: without the map's own error."""
-        return self.covariance_m2[:2, :2] - self.map_sigma_m**2 * np.eye(2)
+        out = self.covariance_m2[:2, :2].copy()
+        out[0, 0] -= self.map_sigma_m**2
+        out[1, 1] -= self.map_sigma_m**2
+        return out
 
     @property
     def relative_sigma_m(self) -> float:

@@ -50,21 +50,21 @@ class SampleMap:
         Returns:
             Samples: in metres east, north and up.
         """
-        step = math.ceil(window.area_px / BLOCK_PX**2 / max_samples)
-        parts = []
+        from engine.kernels.map_points import every_nth  # numba takes a while to import
+
+        step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
         for cell in self._cells_under(window, level):
-            samples, shape = self._cell(cell, level)
-            rows, columns = (
-                slice(max(0, (low - start) // BLOCK_PX), -(-(low + size - start) // BLOCK_PX))
-                for low, size, start in (
-                    (window.y0, window.height_px, cell.y0),
-                    (window.x0, window.width_px, cell.x0),
-                )
-            )
-            inside = np.arange(shape[0])[rows, None] * shape[1] + np.arange(shape[1])[columns]
-            index = inside.ravel()[::step]
+            samples, (rows, columns) = self._cell(cell, level)
+            x, y = window.x0 - cell.x0, window.y0 - cell.y0
+            last = (
+                min(rows, -(-(y + window.height_px) // BLOCK_PX)),
+                min(columns, -(-(x + window.width_px) // BLOCK_PX)),
+            )  # blocks; the remainder beyond a cell's last one has none
+            first = (min(max(0, y // BLOCK_PX), last[0]), min(max(0, x // BLOCK_PX), last[1]))
             arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
-            parts.append([array.take(index, axis=0) for array in arrays])  # twice as fast as indexing
+            parts.append(every_nth(arrays, first, last, columns, step))
+        if len(parts) == 1:
+            return Samples(*parts[0])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _cells_under(self, window: Window, level: int) -> list[Window]:

@@ -44,6 +44,7 @@ class Georeference:
         self._to_enu = Warp(self._exact_enu, box, tolerance=1e-4)
         enu = self._to_enu(np.stack(np.meshgrid(box[:, 0], box[:, 1]), axis=-1).reshape(-1, 2))
         self._from_enu = Warp(self._exact_pixel, np.stack([enu.min(axis=0), enu.max(axis=0)]), tolerance=1e-4)
+        self._lonlat = Warp(self._to_geodetic, box, tolerance=1e-9)  # degrees: 0.1 mm
         self.gsd_m_per_px = math.sqrt(abs(np.linalg.det(self.enu_jacobian(grid.centre_px))))
         if not GSD_RANGE_M[0] <= self.gsd_m_per_px <= GSD_RANGE_M[1]:
             raise MapError(f"map: expected 1 mm to 1 km a pixel, got {self.gsd_m_per_px:.3g} m; is its CRS right?")
@@ -107,7 +108,7 @@ class Georeference:
         Returns:
             WGS84 latitude and longitude in degrees, (...,) each.
         """
-        lonlat = self._to_geodetic(np.asarray(xy_px, np.float64))
+        lonlat = self._lonlat(np.asarray(xy_px, np.float64))
         return lonlat[..., 1], lonlat[..., 0]
 
     def pixel_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:

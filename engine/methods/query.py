@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.covariance import AssumedErrors, with_frame_accuracy
-from engine.geo import enu_from_body, wrap_heading_deg
+from engine.geo import enu_from_body, inverse_2x2, wrap_heading_deg
 from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior
@@ -108,7 +108,7 @@ class Query:
         if prior is None:
             return Window(0, 0, self.site.width_px, self.site.height_px)
         moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
-        moved_px = np.abs(np.linalg.solve(self.jacobian, moved_m))
+        moved_px = np.abs(inverse_2x2(self.jacobian) @ moved_m)
         size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
         slack = 2.0 * SPREAD_SIGMAS * prior.sigma_m / self.site.gsd_m_per_px
         width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
