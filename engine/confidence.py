@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,5 +187,10 @@ def probability(features: PeakFeatures | PoseFeatures, model: PeakModel | PoseMo
         model: weights; None takes the fitted ones.
     """
     model = model or (PEAK_MODEL if isinstance(features, PeakFeatures) else POSE_MODEL)
-    logit = float(np.dot(astuple(model), regressors(features)))
+    logit = float(np.dot(_weights(model), regressors(features)))
     return 1.0 / (1.0 + math.exp(-logit))
+
+
+@lru_cache
+def _weights(model: PeakModel | PoseModel) -> NDArray[np.float64]:
+    return np.array(astuple(model))

@@ -137,13 +137,15 @@ class DenseFit:
 
     Attributes:
         pose: at which picture and map agree best.
-        correlation: of picture and map at the samples, before the last step.
+        first_correlation: of picture and map at the samples, at the pose to begin with.
+        correlation: the same before the last step.
         converged: whether the last step was small.
         projection: of the samples before the last step.
         offsets_m: (3, N) of the samples from the slope's pivot.
     """
 
     pose: Pose
+    first_correlation: float
     correlation: float
     converged: bool
     projection: _Projection
@@ -191,7 +193,7 @@ def refine(
     offset_m = np.ascontiguousarray((samples.points_m - prior.pose.center_m).T)
     # The loops are compiled for one memory layout of the matrices.
     rotation, prior_rotation = (np.ascontiguousarray(pose.rotation) for pose in (start, prior.pose))
-    found, converged, rotation, center_m, slope, *seen = gauss_newton(
+    found, converged, first_correlation, rotation, center_m, slope, *seen = gauss_newton(
         picture.levels, picture.matrix, rotation, start.center_m, start.slope,
         prior_rotation, prior.pose.center_m, prior.pose.slope, prior.precision,
         offset_m, samples.values, samples.gradients, samples.weights,
@@ -200,7 +202,8 @@ def refine(
     if not found:
         return None
     projection = _Projection(*seen)
-    return DenseFit(Pose(rotation, center_m, slope), projection.correlation, converged, projection, offset_m)
+    pose = Pose(rotation, center_m, slope)
+    return DenseFit(pose, first_correlation, projection.correlation, converged, projection, offset_m)
 
 
 def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -160,6 +160,11 @@ def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Arra
     Returns:
         (3, 3), ``v_enu = enu_from_body(...) @ v_body``.
     """
+    return _enu_from_body(roll_deg, pitch_deg, heading_deg).copy()
+
+
+@lru_cache(maxsize=16)  # the steps of a frame ask for the same one
+def _enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
     sr, sp, sh = (math.sin(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     cr, cp, ch = (math.cos(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     # Rz(heading) Ry(pitch) Rx(roll) takes the body to north-east-down; its rows as east, north and -down.
@@ -211,7 +216,7 @@ def chi_square(difference: Array, covariance: Array) -> float:
 def inverse_2x2(matrix: Array) -> Array:
     """The inverse of a (2, 2) matrix that has one, in a tenth of the time of NumPy's."""
     (a, b), (c, d) = matrix.tolist()
-    return np.array([[d, -b], [-c, a]]) / (a * d - b * c)
+    return np.asarray(np.array([[d, -b], [-c, a]]) / (a * d - b * c), np.float64)
 
 
 def transport_covariance(jacobian: Array, covariance: Array) -> Array:

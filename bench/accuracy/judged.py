@@ -15,8 +15,9 @@ from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatc
 from engine.budget import Budget, Deadline
 from engine.confidence import regressors
 from engine.methods.feature_pose import PoseCandidate
-from engine.methods.ncc import Ncc, PeakCandidate
+from engine.methods.ncc import Ncc
 from engine.methods.options import NccOptions, SiftOptions
+from engine.methods.peak_evidence import PeakCandidate
 from engine.methods.query import Query
 from engine.methods.sift import Sift
 from engine.ncc_fft import surface

@@ -43,12 +43,12 @@ def gauss_newton(
         last_step: squared length in standard deviations of a step that is the last.
 
     Returns:
-        Whether a pose was found, and whether the last step was small; rotation, center and slope; of the
-        projection before the last step: rotation, correlation, differences (N,), points (3, N), derivatives (3, N)
-        by the picture and by the map, weights (N,) and cells (N,).
+        Whether a pose was found, and whether the last step was small; the correlation to begin with; rotation,
+        center and slope; of the projection before the last step: rotation, correlation, differences (N,), points
+        (3, N), derivatives (3, N) by the picture and by the map, weights (N,) and cells (N,).
     """
     rotation, center_m, slope = rotation.copy(), center_m.copy(), slope.copy()
-    step, found, converged = np.zeros(_PARAMETERS), True, False
+    step, found, converged, at_first = np.zeros(_PARAMETERS), True, False, np.nan
     while True:
         seen = rotation.copy()
         levels, points, shown, expected, weights, cell, count = project(
@@ -58,6 +58,8 @@ def gauss_newton(
             found = False
         differences, weights, correlation, gain = compare_levels(levels, values, weights)
         expected *= gain
+        if np.isnan(at_first):
+            at_first = correlation
         if found:
             normal, score = normal_equations(shown, expected, points, offset_m, seen, weights, differences, excess)
             normal += precision
@@ -73,8 +75,8 @@ def gauss_newton(
         if not found or converged or steps == 0:
             break
     return (
-        found, converged, rotation, center_m, slope, seen, correlation, differences, points, shown, expected,
-        weights, cell,
+        found, converged, at_first, rotation, center_m, slope, seen, correlation, differences, points, shown,
+        expected, weights, cell,
     )  # fmt: skip
 
 
@@ -134,8 +136,8 @@ def information(shown, expected, points, offset_m, rotation, weights, difference
         cells: number of cells.
 
     Returns:
-        (8, 8) information by the picture's gradients; (8, 8) by both; (8, 8) by the map's; (8, cells) score
-        vectors by the mean of both, summed over the cells.
+        (8, 8) information by the picture's gradients; (8, 8) by both, its symmetric part; (8, 8) by the map's;
+        (8, cells) score vectors by the mean of both, summed over the cells.
     """
     own, common = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros((_PARAMETERS, _PARAMETERS))
     of_map, by_cell = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros((_PARAMETERS, cells))
@@ -148,10 +150,15 @@ def information(shown, expected, points, offset_m, rotation, weights, difference
         by_parameters(two, expected[0, n], expected[1, n], expected[2, n], points, offset_m, rotation, n)
         for i in range(_PARAMETERS):
             by_cell[i, cell[n]] += 0.5 * (one[i] + two[i]) * weight * differences[n]
-            for j in range(_PARAMETERS):
-                own[i, j] += weight * one[i] * one[j]
-                common[i, j] += weight * one[i] * two[j]
-                of_map[i, j] += weight * two[i] * two[j]
+            first, second = weight * one[i], weight * two[i]
+            for j in range(i + 1):
+                own[i, j] += first * one[j]
+                common[i, j] += 0.5 * (first * two[j] + second * one[j])
+                of_map[i, j] += second * two[j]
+    for sums in (own, common, of_map):
+        for i in range(_PARAMETERS):
+            for j in range(i):
+                sums[j, i] = sums[i, j]
     return own, common, of_map, by_cell
 
 

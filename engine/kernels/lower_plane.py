@@ -15,19 +15,26 @@ def lower_plane(offsets, heights_m, share, on_plane_m, rounds):
 
     Args:
         offsets: (N, 2) positions.
-        heights_m: (N,) there.
+        heights_m: (N,) there; NaN where unknown.
         share: of the heights below the plane, 0 to 1.
         on_plane_m: residuals below this have equal weight.
         rounds: of reweighting.
 
     Returns:
-        (3,) level at offset 0, and rise per unit of both offsets.
+        (3,) level at offset 0, and rise per unit of both offsets; and how many heights are known.
     """
-    plane, weights = np.zeros(3), np.ones(len(heights_m))
+    plane, weights, known = np.zeros(3), np.ones(len(heights_m)), 0
+    for n in range(len(heights_m)):
+        if np.isnan(heights_m[n]):
+            weights[n] = 0.0
+        else:
+            known += 1
     for _ in range(rounds):
         one = x = y = xx = xy = yy = z = xz = yz = 0.0
         for n in range(len(heights_m)):
             weight = weights[n]
+            if weight == 0.0:
+                continue
             east, north, up = weight * offsets[n, 0], weight * offsets[n, 1], weight * heights_m[n]
             one += weight
             x += east
@@ -45,6 +52,8 @@ def lower_plane(offsets, heights_m, share, on_plane_m, rounds):
         plane[1], plane[2] = (yy * xz - xy * yz) / size, (xx * yz - xy * xz) / size
         plane[0] = (z - plane[1] * x - plane[2] * y) / one
         for n in range(len(heights_m)):
+            if weights[n] == 0.0:
+                continue
             above = heights_m[n] - plane[0] - plane[1] * offsets[n, 0] - plane[2] * offsets[n, 1]
             weights[n] = (share if above > 0.0 else 1.0 - share) / max(abs(above), on_plane_m)
-    return plane
+    return plane, known

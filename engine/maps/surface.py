@@ -140,10 +140,9 @@ class SurfaceModel:
         from engine.kernels.lower_plane import lower_plane  # numba takes a while to import
 
         heights_m = self.sample(map_xy + _LATTICE * reach_px)
-        known = np.isfinite(heights_m)
-        if 2 * np.count_nonzero(known) < len(known):
+        plane, known = lower_plane(_LATTICE, heights_m, GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
+        if 2 * known < len(_LATTICE):
             return None
-        plane = lower_plane(_LATTICE[known], heights_m[known], GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
         return float(plane[0]), plane[1:] / reach_px
 
     @property

@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from engine.acceptance import judge_peak, judge_second_look
-from engine.confidence import (
-    SECOND_LOOK_MODEL,
-    PeakFeatures,
-    PriorAgreement,
-    peak_features,
-    prior_agreement,
-    probability,
-)
-from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
+from engine.confidence import SECOND_LOOK_MODEL, peak_features, probability
 from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
@@ -27,12 +18,12 @@ from engine.methods.explanation import Explanation, explain_correlation
 from engine.methods.method import Method
 from engine.methods.oblique import is_ground_below, is_oblique
 from engine.methods.options import MatcherOptions
+from engine.methods.peak_evidence import PeakCandidate, agreement_of, features_of, fix_of, with_confidence
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
-from engine.scores import enhance
 from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
@@ -40,29 +31,10 @@ MAX_WINDOW_PX = 8 << 20
 _MAX_CANDIDATES = 4  # of a refused frame
 _SECOND_LOOK = "ncc second look"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
-_EXPECTED_CHI_SQUARE = 2.0  # of two degrees of freedom
 _TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
 _TURNED_SIGMA_DEG = 2.0  # of the heading then
 _MIN_CONFIDENCE_TURNED = 0.9995
-
-
-@dataclass(frozen=True, slots=True)
-class PeakCandidate:
-    """A peak that is not accepted yet.
-
-    Attributes:
-        peak: in pixels of the aligned level.
-        aligned: the hypothesis that it belongs to.
-        fix: what the peak means, if it is accepted; with its confidence where there are features.
-        features: of the confidence model; None where more was searched than a window at one heading and height.
-        searched: heading or height were searched for.
-    """
-
-    peak: Peak
-    aligned: Aligned
-    fix: Fix
-    features: PeakFeatures | None
-    searched: bool
+_MIN_CONFIDENCE_COARSE = 0.999  # of a peak of the coarsest level, from which refinement begins
 
 
 class Ncc(Method):
@@ -101,24 +73,29 @@ class Ncc(Method):
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
-        return self._quick(query) or self.refine(query, self.correlate(query))
+        return self._by_coarse_peak(query) or self.refine(query, self.correlate(query))
 
-    def _quick(self, query: Query) -> Fix | None:
-        if query.prior is None or query.frame.is_doubted or not self._trusts(query) or query.telemetry.height_agl_m is None:
+    def _by_coarse_peak(self, query: Query) -> Fix | None:
+        """A refined fix that begins at the peak of the coarsest level, where that is beyond doubt.
+
+        It costs a fraction of a fine one, and what is refined from it is the same pose.
+        """
+        if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
             return None
-        if not self.options.refine or (query.telemetry.has_tilt and not query.site.has_surface):
-            return None
-        works = expected_window_px(query, self.options)
+        step, works = self._step(query)
         coarser = max(works)
-        if not coarser or not query.scheduler.can_afford("ncc", works[coarser]):
+        if not coarser or not query.scheduler.can_afford(step, works[coarser]):
             return None
-        with query.scheduler.costed("ncc", works[coarser]):
+        with query.scheduler.costed(step, works[coarser]):
             found = self.find(query, coarser=coarser)
             result = found if isinstance(found, NoFix) else self.judge(query, found)
-        if isinstance(result, NoFix) or (result.confidence or 0.0) < 0.999:
+        if isinstance(result, NoFix) or (result.confidence or 0.0) < _MIN_CONFIDENCE_COARSE:
             return None
-        refined = self.refine(query, result)
-        return refined if isinstance(refined, Fix) and refined.stage == "refined" else None
+        work_px = float(query.gray.size)
+        if not query.scheduler.can_afford("refinement", work_px):
+            return None
+        with query.scheduler.costed("refinement", work_px):
+            return Refinement(query, self.samples, self.options).refine_at_once(result)
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
@@ -164,10 +141,7 @@ class Ncc(Method):
 
     def refine(self, query: Query, result: Result) -> Result:
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
-        if not isinstance(result, Fix) or result.stage != "fine" or not self.options.refine:
-            return result
-        # A height that was searched for is not the frame's; an unknown slope would pass for a wrong tilt.
-        if not self._trusts(query) or (query.telemetry.has_tilt and not query.site.has_surface):
+        if not isinstance(result, Fix) or result.stage != "fine" or not self._can_refine(query):
             return result
         if result.attitude is not None:  # found by another heading than the frame's own
             heading_deg = result.attitude.heading_deg
@@ -179,6 +153,14 @@ class Ncc(Method):
             return result
         with query.scheduler.costed("refinement", work_px):
             return Refinement(query, self.samples, self.options).refine(result)
+
+    def _can_refine(self, query: Query) -> bool:
+        """Whether poses are refined: a height that was searched for is not the frame's.
+
+        On a map without a surface model an unknown slope would pass for a wrong tilt.
+        """
+        known = query.telemetry.height_agl_m is not None and self._trusts(query)
+        return self.options.refine and known and not (query.telemetry.has_tilt and not query.site.has_surface)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The correlation surface of a window at the frame's own height and heading."""
@@ -213,10 +195,10 @@ class Ncc(Method):
         if query.scheduler.deadline.remaining_ms < 0:
             detail = "the budget was spent before the peak was known"
             return query.refuse(Reason.LATE, detail, METHOD, window=window)
-        fix = self._fix(correlator, aligned, peak, window, searched=searched)
+        fix = fix_of(correlator, aligned, peak, window, searched=searched)
         found = PeakCandidate(peak, aligned, fix, None, searched)
         no_features = searched or wide or query.prior is None
-        return found if no_features else self._with_confidence(correlator, found)
+        return found if no_features else with_confidence(correlator, found)
 
     def _over_its_ground(
         self, correlator: Correlator, aligned: Aligned, window: Window, peak: Peak | None
@@ -257,8 +239,8 @@ class Ncc(Method):
         for x, y, score in best_positions(scores, max(2, round(exclusion_px)), _MAX_CANDIDATES)[1:]:
             place = corner_px + np.array([x, y])
             peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
-            fix = self._fix(correlator, aligned, peak, found.fix.window, searched=False)
-            fixes.append(replace(fix, confidence=probability(self._features(query, aligned, peak, fix))))
+            fix = fix_of(correlator, aligned, peak, found.fix.window, searched=False)
+            fixes.append(replace(fix, confidence=probability(features_of(query, aligned, peak, fix))))
         return tuple(fixes)
 
     def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
@@ -327,8 +309,8 @@ class Ncc(Method):
         if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
             elsewhere = found.peak.second_score / found.peak.score * peak.score
             peak = replace(peak, second_score=max(peak.second_score, elsewhere))
-        fix = self._fix(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
-        features = peak_features(peak, looked.chance_sigma, self._agreement(query, fix))
+        fix = fix_of(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
+        features = peak_features(peak, looked.chance_sigma, agreement_of(query, fix))
         fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
         return PeakCandidate(peak, found.aligned, fix, features, found.searched)
 
@@ -367,57 +349,3 @@ class Ncc(Method):
         known = pose if pose.grid_heading_deg is not None else replace(pose, grid_heading_deg=0.0)
         with query.scheduler.stage("align"):
             return correlator.align(known, level)
-
-    def _with_confidence(self, correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
-        """The candidate with its probability; one that is not high must also beat the null hypothesis."""
-        query, peak, aligned = correlator.query, found.peak, found.aligned
-        features = self._features(query, aligned, peak, found.fix)
-        confidence = probability(features)
-        if confidence < self.options.rule.null_test_below:
-            null_score = self._null_score(correlator, aligned, found.fix.window)
-            peak = replace(peak, second_score=max(peak.second_score, null_score))
-            features = self._features(query, aligned, peak, found.fix)
-            confidence = probability(features)
-        return replace(found, peak=peak, features=features, fix=replace(found.fix, confidence=confidence))
-
-    def _features(self, query: Query, aligned: Aligned, peak: Peak, fix: Fix) -> PeakFeatures:
-        """What the confidence model is told of a peak."""
-        return peak_features(peak, score_sigma(aligned.template.numel()), self._agreement(query, fix))
-
-    def _agreement(self, query: Query, fix: Fix) -> PriorAgreement:
-        """Of a fix with the prior; without one any place of the map is as good as another."""
-        site = query.site
-        if query.prior is None or query.prior_px is None:
-            area_m2 = site.width_px * site.height_px * site.gsd_m_per_px**2
-            return PriorAgreement(_EXPECTED_CHI_SQUARE, math.sqrt(area_m2 / 12.0))
-        return prior_agreement(fix, site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
-
-    def _null_score(self, correlator: Correlator, aligned: Aligned, window: Window) -> float:
-        """The best score of the null-hypothesis templates: what this window gives to chance."""
-        options, best = self.options, -1.0
-        for patch in correlator.nowhere(aligned):
-            enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
-            template = torch.from_numpy(enhanced).to(correlator.query.device)
-            rival = correlator.search(replace(aligned, template=template), window)
-            best = best if rival is None else max(best, rival.score)
-        return best
-
-    def _fix(self, correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
-        """The camera's nadir and its covariance; the heading too where it was searched for."""
-        query, pose = correlator.query, aligned.pose
-        errors = query.errors(self.options.errors)
-        height_m = pose.height_agl_m
-        assert height_m is not None  # asked for before
-        rows, columns = aligned.template.shape
-        peak_px2 = peak_covariance_px(peak, rows * columns)
-        peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)
-        covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
-        return query.fix(
-            METHOD,
-            correlator.nadir_px(peak, aligned),
-            covariance,
-            score=peak.score,
-            window=window,
-            grid_attitude=pose.grid_attitude if searched else None,
-            map_sigma_m=errors.map_m,
-        )

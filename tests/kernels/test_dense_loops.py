@@ -117,7 +117,8 @@ def test_a_share_of_the_heights_is_below_their_plane(share):
     rng = np.random.default_rng(8)
     offsets = rng.uniform(-1, 1, (225, 2))
     heights_m = 100.0 + offsets @ [2.0, -5.0] + rng.exponential(6.0, 225)
-    plane = lower_plane(offsets, heights_m, share, 0.01, 60)
+    plane, known = lower_plane(offsets, heights_m, share, 0.01, 60)
+    assert known == len(heights_m)
     above = heights_m - plane[0] - offsets @ plane[1:]
     assert np.mean(above < 0) == pytest.approx(share, abs=0.01)
 
@@ -132,4 +133,8 @@ def test_a_share_of_the_heights_is_below_their_plane(share):
 
 def test_heights_of_a_plane_have_that_plane():
     offsets = np.random.default_rng(9).uniform(-1, 1, (40, 2))
-    np.testing.assert_allclose(lower_plane(offsets, 5.0 + offsets @ [1.0, 2.0], 0.2, 0.3, 8), [5, 1, 2], atol=1e-9)
+    heights_m = 5.0 + offsets @ [1.0, 2.0]
+    heights_m[::3] = np.nan
+    plane, known = lower_plane(offsets, heights_m, 0.2, 0.3, 8)
+    np.testing.assert_allclose(plane, [5, 1, 2], atol=1e-9)
+    assert known == np.isfinite(heights_m).sum()

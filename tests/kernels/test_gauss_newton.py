@@ -61,7 +61,8 @@ def test_sums_for_the_covariance_are_those_of_the_definition(samples):
         shown, expected, points, offset_m, rotation, weights, differences, cells, 64
     )
     for found, a, b in ((own, one, one), (common, one, two), (of_map, two, two)):
-        np.testing.assert_allclose(found, (a.T * weights) @ b, rtol=1e-10, atol=1e-9)
+        right = (a.T * weights) @ b
+        np.testing.assert_allclose(found, 0.5 * (right + right.T), rtol=1e-10, atol=1e-9)
     scores = 0.5 * (one + two) * (weights * differences)[:, None]
     right = np.array([np.bincount(cells, score, 64) for score in scores.T])
     np.testing.assert_allclose(by_cell, right, rtol=1e-10, atol=1e-10)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
-from engine.methods.ncc import Ncc
+from engine.methods import ncc
 from engine.methods.options import NccOptions
 from engine.sim import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_town, site_of
@@ -64,13 +64,13 @@ def turn_between(a_deg, b_deg):
 @pytest.fixture
 def aligned_heights(monkeypatch):
     """The heights of the hypotheses behind the fixes; a fix does not have them."""
-    heights, real = [], Ncc._fix
+    heights, real = [], ncc.fix_of
 
-    def noting(self, correlator, aligned, *rest, **named):
+    def noting(correlator, aligned, *rest, **named):
         heights.append(aligned.pose.height_agl_m)
-        return real(self, correlator, aligned, *rest, **named)
+        return real(correlator, aligned, *rest, **named)
 
-    monkeypatch.setattr(Ncc, "_fix", noting)
+    monkeypatch.setattr(ncc, "fix_of", noting)
     return heights
 
 

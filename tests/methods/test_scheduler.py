@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from engine import Budget, Fix, MatcherOptions, Navigator, NccOptions, NoFix, OrthoMap, Prior, Reason, SceneMatcher
+from engine.methods.ncc import Ncc
 from engine.methods.sift import Sift
 
 NADIR = np.array([315.0, 296.0])
@@ -81,14 +82,37 @@ def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, 
 
 @pytest.mark.parametrize(("method", "step"), [("ncc", "ncc"), ("sift", "sift")])
 def test_with_less_time_a_coarse_fix_of_the_same_place(ground, make, frame, prior, method, step):
-    fine = make(method)
-    work = []
-    fine._costs.upper_bound_ms = lambda name, pixels: work.append(pixels) or 0.0
-    fine.locate(frame, prior, HURRY)
-    # A pixel costs so much that the finest step is 1.5 times the budget.
-    fix = make(method, **{step: 1.5 * HURRY.total_ms / work[0]}).locate(frame, prior, HURRY)
+    per_unit = {step: cost_of_the_finest(make, frame, prior, method, step)}
+    fix = make(method, **per_unit, refinement=1e9).locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
+
+
+def cost_of_the_finest(make, frame, prior, method, step):
+    """Per unit of work, so that the finest variant of a step takes 1.5 times the budget."""
+    probe, work = make(method, refinement=1e9), []
+    known = probe._costs.upper_bound_ms
+
+    def noting(name, amount):
+        work.extend([amount] if name == step else [])
+        return known(name, amount)
+
+    probe._costs.upper_bound_ms = noting
+    probe.locate(frame, prior, HURRY)
+    return 1.5 * HURRY.total_ms / max(work)
+
+
+def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, frame, prior, monkeypatch):
+    """Where there is no time for the finest level; and where there is, the coarse one is enough."""
+    hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc", "ncc")).locate(frame, prior, HURRY)
+    by_coarse = make("ncc").locate(frame, prior)
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda self, query: None)
+    by_fine = make("ncc").locate(frame, prior)
+    for fix in (hurried, by_coarse, by_fine):
+        assert off_m(ground, fix) < 0.3
+        assert fix.stage == "refined"
+    apart_m = math.hypot(by_coarse.east_m - by_fine.east_m, by_coarse.north_m - by_fine.north_m)
+    assert apart_m < by_fine.relative_sigma_m
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])

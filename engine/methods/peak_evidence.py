@@ -1,0 +1,95 @@
+"""What a correlation peak means: the fix that it makes if it is accepted, and how probable it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+
+from engine.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
+from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
+from engine.methods.correlation import METHOD, Aligned, Correlator
+from engine.methods.query import Query
+from engine.scores import enhance
+from engine.values import Fix, Peak, Window
+
+_EXPECTED_CHI_SQUARE = 2.0  # of two degrees of freedom
+
+
+@dataclass(frozen=True, slots=True)
+class PeakCandidate:
+    """A peak that is not accepted yet.
+
+    Attributes:
+        peak: in pixels of the aligned level.
+        aligned: the hypothesis that it belongs to.
+        fix: what the peak means, if it is accepted; with its confidence where there are features.
+        features: of the confidence model; None where more was searched than a window at one heading and height.
+        searched: heading or height were searched for.
+    """
+
+    peak: Peak
+    aligned: Aligned
+    fix: Fix
+    features: PeakFeatures | None
+    searched: bool
+
+
+def with_confidence(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
+    """The candidate with its probability; one that is not high must also beat the null hypothesis."""
+    query, peak, aligned = correlator.query, found.peak, found.aligned
+    features = features_of(query, aligned, peak, found.fix)
+    confidence = probability(features)
+    if confidence < correlator.options.rule.null_test_below:
+        null_score = _null_score(correlator, aligned, found.fix.window)
+        peak = replace(peak, second_score=max(peak.second_score, null_score))
+        features = features_of(query, aligned, peak, found.fix)
+        confidence = probability(features)
+    return replace(found, peak=peak, features=features, fix=replace(found.fix, confidence=confidence))
+
+
+def features_of(query: Query, aligned: Aligned, peak: Peak, fix: Fix) -> PeakFeatures:
+    """What the confidence model is told of a peak."""
+    return peak_features(peak, score_sigma(aligned.template.numel()), agreement_of(query, fix))
+
+
+def agreement_of(query: Query, fix: Fix) -> PriorAgreement:
+    """Of a fix with the prior; without one any place of the map is as good as another."""
+    site = query.site
+    if query.prior is None or query.prior_px is None:
+        area_m2 = site.width_px * site.height_px * site.gsd_m_per_px**2
+        return PriorAgreement(_EXPECTED_CHI_SQUARE, math.sqrt(area_m2 / 12.0))
+    return prior_agreement(fix, site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+
+
+def _null_score(correlator: Correlator, aligned: Aligned, window: Window) -> float:
+    """The best score of the null-hypothesis templates: what this window gives to chance."""
+    options, best = correlator.options, -1.0
+    for patch in correlator.nowhere(aligned):
+        enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
+        template = torch.from_numpy(enhanced).to(correlator.query.device)
+        rival = correlator.search(replace(aligned, template=template), window)
+        best = best if rival is None else max(best, rival.score)
+    return best
+
+
+def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
+    """The camera's nadir and its covariance; the heading too where it was searched for."""
+    query, pose = correlator.query, aligned.pose
+    errors = query.errors(correlator.options.errors)
+    height_m = pose.height_agl_m
+    assert height_m is not None  # asked for before
+    rows, columns = aligned.template.shape
+    peak_px2 = peak_covariance_px(peak, rows * columns)
+    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)
+    covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
+    return query.fix(
+        METHOD,
+        correlator.nadir_px(peak, aligned),
+        covariance,
+        score=peak.score,
+        window=window,
+        grid_attitude=pose.grid_attitude if searched else None,
+        map_sigma_m=errors.map_m,
+    )
