@@ -12,7 +12,6 @@ References:
     https://doi.org/10.1214/aoms/1177703732 (the variance of such an estimate).
 """
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -28,7 +27,6 @@ _STEP_SIGMAS = 2e-2  # a step this small, in standard deviations of the pose, is
 _PAIRS = 24  # pairs of matches that give candidate centres where the attitude is known
 _SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
 _REACH_SIGMAS = 4.0
-_FAR_PX = 1e9  # assigned coordinates of points behind the camera
 _MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
 
 
@@ -172,17 +170,10 @@ def reproject(problem: Problem, R: Array, center: Array) -> Reprojection:
     Returns:
         Pixels and squared distances; points behind the camera are far off.
     """
-    x = R @ problem.points - (R @ center)[:, None]
-    behind = x[2] < 1e-9
-    x[2, behind] = 1.0
-    near = 1 / x[2]
-    projected = problem.K[:2, :2] @ (x[:2] * near) + problem.K[:2, 2:]
-    projected[:, behind] = _FAR_PX
-    x[:2] *= near
-    x[2] = near
-    residual = projected - problem.pixels
-    residual *= residual
-    return Reprojection(x, projected, residual[0] + residual[1])
+    from engine.kernels import pose_fit  # numba takes a while to import
+
+    rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
+    return Reprojection(*pose_fit.reproject(problem.points, problem.pixels, problem.K, rotation, center))
 
 
 def gauss_newton(
@@ -200,52 +191,18 @@ def gauss_newton(
     Returns:
         The pose, or None where there are too few inliers or they do not determine it.
     """
-    square = problem.tolerance_px**2
-    reach = slack**2 * square
-    view, variance, freedom = reproject(problem, R, center), reach / 9, math.inf
-    inliers = view.squared <= reach
-    for _ in range(steps):
-        if (count := np.count_nonzero(inliers)) < problem.min_inliers:
-            return None
-        gain, noise = _biweight_factors(0.5 * reach / variance)
-        scale = noise * _student(freedom) * variance
-        normal, gradient = _normal_equations(problem, view, np.maximum(1 - view.squared / reach, 0) ** 2, scale)
-        covariance = _inverse(problem, normal)
-        if covariance is None:
-            return None
-        gradient[3:] -= problem.precision @ turn_from_attitude(problem, R)
-        delta = covariance @ gradient
-        center = center + R.T @ delta[:3]
-        R = cv2.Rodrigues(delta[3:])[0] @ R
-        view = reproject(problem, R, center)
-        # The trace is the number of parameters that the matches determine; the prior determines the rest.
-        freedom = 2 * count - float(np.vdot(covariance, normal))
-        variance = _variance_px2(float((problem.weights * inliers) @ view.squared) / freedom, problem)
-        inliers, reach = view.squared <= square, max(square, _REACH_SIGMAS**2 * variance)
-        if float(delta @ gradient) < _STEP_SIGMAS**2:
-            break
-    return Fit(R, center, view, inliers, gain * normal, variance)
+    from engine.kernels.pose_fit import fit_pose  # numba takes a while to import
 
-
-def _normal_equations(
-    problem: Problem, view: Reprojection, agreement: Array, variance: float
-) -> tuple[Array, Array]:
-    """Return J^T W J (6, 6) and -J^T W r (6,), W over the variance, for a step of the centre and of the rotation.
-
-    In the camera's axes, with x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel
-    is K x / z.
-    """
-    u, v, near = view.tangents
-    J = np.zeros((6, 2, len(u)))
-    J[0, 0] = J[1, 1] = -near
-    J[2, 0], J[2, 1] = u * near, v * near
-    J[4, 1] = u * v
-    J[3, 0], J[3, 1] = -J[4, 1], -1 - v * v
-    J[4, 0] = 1 + u * u
-    J[5, 0], J[5, 1] = -v, u
-    J = problem.K[:2, :2] @ J
-    weighted, flat = (J * (problem.weights * agreement)).reshape(6, -1), J.reshape(6, -1)
-    return weighted @ flat.T / variance, weighted @ (problem.pixels - view.projected).ravel() / variance
+    rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
+    attitude = rotation if problem.attitude is None else np.ascontiguousarray(problem.attitude)
+    found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
+        problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
+        problem.tolerance_px, problem.noise_floor_px, problem.min_inliers,
+        rotation, center, steps, slack, _REACH_SIGMAS, _STEP_SIGMAS,
+    )  # fmt: skip
+    if not found:
+        return None
+    return Fit(rotation, center, Reprojection(tangents, projected, squared), inliers, information, variance)
 
 
 def _inverse(problem: Problem, information: Array) -> Array | None:
@@ -254,25 +211,6 @@ def _inverse(problem: Problem, information: Array) -> Array | None:
     total[3:, 3:] += problem.precision
     found, covariance = cv2.invert(total, flags=cv2.DECOMP_CHOLESKY)
     return np.asarray(covariance) if found else None
-
-
-def _biweight_factors(u: float) -> tuple[float, float]:
-    """Return the efficiency factors of the biweight w = (1 - r^2 / T^2)^2 for normal noise s, u = T^2 / (2 s^2).
-
-    The first factor turns the sum of w J^T J into the derivative that the sum of w J^T r is expected to have, the
-    second s^2 into the variance that makes it the inverse covariance (Huber's sandwich): with q = r^2 / (2 s^2),
-    which is exponential, they are  E[w q] / E[w]  and  E[w^2 q] / E[w q].
-    """
-    u = min(u, 500.0)
-    moments, tail = [1 - math.exp(-u)], math.exp(-u)  # of q up to u: g_n = n g_(n-1) - u^n e^-u
-    for n in range(1, 6):
-        tail *= u
-        moments.append(n * moments[-1] - tail)
-    g = [moment / u**n for n, moment in enumerate(moments)]
-    weight = g[0] - 2 * g[1] + g[2]
-    sensitivity = u * (g[1] - 2 * g[2] + g[3])
-    noise = u * (g[1] - 4 * g[2] + 6 * g[3] - 4 * g[4] + g[5])
-    return sensitivity / weight, noise / sensitivity
 
 
 def turn_from_attitude(problem: Problem, R: Array) -> Array:
@@ -289,25 +227,6 @@ def turn_from_attitude(problem: Problem, R: Array) -> Array:
         return np.zeros(3)
     turn: Array = cv2.Rodrigues(R @ problem.attitude.T)[0][:, 0]
     return turn
-
-
-def _variance_px2(mean: float, problem: Problem) -> float:
-    """Return the variance s^2 at which distances r, truncated at T, have this mean square per axis.
-
-    E[r^2 | r < T] = 2 s^2 (1 - u / (e^u - 1)),  u = T^2 / (2 s^2).
-    """
-    mean = max(mean, problem.noise_floor_px**2)
-    half = 0.5 * problem.tolerance_px**2
-    variance = min(mean, half)
-    for _ in range(5):
-        u = min(half / variance, 50.0)
-        variance = min(mean / (1 - u / math.expm1(u)), half)
-    return variance
-
-
-def _student(freedom: float) -> float:
-    """Return the variance of Student's t over a normal's, since the variance is itself estimated."""
-    return 1.0 if math.isinf(freedom) else freedom / max(freedom - 2, 1.0)
 
 
 def match_covariance(problem: Problem, fit: Fit) -> Array | None:

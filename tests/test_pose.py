@@ -12,8 +12,8 @@ from scipy.stats import chi2, norm
 
 from bench.accuracy.pose_scenes import GROUNDS, WRONG
 from bench.accuracy.poses import CHI2_3_SIGMA, accepted, coverage
-from engine import pnp
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.kernels.pose_fit import biweight_factors
 from engine.pose import AttitudePrior, PoseOptions, PoseStart, PoseStats, solve_pose
 
 K = np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]])
@@ -232,7 +232,7 @@ def test_biweight_factors_are_their_integrals(u):
         return quad(lambda q: f(q, (1 - q / u) ** 2) * math.exp(-q), 0, u)[0]
 
     weight, pull, noise = mean(lambda q, w: w), mean(lambda q, w: w * q), mean(lambda q, w: w * w * q)
-    np.testing.assert_allclose(pnp._biweight_factors(u), (pull / weight, noise / pull), rtol=1e-6)
+    np.testing.assert_allclose(biweight_factors(u), (pull / weight, noise / pull), rtol=1e-6)
 
 
 def test_where_the_search_began_does_not_show():

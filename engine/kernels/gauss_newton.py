@@ -64,10 +64,10 @@ def gauss_newton(
             normal, score = normal_equations(shown, expected, points, offset_m, seen, weights, differences, excess)
             normal += precision
             off = parameters_between(rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope)
-            score -= _product(precision, off.reshape(_PARAMETERS, 1))[:, 0]
+            score -= small_product(precision, off.reshape(_PARAMETERS, 1))[:, 0]
             found = solve(normal, score, step)
         if found:
-            rotation = _product(rotation_of(step[3:6]), rotation)
+            rotation = small_product(rotation_of(step[3:6]), rotation)
             center_m += step[:3]
             slope += step[6:]
             converged = np.sum(step * score) < last_step
@@ -198,24 +198,41 @@ def rotation_of(vector):
     cosine = 0.5 if angle < 1e-4 else (1.0 - np.cos(angle)) / (angle * angle)
     x, y, z = vector[0], vector[1], vector[2]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + sine * cross + cosine * _product(cross, cross)
+    return np.eye(3) + sine * cross + cosine * small_product(cross, cross)
 
 
 @compiled
 def parameters_between(rotation, center_m, slope, other_rotation, other_center_m, other_slope):
     """The parameters (8,) of the step from another pose to this one."""
-    turn = _product(rotation, np.ascontiguousarray(other_rotation.T))
-    sine = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    size = np.sqrt(np.sum(sine * sine))
-    angle = np.arctan2(size, 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0))
     out = np.empty(_PARAMETERS)
     out[:3], out[6:] = center_m - other_center_m, slope - other_slope
-    out[3:6] = sine * (1.0 if size < 1e-9 else angle / size)
+    out[3:6] = rotation_vector(small_product(rotation, np.ascontiguousarray(other_rotation.T)))
     return out
 
 
 @compiled
-def _product(a, b):
+def rotation_vector(turn):
+    """The rotation vector (3,) of a rotation (3, 3)."""
+    sine = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    size, cosine = np.sqrt(np.sum(sine * sine)), 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
+    angle = np.arctan2(size, cosine)
+    if cosine > -0.9:
+        return sine * (1.0 if size < 1e-9 else angle / size)
+    # Towards half a turn the sine vanishes: the axis is that of the symmetric part, 1 - cosine times a a^T.
+    k = 0
+    for i in range(1, 3):
+        if turn[i, i] > turn[k, k]:
+            k = i
+    axis = np.empty(3)
+    axis[k] = np.sqrt(max((turn[k, k] - cosine) / (1.0 - cosine), 0.0))
+    for i in range(3):
+        if i != k:
+            axis[i] = (turn[k, i] + turn[i, k]) / (2.0 * (1.0 - cosine) * axis[k])
+    return axis * (-angle if np.sum(axis * sine) < 0.0 else angle)
+
+
+@compiled
+def small_product(a, b):
     """Of two small matrices; numba's own needs SciPy."""
     out = np.zeros((a.shape[0], b.shape[1]))
     for i in range(a.shape[0]):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from engine.kernels.gauss_newton import (
@@ -14,6 +16,7 @@ from engine.kernels.gauss_newton import (
     normal_equations,
     parameters_between,
     rotation_of,
+    rotation_vector,
     solve,
 )
 
@@ -72,6 +75,14 @@ def test_sums_for_the_covariance_are_those_of_the_definition(samples):
 def test_rotations_are_those_of_opencv(vector):
     vector = np.array(vector)
     np.testing.assert_allclose(rotation_of(vector), cv2.Rodrigues(vector)[0], atol=1e-9)
+
+
+@given(axis=st.tuples(ANGLES, ANGLES, ANGLES), angle=st.floats(0.0, math.pi - 1e-6))
+def test_rotation_vectors_are_those_of_the_rotation_up_to_half_a_turn(axis, angle):
+    axis = np.array(axis)
+    assume(np.linalg.norm(axis) > 1e-3)
+    vector = axis / np.linalg.norm(axis) * angle
+    np.testing.assert_allclose(rotation_vector(cv2.Rodrigues(vector)[0]), vector, atol=1e-7)
 
 
 @given(vector=st.tuples(ANGLES, ANGLES, ANGLES), other=st.tuples(ANGLES, ANGLES, ANGLES))

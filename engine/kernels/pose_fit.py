@@ -1,0 +1,219 @@
+"""Gauss-Newton over the six parameters of a pose by matched points, in one compiled loop.
+
+Arrays of matches are (3, N), (2, N) or (N,) float64, and names are those of :mod:`engine.pnp`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from engine.kernels.gauss_newton import rotation_of, rotation_vector, small_product, solve
+from engine.kernels.jit import compiled
+
+_SIX = 6
+_FAR_PX = 1e9  # assigned coordinates of points behind the camera
+
+
+@compiled
+def reproject(points, pixels, matrix, rotation, center):
+    """Reproject all matches.
+
+    Args:
+        points: (3, N) of the map.
+        pixels: (2, N) of the picture.
+        matrix: (3, 3) pinhole.
+        rotation: (3, 3) of cam_from_map.
+        center: (3,) of the camera.
+
+    Returns:
+        (3, N) x / z, y / z and 1 / z in the camera; (2, N) pixels, far off for points behind the camera; (N,)
+        squared distances.
+    """
+    count = pixels.shape[1]
+    tangents, projected, squared = np.empty((3, count)), np.empty((2, count)), np.empty(count)
+    for n in range(count):
+        x, y, z = points[0, n] - center[0], points[1, n] - center[1], points[2, n] - center[2]
+        across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        is_behind = depth < 1e-9
+        near = 1.0 if is_behind else 1.0 / depth
+        u, v = across * near, down * near
+        tangents[0, n], tangents[1, n], tangents[2, n] = u, v, near
+        if is_behind:
+            projected[0, n] = projected[1, n] = _FAR_PX
+        else:
+            projected[0, n] = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]
+            projected[1, n] = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]
+        squared[n] = (projected[0, n] - pixels[0, n]) ** 2 + (projected[1, n] - pixels[1, n]) ** 2
+    return tangents, projected, squared
+
+
+@compiled
+def fit_pose(
+    points, pixels, matrix, weights, attitude, precision, tolerance_px, noise_floor_px, least,
+    rotation, center, steps, slack, reach_sigmas, step_sigmas,
+):  # fmt: skip
+    """Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
+
+    Args:
+        points: (3, N) of the map.
+        pixels: (2, N) of the picture.
+        matrix: (3, 3) pinhole.
+        weights: (N,) relative inverse variances.
+        attitude: (3, 3) known rotation.
+        precision: (3, 3) inverse covariance of its angles, 0 where it is not known.
+        tolerance_px: of an inlier.
+        noise_floor_px: least standard deviation of a pixel.
+        least: number of inliers with which to go on.
+        rotation: (3, 3) to begin with.
+        center: (3,) to begin with.
+        steps: at most, 1 or more.
+        slack: factor on the tolerance in the first step.
+        reach_sigmas: standard deviations at which a match has no weight any more.
+        step_sigmas: a step this small, in standard deviations of the pose, is the last.
+
+    Returns:
+        Whether there is a pose; rotation, center; what :func:`reproject` returns; inliers (N,) bool; information
+        (6, 6) by the matches alone; variance of a pixel's x and y.
+    """
+    square = tolerance_px * tolerance_px
+    reach = slack * slack * square
+    variance, freedom, found = reach / 9.0, np.inf, True
+    tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
+    inliers, information = squared <= reach, np.zeros((_SIX, _SIX))
+    while True:
+        count = np.count_nonzero(inliers)
+        found = count >= least
+        if not found:
+            break
+        gain, noise = biweight_factors(0.5 * reach / variance)
+        scale = noise * student(freedom) * variance
+        normal, gradient = normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, scale)
+        covariance = np.zeros((_SIX, _SIX))
+        found = _invert(normal, precision, covariance)
+        if not found:
+            break
+        turn = rotation_vector(small_product(rotation, np.ascontiguousarray(attitude.T)))
+        for i in range(3):
+            for j in range(3):
+                gradient[3 + i] -= precision[i, j] * turn[j]
+        delta = np.zeros(_SIX)
+        for i in range(_SIX):
+            for j in range(_SIX):
+                delta[i] += covariance[i, j] * gradient[j]
+        center = center + _turned_back(rotation, delta)
+        rotation = small_product(rotation_of(delta[3:]), rotation)
+        tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
+        # The trace is the number of parameters that the matches determine; the prior determines the rest.
+        freedom = 2.0 * count - np.sum(covariance * normal)
+        mean = 0.0
+        for n in range(weights.size):
+            if inliers[n]:
+                mean += weights[n] * squared[n]
+        variance = variance_px2(mean / freedom, tolerance_px, noise_floor_px)
+        inliers, reach, information = squared <= square, max(square, reach_sigmas**2 * variance), gain * normal
+        steps -= 1
+        if np.sum(delta * gradient) < step_sigmas**2 or steps == 0:
+            break
+    return found, rotation, center, tangents, projected, squared, inliers, information, variance
+
+
+@compiled
+def normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, variance):
+    """J^T W J (6, 6) and -J^T W r (6,), W over the variance, for a step of the centre and of the rotation.
+
+    In the camera's axes, with x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel
+    is K x / z.
+    """
+    normal, gradient, row = np.zeros((_SIX, _SIX)), np.zeros(_SIX), np.empty((2, _SIX))
+    for n in range(weights.size):
+        agreement = max(1.0 - squared[n] / reach, 0.0)
+        weight = weights[n] * agreement * agreement / variance
+        if weight <= 0.0:
+            continue
+        u, v, near = tangents[0, n], tangents[1, n], tangents[2, n]
+        by_u = (-near, 0.0, u * near, -u * v, 1.0 + u * u, -v)
+        by_v = (0.0, -near, v * near, -1.0 - v * v, u * v, u)
+        for axis in range(2):
+            off = pixels[axis, n] - projected[axis, n]
+            for i in range(_SIX):
+                row[axis, i] = matrix[axis, 0] * by_u[i] + matrix[axis, 1] * by_v[i]
+                gradient[i] += weight * row[axis, i] * off
+            for i in range(_SIX):
+                weighted = weight * row[axis, i]
+                for j in range(i + 1):
+                    normal[i, j] += weighted * row[axis, j]
+    for i in range(_SIX):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
+    return normal, gradient
+
+
+@compiled
+def _turned_back(rotation, delta):
+    """The step of the centre, from the camera's axes to the map's."""
+    out = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            out[i] += rotation[j, i] * delta[j]
+    return out
+
+
+@compiled
+def _invert(information, precision, out):
+    """Write the inverse of what the matches and the known attitude say; False where that is not definite."""
+    for column in range(_SIX):
+        total, right = information.copy(), np.zeros(_SIX)
+        for i in range(3):
+            for j in range(3):
+                total[3 + i, 3 + j] += precision[i, j]
+        right[column] = 1.0
+        if not solve(total, right, out[column]):
+            return False
+    return True
+
+
+@compiled
+def biweight_factors(u):
+    """The efficiency factors of the biweight w = (1 - r^2 / T^2)^2 for normal noise s, u = T^2 / (2 s^2).
+
+    The first factor turns the sum of w J^T J into the derivative that the sum of w J^T r is expected to have, the
+    second s^2 into the variance that makes it the inverse covariance (Huber's sandwich): with q = r^2 / (2 s^2),
+    which is exponential, they are  E[w q] / E[w]  and  E[w^2 q] / E[w q].
+    """
+    u = min(u, 500.0)
+    g, tail, moment, power = np.empty(6), math.exp(-u), 1.0 - math.exp(-u), 1.0
+    g[0] = moment
+    for n in range(1, 6):  # moments of q up to u: g_n = n g_(n-1) - u^n e^-u
+        tail *= u
+        power *= u
+        moment = n * moment - tail
+        g[n] = moment / power
+    weight = g[0] - 2.0 * g[1] + g[2]
+    sensitivity = u * (g[1] - 2.0 * g[2] + g[3])
+    noise = u * (g[1] - 4.0 * g[2] + 6.0 * g[3] - 4.0 * g[4] + g[5])
+    return sensitivity / weight, noise / sensitivity
+
+
+@compiled
+def variance_px2(mean, tolerance_px, noise_floor_px):
+    """The variance s^2 at which distances r, truncated at T, have this mean square per axis.
+
+    E[r^2 | r < T] = 2 s^2 (1 - u / (e^u - 1)),  u = T^2 / (2 s^2).
+    """
+    mean = max(mean, noise_floor_px * noise_floor_px)
+    half = 0.5 * tolerance_px * tolerance_px
+    variance = min(mean, half)
+    for _ in range(5):
+        u = min(half / variance, 50.0)
+        variance = min(mean / (1.0 - u / math.expm1(u)), half)
+    return variance
+
+
+@compiled
+def student(freedom):
+    """The variance of Student's t over a normal's, since the variance is itself estimated."""
+    return 1.0 if np.isinf(freedom) else freedom / max(freedom - 2.0, 1.0)

@@ -1,0 +1,91 @@
+"""The compiled pose fit: derivatives by differences, OpenCV's projection, and poses that are found again."""
+
+import cv2
+import numpy as np
+import pytest
+
+from engine.kernels.pose_fit import fit_pose, normal_equations, reproject
+
+MATRIX = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
+CENTER = np.array([3.0, -4.0, 120.0])
+ROTATION = cv2.Rodrigues(np.array([np.pi - 0.05, 0.03, 0.02]))[0]  # looks down
+
+
+@pytest.fixture(scope="module")
+def points():
+    return np.random.default_rng(1).uniform([-40, -40, 0], [40, 40, 15], (60, 3)).T.copy()
+
+
+def pixels_of(points, rotation, center):
+    rotvec, shift = cv2.Rodrigues(rotation)[0], -rotation @ center
+    return cv2.projectPoints(points.T.copy(), rotvec, shift, MATRIX, None)[0][:, 0].T.copy()
+
+
+def fitted(points, pixels, *, attitude=None, precision=None, turn=(0.02, -0.015, 0.03), shift=(2.0, -1.0, 3.0)):
+    start = cv2.Rodrigues(np.array(turn))[0] @ ROTATION
+    known = np.zeros((3, 3)) if precision is None else precision
+    return fit_pose(
+        points, pixels, MATRIX, np.ones(points.shape[1]), start if attitude is None else attitude, known,
+        20.0, 0.1, 6, start, CENTER + shift, 30, 3.0, 4.0, 1e-6,
+    )  # fmt: skip
+
+
+def test_pixels_are_those_of_opencv_and_points_behind_are_far_off(points):
+    pixels = pixels_of(points, ROTATION, CENTER)
+    _, projected, squared = reproject(points, pixels + 2.0, MATRIX, ROTATION, CENTER)
+    np.testing.assert_allclose(projected, pixels, atol=1e-9)
+    np.testing.assert_allclose(squared, 8.0, atol=1e-9)
+    behind = reproject(points + np.array([[0.0], [0.0], [500.0]]), pixels, MATRIX, ROTATION, CENTER)
+    assert (behind[2] > 1e12).all()
+    assert all(np.isfinite(values).all() for values in behind)
+
+
+def test_normal_equations_are_those_of_finite_differences(points):
+    rng = np.random.default_rng(2)
+    pixels = pixels_of(points, ROTATION, CENTER) + rng.normal(0, 2.0, (2, points.shape[1]))
+    weights, reach, variance = rng.uniform(0.5, 2.0, points.shape[1]), 12.0, 1.7
+    view = reproject(points, pixels, MATRIX, ROTATION, CENTER)
+    normal, gradient = normal_equations(*view, pixels, MATRIX, weights, reach, variance)
+
+    def projected(step):
+        rotation = cv2.Rodrigues(step[3:])[0] @ ROTATION
+        return reproject(points, pixels, MATRIX, rotation, CENTER + ROTATION.T @ step[:3])[1].ravel()
+
+    steps = 1e-5 * np.eye(6)
+    jacobian = np.stack([(projected(s) - projected(-s)) / 2e-5 for s in steps], axis=1)
+    agreement = np.maximum(1.0 - view[2] / reach, 0.0) ** 2
+    weighted = np.tile(weights * agreement / variance, 2)
+    assert 0 < np.count_nonzero(agreement) < len(agreement)
+    np.testing.assert_allclose(normal, (jacobian.T * weighted) @ jacobian, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(
+        gradient, jacobian.T @ (weighted * (pixels - view[1]).ravel()), rtol=1e-4, atol=1e-4
+    )
+
+
+def test_a_pose_is_found_again_among_wrong_matches(points):
+    pixels = pixels_of(points, ROTATION, CENTER)
+    pixels[:, ::4] += 60.0
+    found, rotation, center, _, _, _, inliers, information, variance = fitted(points, pixels)
+    assert found
+    np.testing.assert_allclose(center, CENTER, atol=1e-4)
+    np.testing.assert_allclose(rotation, ROTATION, atol=1e-6)
+    assert inliers.tolist() == [n % 4 != 0 for n in range(points.shape[1])]
+    assert variance == pytest.approx(0.01)  # the noise floor
+    assert np.linalg.eigvalsh(information)[0] > 0.0
+
+
+def test_a_known_attitude_determines_what_two_points_do_not(points):
+    few = points[:, :2].copy()
+    pixels = pixels_of(few, ROTATION, CENTER)
+    known = 1e8 * np.eye(3)
+    args = (few, pixels, MATRIX, np.ones(2), ROTATION)
+    rest = (20.0, 0.1, 2, ROTATION, CENTER + np.array([1.0, 1.0, -2.0]), 30, 3.0, 4.0, 1e-6)
+    found, _, center, *_ = fit_pose(*args, known, *rest)
+    assert found
+    np.testing.assert_allclose(center, CENTER, atol=1e-3)
+    assert not fit_pose(*args, np.zeros((3, 3)), *rest)[0]
+
+
+def test_too_few_inliers_have_no_pose(points):
+    pixels = pixels_of(points, ROTATION, CENTER) + 500.0
+    assert not fitted(points, pixels)[0]
