@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -208,7 +209,6 @@ SIDE_STEP_PX = 32
 MAX_PICTURE_PX = 8 << 20
 """Most pixels of one: where it would cover more, its height is out of proportion to the map."""
 _NODES = 17  # along each side of the lattice on which the projection is computed; bilinear between
-_BORDER_RAYS = 16  # along each side of the frame
 RIM_PX = 5
 """What an orthorectified frame shows ends so far within its edge, whose gradients are none of the ground."""
 
@@ -261,7 +261,7 @@ def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_ja
         (2, 2) lower and upper corner in map pixels from the nadir; None where the middle of the frame looks beyond
         that angle.
     """
-    rays = _border_rays(camera) @ camera.enu_from_camera(attitude).T
+    rays = camera.border_rays @ camera.enu_from_camera(attitude).T
     reach = np.hypot(rays[:, 0], rays[:, 1])
     limit = math.tan(math.radians(MAX_FIELD_DEG))
     if rays[-1, 2] >= 0.0 or reach[-1] > -rays[-1, 2] * limit * (1.0 - 1e-9):
@@ -335,18 +335,13 @@ def _drawn(
     return np.asarray(cv2.remap(picture, x_px, y_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _border_rays(camera: Camera) -> Array:
-    """Rays (N, 3) through the border of the frame, and last the one through its middle."""
-    share = np.linspace(0.0, 1.0, _BORDER_RAYS, endpoint=False)
-    zero, one = np.zeros_like(share), np.ones_like(share)
-    sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
-    xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
-    pixels = xy * [camera.width_px - 1, camera.height_px - 1]
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(camera.matrix).T
-    return np.asarray(rays, np.float64)
-
-
 def _between_nodes(values: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
     """A lattice (n, n, C) from corner to corner, bilinear at every pixel of a square."""
+    return np.asarray(cv2.remap(values, *_places_between_nodes(side_px), cv2.INTER_LINEAR), np.float32)
+
+
+@lru_cache(maxsize=4)  # a flight meets few sizes
+def _places_between_nodes(side_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     at = np.linspace(0.0, _NODES - 1.0, side_px, dtype=np.float32)
-    return np.asarray(cv2.remap(values, *np.meshgrid(at, at), cv2.INTER_LINEAR), np.float32)
+    across, down = np.meshgrid(at, at)
+    return across, down

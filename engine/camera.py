@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 """Names of ROS camera_info, and the valid numbers of coefficients of each."""
+_BORDER_RAYS = 16  # along each side of the frame
 
 
 NADIR_PITCH_DEG = -90.0
@@ -227,6 +228,17 @@ class Camera:
         w, h = self.width_px - 0.5, self.height_px - 0.5
         pixels = [[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h], [(w - 0.5) / 2, (h - 0.5) / 2]]
         return np.asarray(np.c_[pixels, np.ones(5)] @ np.linalg.inv(self.matrix).T, dtype=np.float64)
+
+    @cached_property
+    def border_rays(self) -> Array:
+        """(N, 3) optical rays through the border of the frame, and last the one through its middle."""
+        share = np.linspace(0.0, 1.0, _BORDER_RAYS, endpoint=False)
+        zero, one = np.zeros_like(share), np.ones_like(share)
+        sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
+        xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
+        pixels = xy * [self.width_px - 1, self.height_px - 1]
+        rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(self.matrix).T
+        return np.asarray(rays, np.float64)
 
     @property
     def distorts(self) -> bool:
