@@ -285,7 +285,7 @@ def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], ex
     for members in groups.values():
         images = torch.stack([searches[i].image for i in members])
         sums = torch.stack([searches[i].sums for i in members])
-        rows.append(_summits(images, sums, torch.stack([templates[i] for i in members]), exclusion_px))
+        rows.append(match_on_device(images, sums, torch.stack([templates[i] for i in members]), exclusion_px))
     found = torch.cat(rows).cpu().numpy()
     peaks: dict[int, Peak] = {}
     for (size, shape), members in groups.items():
@@ -295,8 +295,18 @@ def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], ex
     return [peaks[index] for index in range(len(searches))]
 
 
-def _summits(images: Tensor, sums: Tensor, templates: Tensor, exclusion_px: float) -> Tensor:
-    """The :func:`engine.peaks.summits` (B, 28) of windows (B, H, W), their sums, and templates (B, h, w)."""
+def match_on_device(images: Tensor, sums: Tensor, templates: Tensor, exclusion_px: float) -> Tensor:
+    """Match a batch where its tensors are: fixed shapes, no copy, and nothing to wait for.
+
+    Args:
+        images: (B, H, W) float32 of :class:`Search`.
+        sums: (B, 2, H+1, W+1) of :class:`Search`.
+        templates: (B, h, w) float32.
+        exclusion_px: radius about a peak within which no rival is counted.
+
+    Returns:
+        (B, 28) of :func:`engine.peaks.summits`.
+    """
     inverse_norms = kernels.inverse_norm(sums, *templates.shape[1:])
     products = kernels.products(images, _centred(templates))
     return summits(products, inverse_norms, exclusion_px=exclusion_px)

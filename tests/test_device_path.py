@@ -272,6 +272,18 @@ def test_a_picture_of_any_size_has_features_on_a_device(size):
     assert np.isfinite(angles).all()
 
 
+def test_a_picture_with_more_extrema_than_there_is_room_for_keeps_what_fits():
+    ramp = torch.arange(240) // 4
+    chess = ((ramp[:, None] + ramp) % 2).float()[None, None]
+    everything = sift(chess, upsample=1, max_keypoints=20_000)
+    with pretended_device() as crossings:
+        found = sift(chess.to(DEVICE), upsample=1, max_keypoints=20_000)
+        assert crossings.waits == []
+        valid, descriptors = download([found.valid, found.descriptors])
+    assert 0 < valid.sum() < everything.valid.sum()
+    np.testing.assert_allclose(np.linalg.norm(descriptors[valid], axis=1), 1.0, atol=1e-5)
+
+
 def test_matches_are_the_cpus():
     expected = match(*(sift(scene[None]) for scene in scenes()), max_scale_factor=2.0)
     with pretended_device() as crossings:

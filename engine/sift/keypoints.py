@@ -23,8 +23,8 @@ _EDGE_RATIO = 10.0
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _PART_PX = 200_000  # pixels of an octave per thread, below which another thread does not pay
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
-# Extrema that tensor ops have room for: one to so many pixels as the image has, and at least so many an octave.
-# Photographs and maps have one to 30 or more; of a picture with too many the coarsest levels' are left out.
+# Extrema that tensor ops have room for in an octave: one to so many of its pixels, to four times as many where the
+# picture is doubled, and at least so many. Photographs have half as many or fewer; else the coarsest are left out.
 _PX_PER_EXTREMUM = 16
 _MIN_EXTREMA = 256
 _MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
