@@ -1,5 +1,5 @@
-# make demo | test | test-all | check | package | extras | bench | bench-flights | bench-latency: each sets itself up in
-# .venv and is quick the second time.
+# make demo | test | test-all | check | package | extras | bench | bench-gpu | bench-flights | bench-latency: each sets itself up
+# in .venv and is quick the second time.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +9,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test test-slow test-all check package extras docs bench integrity simulated bench-flights bench-latency clean
+.PHONY: demo test test-slow test-all check package extras docs bench bench-gpu integrity simulated bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -61,6 +61,10 @@ bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks
 	$(BIN)/python -m pytest bench/speed --benchmark-only --benchmark-json=.benchmarks/run.json --benchmark-save-data
 	$(BIN)/python -m bench.pages.report .benchmarks/run.json
+
+# One table of a GPU beside the CPU; without CUDA it says so and ends well.
+bench-gpu: $(VENV)/dev.stamp
+	$(BIN)/python -m bench.gpu
 
 integrity: $(VENV)/dev.stamp
 	$(BIN)/python -m bench.accuracy.integrity

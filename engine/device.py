@@ -1,4 +1,4 @@
-"""Selection of the device, number of threads, and synchronisation.
+"""Selection of the device, copies to it and from it, number of threads, and synchronisation.
 
 torch is imported by what uses it: arguments are checked, and live frames queued, without.
 """
@@ -10,7 +10,10 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from engine.errors import DeviceError, OptionError
 
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 R = TypeVar("R")
+AnyArray = NDArray[Any]
+_ALIGNMENT = 16  # bytes; no element is larger
 _WORKER = "scenematch-worker"
 _chosen = threading.Event()  # whether the number of threads was chosen, for the whole process as torch's is
 
@@ -56,6 +61,55 @@ def synchronise(device: torch.device) -> None:
         import torch
 
         torch.cuda.synchronize(device)
+
+
+def upload(arrays: Sequence[AnyArray], device: torch.device) -> list[torch.Tensor]:
+    """Arrays as tensors on a device, in one copy; on the CPU they share memory with the arrays.
+
+    Args:
+        arrays: of any shapes and of types that torch has.
+        device: of the tensors.
+
+    Returns:
+        As many, of the same shapes and types.
+    """
+    import torch
+
+    tensors = [torch.from_numpy(np.ascontiguousarray(array)) for array in arrays]
+    if device.type == "cpu":
+        return tensors
+    return _unpacked(_packed(tensors).to(device), tensors)
+
+
+def download(tensors: Sequence[torch.Tensor]) -> list[AnyArray]:
+    """Tensors of one device as arrays, in one copy; those of the CPU share memory with the arrays.
+
+    Args:
+        tensors: of any shapes.
+
+    Returns:
+        As many, of the same shapes and types.
+    """
+    if all(tensor.device.type == "cpu" for tensor in tensors):
+        return [tensor.numpy() for tensor in tensors]
+    return [tensor.numpy() for tensor in _unpacked(_packed(tensors).cpu(), tensors)]
+
+
+def _packed(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The bytes of tensors, each beginning on a multiple of what the largest element needs."""
+    import torch
+
+    parts = [tensor.contiguous().view(-1).view(torch.uint8) for tensor in tensors]
+    return torch.cat([torch.nn.functional.pad(part, (0, -len(part) % _ALIGNMENT)) for part in parts])
+
+
+def _unpacked(packed: torch.Tensor, like: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    out, begin = [], 0
+    for tensor in like:
+        size = tensor.numel() * tensor.element_size()
+        out.append(packed[begin : begin + size].view(tensor.dtype).view(tensor.shape))
+        begin += size + -size % _ALIGNMENT
+    return out
 
 
 def set_threads(count: int) -> None:

@@ -30,7 +30,7 @@ from torch import Tensor
 from engine.device import in_parallel
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.sift.descriptors import describe, dominant_angle
-from engine.sift.keypoints import Points, allowed, detect, rank, strongest
+from engine.sift.keypoints import Points, detect, strongest
 from engine.sift.scale_space import make_plan
 
 
@@ -143,14 +143,16 @@ def _sift(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Feature
     with torch.inference_mode():
         gaussians, points = detect(images, plan, options.contrast_threshold)
         if mask is not None:
-            points = points.take(allowed(points, mask))
-        points = points.take(strongest(points, plan, options.max_keypoints, options.spread))
+            points = points.within(mask)
+        index, filled = strongest(points, plan, len(images), options.max_keypoints, options.spread)
+        # On a GPU empty slots are described too: how many there are is not known to the host.
+        points = points.take(index[filled] if images.device.type == "cpu" else index)
         if options.up_rad is None:
             angle = dominant_angle(gaussians, points, plan)
         else:
             angle = torch.full_like(points.x, options.up_rad)
         descriptors = describe(gaussians, points, angle, plan, root=options.root)
-        return _to_slots(points, angle, descriptors, len(images), options.max_keypoints)
+        return _to_slots(points, angle, descriptors, filled, len(images))
 
 
 def prepare_plans(sides_px: Iterable[int], device: torch.device) -> None:
@@ -290,7 +292,7 @@ def _forbid(
 ) -> None:
     """Lower the cosine (B, N, M) of excluded pairs by a large number, in place; faster than masks."""
     for valid, dim in ((query.valid, 2), (train.valid, 1)):
-        if not bool(valid.all()):
+        if valid.device.type != "cpu" or not bool(valid.all()):
             cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
     if max_angle_diff_deg is not None and max_angle_diff_deg < 180:
         expected, actual = torch.deg2rad(query.angle_deg + rotation_deg), torch.deg2rad(train.angle_deg)
@@ -357,15 +359,17 @@ def _check_options(max_keypoints: int, upsample: int, contrast_threshold: float,
         raise OptionError(f"spread: expected at least 1, got {spread}")
 
 
-def _to_slots(points: Points, angle: Tensor, descriptors: Tensor, batch: int, slots: int) -> Features:
-    """Scatter points, ordered by image, into (B, N) slots."""
-    index = points.image * slots + rank(points.image)
+def _to_slots(points: Points, angle: Tensor, descriptors: Tensor, filled: Tensor, batch: int) -> Features:
+    """Columns of all slots, or of the filled ones, as (B, N) slots that are zero where they are empty."""
 
-    def scatter(values: Tensor) -> Tensor:
-        out = values.new_zeros(batch * slots, *values.shape[1:])
-        out[index] = values
-        return out.view(batch, slots, *values.shape[1:])
+    def slots(values: Tensor) -> Tensor:
+        if len(values) == len(filled):
+            out = torch.where(filled.view(-1, *[1] * (values.ndim - 1)), values, 0)
+        else:
+            out = values.new_zeros(len(filled), *values.shape[1:])
+            out[filled] = values
+        return out.view(batch, -1, *values.shape[1:])
 
     degrees = torch.rad2deg(angle).remainder(360)
-    valid = torch.ones_like(index, dtype=torch.bool)
-    return Features(*map(scatter, (points.xy_px, points.scale_px, degrees, descriptors, valid)))
+    xy_px, scale_px, angle_deg, described = map(slots, (points.xy_px, points.scale_px, degrees, descriptors))
+    return Features(xy_px, scale_px, angle_deg, described, filled.view(batch, -1))

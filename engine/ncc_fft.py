@@ -8,7 +8,7 @@ Convention:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.kernels import ncc as kernels
-from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit
+from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit, peak_of, summits
 from engine.values import Peak
 
 _DTYPES = (torch.uint8, torch.int16, torch.uint16, torch.int32, torch.float16, torch.float32, torch.float64)
@@ -63,14 +63,13 @@ def ncc(
     """
     _check(search, templates)
     if search_valid is not None or templates_valid is not None:
-        kernels.check_finite("search", search)
-        kernels.check_finite("templates", templates)
         masks = _masks(search, templates, search_valid, templates_valid)
         if not zero_mean:
             raise OptionError("zero_mean: expected True where masks are given, got False")
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
         scores = kernels.masked_ncc_surface(search, masks[0], templates, masks[1], min_overlap=min_overlap)
+        kernels.check_finite(search=search, templates=templates)  # last: the host waits for it
     else:
         work = torch.float64 if search.dtype in _DOUBLE or templates.dtype in _DOUBLE else torch.float32
         scores = kernels.ncc_surface(_as(search, work), _as(templates, work), zero_mean=zero_mean)
@@ -233,11 +232,10 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
     Raises:
         ShapeError: the template is not (h, w), is empty, or is larger than the map.
     """
-    if template.ndim != 2 or 0 in template.shape:
-        raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
+    _check_template(search, template)
     with torch.inference_mode():
         if search.image.device.type != "cpu":
-            return _peak_on_device(search, template, exclusion_px)
+            return _peaks_on_device([search], [template], exclusion_px)[0]
         if not exhaustive:
             found = _coarse_to_fine(search, template, exclusion_px)
             if found is not None:
@@ -245,25 +243,73 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
         return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)
 
 
-def _peak_on_device(search: Search, template: Tensor, exclusion_px: float) -> Peak:
-    """:func:`find_peak` of the surface, bit for bit; 28 numbers are copied from the device, at once."""
+def match_templates(searches: Sequence[Search], templates: Sequence[Tensor], *, exclusion_px: float) -> list[Peak]:
+    """The peaks of many templates, each in its own part of a map: one copy from a GPU for all of them.
+
+    On a GPU pairs of equal shapes are matched at once.
+
+    Args:
+        searches: from :func:`prepare`, on one device.
+        templates: (h, w) float32 each, as many, on the same device.
+        exclusion_px: radius about a peak within which no rival is counted.
+
+    Returns:
+        Those of :func:`match_template`, in the same order.
+
+    Raises:
+        ShapeError: there are not as many templates as parts of a map, or one of them does not fit its part.
+    """
+    if len(searches) != len(templates):
+        raise ShapeError(f"templates: expected {len(searches)} (searches), got {len(templates)}")
+    for search, template in zip(searches, templates, strict=True):
+        _check_template(search, template)
+    if not searches or searches[0].image.device.type == "cpu":
+        pairs = zip(searches, templates, strict=True)
+        return [match_template(search, template, exclusion_px=exclusion_px) for search, template in pairs]
+    with torch.inference_mode():
+        return _peaks_on_device(searches, templates, exclusion_px)
+
+
+def _check_template(search: Search, template: Tensor) -> None:
+    if template.ndim != 2 or 0 in template.shape:
+        raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
     _check_fit(search, template[None])
-    inverse_norms = kernels.inverse_norm(search.sums, *template.shape)
-    products = kernels.products(search.image, _centred(template[None]))
-    best, position = kernels.peak(products, inverse_norms)
-    second = kernels.rival(products, inverse_norms, position, math.floor(exclusion_px * exclusion_px))
-    height, width = inverse_norms.shape
-    near = torch.arange(-2, 3, device=position.device)
-    rows = (position // width + near).clamp_(0, height - 1)[:, None]
-    columns = (position % width + near).clamp_(0, width - 1)
-    around = (products[0, rows, columns] * inverse_norms[rows, columns]).clamp_(-1.0, 1.0)
-    found = torch.cat([part.double() for part in (position, best, second, around.flatten())]).cpu().numpy()
-    y, x = divmod(int(found[0]), width)
-    dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
-    r = min(2, x, y, width - 1 - x, height - 1 - y)
-    if r > 0:
-        dx, dy, curvature = fit_summit(found[3:].reshape(5, 5)[2 - r : 3 + r, 2 - r : 3 + r])
-    return Peak(x + dx, y + dy, float(found[1]), float(found[2]), curvature)
+
+
+def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], exclusion_px: float) -> list[Peak]:
+    """:func:`find_peak` of the surfaces, bit for bit; 28 numbers a surface are copied from the device, at once."""
+    groups: dict[tuple[torch.Size, torch.Size], list[int]] = {}
+    for index, (search, template) in enumerate(zip(searches, templates, strict=True)):
+        groups.setdefault((search.image.shape, template.shape), []).append(index)
+    rows = []
+    for members in groups.values():
+        images = torch.stack([searches[i].image for i in members])
+        sums = torch.stack([searches[i].sums for i in members])
+        rows.append(match_on_device(images, sums, torch.stack([templates[i] for i in members]), exclusion_px))
+    found = torch.cat(rows).cpu().numpy()
+    peaks: dict[int, Peak] = {}
+    for (size, shape), members in groups.items():
+        width, height = size[1] - shape[1] + 1, size[0] - shape[0] + 1
+        for index in members:
+            peaks[index] = peak_of(found[len(peaks)], height, width)
+    return [peaks[index] for index in range(len(searches))]
+
+
+def match_on_device(images: Tensor, sums: Tensor, templates: Tensor, exclusion_px: float) -> Tensor:
+    """Match a batch where its tensors are: fixed shapes, no copy, and nothing to wait for.
+
+    Args:
+        images: (B, H, W) float32 of :class:`Search`.
+        sums: (B, 2, H+1, W+1) of :class:`Search`.
+        templates: (B, h, w) float32.
+        exclusion_px: radius about a peak within which no rival is counted.
+
+    Returns:
+        (B, 28) of :func:`engine.peaks.summits`.
+    """
+    inverse_norms = kernels.inverse_norm(sums, *templates.shape[1:])
+    products = kernels.products(images, _centred(templates))
+    return summits(products, inverse_norms, exclusion_px=exclusion_px)
 
 
 def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Peak | None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from engine.errors import ShapeError
+from engine.kernels import ncc as kernels
 from engine.values import Peak
 
 # Of surfaces with more positions than this only the best of every tile is a candidate.
 _TILED_PX = 1 << 18
 _TILE_PX = 16
+_REACH_PX = 2  # of the scores about a peak, on either side, that refine it
 
 
 def best_positions(scores: Tensor, separation_px: int, count: int) -> list[tuple[int, int, float]]:
@@ -77,7 +82,11 @@ def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
     """
     if scores.ndim != 2 or 0 in scores.shape:
         raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
-    values = scores.cpu().numpy()
+    if scores.device.type != "cpu":
+        ones = torch.ones((), device=scores.device).expand(scores.shape)
+        found = summits(scores.float()[None], ones, exclusion_px=exclusion_px).cpu().numpy()[0]
+        return peak_of(found, *scores.shape)
+    values = scores.numpy()
     y, x = divmod(int(values.argmax()), values.shape[1])
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
     r = min(2, x, y, values.shape[1] - 1 - x, values.shape[0] - 1 - y)
@@ -85,6 +94,50 @@ def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
         dx, dy, curvature = fit_summit(values[y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))
     second = _second_score(values, x, y, exclusion_px)
     return Peak(x + dx, y + dy, float(values[y, x]), second, curvature)
+
+
+def summits(products: Tensor, inverse_norms: Tensor, *, exclusion_px: float) -> Tensor:
+    """What the peaks of surfaces are made of, where the surfaces are: nothing is copied from a GPU.
+
+    Args:
+        products: (T, H', W') float32 numerators.
+        inverse_norms: (H', W') float32, or (T, H', W').
+        exclusion_px: radius about a peak within which no rival is counted.
+
+    Returns:
+        (T, 28) float64: flat index, score, the rival's score, and the 5 x 5 scores about it, those on the border
+        repeated beyond it.
+    """
+    best, position = kernels.peak(products, inverse_norms)
+    second = kernels.rival(products, inverse_norms, position, math.floor(exclusion_px * exclusion_px))
+    count, height, width = products.shape
+    near = torch.arange(-_REACH_PX, _REACH_PX + 1, device=position.device)
+    rows = ((position // width)[:, None] + near).clamp_(0, height - 1)[:, :, None]
+    columns = ((position % width)[:, None] + near).clamp_(0, width - 1)[:, None, :]
+    of = torch.arange(count, device=position.device)[:, None, None]
+    norms = inverse_norms.expand(products.shape)
+    around = (products[of, rows, columns] * norms[of, rows, columns]).nan_to_num_(nan=-1.0).clamp_(-1.0, 1.0)
+    return torch.cat([torch.stack([position.double(), best.double(), second.double()], 1), around.flatten(1)], 1)
+
+
+def peak_of(summit: NDArray[np.float64], height: int, width: int) -> Peak:
+    """The peak of one surface.
+
+    Args:
+        summit: (28,) of :func:`summits`, on the CPU.
+        height: of the surface.
+        width: of the surface.
+
+    Returns:
+        Peak: that of :func:`find_peak`.
+    """
+    y, x = divmod(int(summit[0]), width)
+    dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
+    r = min(_REACH_PX, x, y, width - 1 - x, height - 1 - y)
+    if r > 0:
+        side, inner = 2 * _REACH_PX + 1, slice(_REACH_PX - r, _REACH_PX + r + 1)
+        dx, dy, curvature = fit_summit(summit[3:].reshape(side, side)[inner, inner])
+    return Peak(x + dx, y + dy, float(summit[1]), float(summit[2]), curvature)
 
 
 def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: float) -> float:

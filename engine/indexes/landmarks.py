@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from engine.device import download, upload
 from engine.features import Features, sift
 from engine.indexes.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.orthomap import OrthoMap
@@ -56,10 +57,12 @@ class Landmarks:
 
     Attributes:
         features: batch of one, N slots, in pixels of the level, on the device.
+        xy_px: (N, 2) their positions once more, where no device must be asked.
         points_m: (N, 3) east, north and height of the surface.
     """
 
     features: Features
+    xy_px: NDArray[np.float32]
     points_m: Array
 
 
@@ -184,12 +187,13 @@ class LandmarkMap:
             contrast_threshold=MIN_CONTRAST,
             spread=1,  # by strength alone; landmarks are spread by the cells of the level
         )
-        count = int(found.valid.sum())
-        xy = found.xy_px[0, :count].cpu().numpy() + np.array([left, top], np.float32)
+        fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
+        valid, *all_slots = download([values[0] for values in fields])
+        positions, scale, angle, descriptors = (values[valid] for values in all_slots)
+        xy = positions + np.array([left, top], np.float32)
         rank = _rank_in_cells(xy)
         kept = np.flatnonzero(rank < MAX_PER_CELL)
-        values = (found.scale_px, found.angle_deg, found.descriptors)
-        scale, angle, descriptors = (v[0, :count].cpu().numpy()[kept] for v in values)
+        scale, angle, descriptors = scale[kept], angle[kept], descriptors[kept]
         arrays = (xy[kept], scale, angle, rank[kept], descriptors)
         return {name: a.astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
 
@@ -200,13 +204,10 @@ class LandmarkMap:
         }
 
     def _to_landmarks(self, found: NamedArrays) -> Landmarks:
-        def tensor(name: str) -> torch.Tensor:
-            return torch.from_numpy(found[name]).to(self._device)[None]
-
+        columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
+        xy, scale, angle, descriptors = (column[None] for column in upload(columns, self._device))
         valid = torch.ones(1, len(found["rank"]), dtype=torch.bool, device=self._device)
-        descriptors = tensor("descriptors").float()
-        features = Features(tensor("xy_px"), tensor("scale_px"), tensor("angle_deg"), descriptors, valid)
-        return Landmarks(features, found["points_m"])
+        return Landmarks(Features(xy, scale, angle, descriptors.float(), valid), found["xy_px"], found["points_m"])
 
 
 def as_picture(gray: NDArray[np.uint8], device: torch.device) -> torch.Tensor:

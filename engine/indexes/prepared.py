@@ -37,11 +37,13 @@ class Region:
         window: its extent, in pixels of the level.
         search: prepared pixels that templates are matched against.
         valid: (H, W) bool, False on nodata; None where all pixels are valid.
+        mask: the same on the host, which is asked without waiting for a device.
     """
 
     window: Window
     search: Search
     valid: torch.Tensor | None
+    mask: NDArray[np.bool_] | None = None
 
 
 class PreparedMap:
@@ -77,12 +79,10 @@ class PreparedMap:
         region = self._region(aligned, level)
         i, j = aligned.x0 - region.window.x0, aligned.y0 - region.window.y0
         search = region.search.crop(i, j, aligned.width_px, aligned.height_px)
-        valid = None
-        if region.valid is not None:
-            valid = region.valid[j : j + aligned.height_px, i : i + aligned.width_px]
-            if bool(valid.all()):
-                valid = None
-        return Region(aligned, search, valid)
+        part = np.s_[j : j + aligned.height_px, i : i + aligned.width_px]
+        if region.valid is None or region.mask is None or region.mask[part].all():
+            return Region(aligned, search, None)
+        return Region(aligned, search, region.valid[part], region.mask[part])
 
     def _region(self, window: Window, level: int) -> Region:
         with self._lock:
@@ -139,10 +139,10 @@ class PreparedMap:
             window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
         ]
         image = torch.from_numpy(np.ascontiguousarray(picture[inner])).to(self._device)
-        valid = None
-        if mask is not None and not mask[inner].all():
-            valid = torch.from_numpy(np.ascontiguousarray(mask[inner])).to(self._device)
-        return Region(window, prepare(image), valid)
+        if mask is None or mask[inner].all():
+            return Region(window, prepare(image), None)
+        own = np.ascontiguousarray(mask[inner])
+        return Region(window, prepare(image), torch.from_numpy(own).to(self._device), own)
 
 
 def _contains(region: Window, window: Window) -> bool:

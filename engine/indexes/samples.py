@@ -103,8 +103,8 @@ class SampleMap:
         rows, columns = _steepest(cv2.magnitude(across, down), shape)
         xy_px = self._site.full_from_level(np.stack([columns + cell.x0, rows + cell.y0], axis=-1), level)
         weights = np.ones(len(rows))
-        if region.valid is not None:
-            weights = region.valid.cpu().numpy()[inner][rows, columns].astype(np.float64)
+        if region.mask is not None:
+            weights = region.mask[inner][rows, columns].astype(np.float64)
         height_m = self._site.surface_at(xy_px)
         weights *= self._site.roughness_weight_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
         points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])

@@ -46,18 +46,19 @@ def fast_length(n: int) -> int:
     return best
 
 
-def check_finite(name: str, tensor: Tensor) -> None:
-    """Check that no value is NaN or infinity; a finite sum implies that, and is faster.
+def check_finite(**tensors: Tensor) -> None:
+    """Check that no value is NaN or infinity; finite sums imply that, are faster, and are copied at once.
 
     Args:
-        name: of the argument.
-        tensor: of any shape.
+        tensors: by the name of the argument, of any shape, on one device.
 
     Raises:
         OptionError: one is.
     """
-    if not (math.isfinite(float(tensor.detach().sum())) or bool(torch.isfinite(tensor).all())):
-        raise OptionError(f"{name}: expected finite values, got NaN or infinity")
+    sums = torch.stack([tensor.detach().sum().double() for tensor in tensors.values()]).cpu().tolist()
+    for (name, tensor), total in zip(tensors.items(), sums, strict=True):
+        if not (math.isfinite(total) or bool(torch.isfinite(tensor).all())):
+            raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 
 
 def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
@@ -83,14 +84,19 @@ def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
     h, w = templates.shape[-2:]
     sums = integrals(search)
     energy = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w)
-    window_energy = float(sums[1, -1, -1])
-    flat = energy <= _FLAT_SHARE * window_energy
-    energy.masked_fill_(flat, torch.inf)
-    single = search.dtype != torch.float64 and window_energy <= FLOAT32_NORM_RATIO**2 * float(energy.min())
-    work = torch.float32 if single else torch.float64
+    window_energy = sums[1, -1, -1]
+    energy.masked_fill_(energy <= _FLAT_SHARE * window_energy, torch.inf)
+    work = torch.float32 if _suits_float32(search, window_energy, energy) else torch.float64
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
     normal = (templates / norm.clamp_min(_TINY)).to(work)  # a flat template is all zeros, and scores 0 everywhere
     return correlate(search.to(work), normal).mul_(energy.to(work).rsqrt_()).clamp_(-1.0, 1.0)
+
+
+def _suits_float32(search: Tensor, window_energy: Tensor, energy: Tensor) -> bool:
+    """Whether no patch is too weak for float32; on a GPU not asked, since the host would wait for the answer."""
+    if search.device.type != "cpu" or search.dtype == torch.float64:
+        return False
+    return float(window_energy) <= FLOAT32_NORM_RATIO**2 * float(energy.min())
 
 
 def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
@@ -111,7 +117,7 @@ def products(image: Tensor, templates: Tensor) -> Tensor:
     """Numerators of :func:`prepared_surface`.
 
     Args:
-        image: (H, W) float32.
+        image: (H, W) float32, or (T, H, W) where every template has its own.
         templates: (T, h, w) float32 of zero mean, scaled to a norm of 1 here.
 
     Returns:
@@ -126,10 +132,10 @@ def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32.
+        inverse_norms: (H', W') float32, or (T, H', W').
 
     Returns:
-        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
+        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones; NaN counts as -1.
     """
     scores = _scores(products, inverse_norms).flatten(1)
     index = scores.argmax(dim=1, keepdim=True)
@@ -141,37 +147,38 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
 
     Args:
         products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32.
-        winner: one int64, the flat index of the disc's centre.
+        inverse_norms: (H', W') float32, or (T, H', W').
+        winner: (T,) int64, the flat index of the disc's centre.
         radius_squared: positions of at most this squared distance are inside, in squared pixels.
 
     Returns:
         (T,) float32; -1 where nothing is outside.
     """
-    height, width = inverse_norms.shape
-    dy = torch.arange(height, device=winner.device)[:, None] - winner // width
-    dx = torch.arange(width, device=winner.device) - winner % width
+    height, width = products.shape[1:]
+    row, column = (winner // width)[:, None, None], (winner % width)[:, None, None]
+    dy = torch.arange(height, device=winner.device)[:, None] - row
+    dx = torch.arange(width, device=winner.device) - column
     scores = _scores(products, inverse_norms)
     return scores.masked_fill_(dy * dy + dx * dx <= radius_squared, -1.0).amax(dim=(1, 2))
 
 
 def _scores(products: Tensor, inverse_norms: Tensor) -> Tensor:
-    return (products * inverse_norms).clamp_(-1.0, 1.0)
+    return (products * inverse_norms).nan_to_num_(nan=-1.0).clamp_(-1.0, 1.0)
 
 
 def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
     """Reciprocal norm about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        sums: (..., 2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (H-h+1, W-w+1) float32; 0 where a patch is flat.
+        (..., H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    energy = box_energy(sums, h, w)
-    floor = _FLAT_SHARE * (sums[1, -1, -1] - sums[1, 0, 0])  # no less than the window's own energy
+    energy, squares = box_energy(sums, h, w), sums[..., 1, :, :]
+    floor = _FLAT_SHARE * (squares[..., -1:, -1:] - squares[..., :1, :1])  # no less than the window's own energy
     return energy.masked_fill_(energy <= floor, torch.inf).float().rsqrt_()
 
 
@@ -182,22 +189,29 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
     into the cache.
 
     Args:
-        search: (H, W) floating point.
+        search: (H, W) floating point, or (T, H, W) where every template has its own.
         templates: (T, h, w) of the same dtype.
 
     Returns:
         (T, H-h+1, W-w+1) sums of products.
     """
-    (H, W), (h, w) = search.shape, templates.shape[-2:]
+    (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
     block = fast_length(max(_MIN_BLOCK_PX, 3 * max(h, w)))
     if max(_MIN_BLOCKED_PX, 2 * block * block) < H * W:
+        if search.ndim == 3:
+            return torch.cat([correlate(*pair) for pair in zip(search, templates.split(1), strict=True)])
         return _correlate_blocks(search, templates, min(block, fast_length(H)), min(block, fast_length(W)))
     rows, columns = fast_length(H), fast_length(W)
-    spectrum = torch.fft.rfft2(search, s=(rows, columns))
-    count = max(1, _CHUNK_NUMBERS // (2 * spectrum.numel()))
+    size = (rows, columns)
+    count = max(1, _CHUNK_NUMBERS // (2 * rows * (columns // 2 + 1)))
+    groups = templates.split(count)
+    if search.ndim == 2:
+        spectra = [torch.fft.rfft2(search, s=size)] * len(groups)
+    else:
+        spectra = [torch.fft.rfft2(group, s=size) for group in search.split(count)]
     parts = [
-        _inverse(spectrum * torch.fft.rfft2(group, s=(rows, columns)).conj(), H - h + 1, W - w + 1, columns)
-        for group in templates.split(count)
+        _inverse(spectrum * torch.fft.rfft2(group, s=size).conj(), H - h + 1, W - w + 1, columns)
+        for spectrum, group in zip(spectra, groups, strict=True)
     ]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
@@ -282,13 +296,14 @@ def box_energy(sums: Tensor, h: int, w: int) -> Tensor:
     """Sum of squares about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        sums: (..., 2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (H-h+1, W-w+1) float64.
+        (..., H-h+1, W-w+1) float64.
     """
-    total, square = box_sum(sums, h, w)
+    both = box_sum(sums, h, w)
+    total, square = both[..., 0, :, :], both[..., 1, :, :]
     energy: Tensor = square.addcmul_(total, total, value=-1.0 / (h * w))
     return energy

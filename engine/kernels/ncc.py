@@ -46,9 +46,9 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
         from engine.kernels import by_opencv
 
         return by_opencv.ncc_surface(search, templates, zero_mean=zero_mean)
-    eager.check_finite("search", search)
-    eager.check_finite("templates", templates)
-    return eager.ncc_surface(search, templates, zero_mean=zero_mean)
+    scores = eager.ncc_surface(search, templates, zero_mean=zero_mean)
+    eager.check_finite(search=search, templates=templates)  # last: the host waits for it
+    return scores
 
 
 def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
@@ -73,14 +73,14 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
     """Reciprocal norm about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's, or (B, 2, H+1, W+1).
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (H-h+1, W-w+1) float32; 0 where a patch is flat.
+        (H-h+1, W-w+1) float32, or (B, H-h+1, W-w+1); 0 where a patch is flat.
     """
-    if sums.device.type == "cpu":
+    if sums.device.type == "cpu" and sums.ndim == 3:
         from engine.kernels import by_opencv
 
         return by_opencv.inverse_norm(sums, h, w)
@@ -92,7 +92,7 @@ def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         products: (T, H', W') float32 from :func:`products`.
-        inverse_norms: (H', W') float32.
+        inverse_norms: (H', W') float32, or (T, H', W').
 
     Returns:
         Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
@@ -109,8 +109,8 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
 
     Args:
         products: (T, H', W') float32 from :func:`products`.
-        inverse_norms: (H', W') float32.
-        winner: one int64, the flat index of the disc's centre, on the device.
+        inverse_norms: (H', W') float32, or (T, H', W').
+        winner: (T,) int64, the flat index of the disc's centre, on the device.
         radius_squared: positions of at most this squared distance are inside, in squared pixels.
 
     Returns:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 _BLOCK = 2048
 # Sizes, strides and offsets of views change with the window; specialising on them would compile in flight.
-_SIZES = ("count", "width", "template_stride", "row_stride", "norm_stride", "radius_squared")
+_STRIDES = ("template_stride", "row_stride", "norm_template_stride", "norm_stride")
+_SIZES = ("count", "width", *_STRIDES, "radius_squared")
 _VIEWS = ("products", "inverse_norms", "winner")
 
 
@@ -28,6 +29,7 @@ def _block_peaks(
     width: tl.int32,
     template_stride: tl.int64,
     row_stride: tl.int64,
+    norm_template_stride: tl.int64,
     norm_stride: tl.int64,
     radius_squared: tl.int64,
     BLOCK: tl.constexpr,
@@ -41,10 +43,11 @@ def _block_peaks(
     y, x = row + along // width, along % width
     inside = first + lanes < count
     product = tl.load(products + template * template_stride + y * row_stride + x, mask=inside, other=0.0)
-    score = product * tl.load(inverse_norms + y * norm_stride + x, mask=inside, other=0.0)
-    score = tl.minimum(tl.maximum(score, -1.0), 1.0)
+    norm = tl.load(inverse_norms + template * norm_template_stride + y * norm_stride + x, mask=inside, other=0.0)
+    score = product * norm
+    score = tl.minimum(tl.maximum(score, -1.0), 1.0)  # NaN becomes -1
     if winner is not None:
-        middle = tl.load(winner)
+        middle = tl.load(winner + template)
         dy, dx = y - middle // width, x - middle % width
         score = tl.where(dy * dy + dx * dx > radius_squared, score, -1.0)
     score = tl.where(inside, score, -2.0)  # below every score
@@ -59,7 +62,7 @@ def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32.
+        inverse_norms: (H', W') float32, or (T, H', W').
 
     Returns:
         Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
@@ -74,8 +77,8 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
 
     Args:
         products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32.
-        winner: one int64, the flat index of the disc's centre, on the device.
+        inverse_norms: (H', W') float32, or (T, H', W').
+        winner: (T,) int64, the flat index of the disc's centre, on the device.
         radius_squared: positions of at most this squared distance are inside, in squared pixels.
 
     Returns:
@@ -90,7 +93,8 @@ def _launch(
     """Best scores and their flat indices by block, (T, blocks) each."""
     templates, height, width = products.shape
     count = height * width
-    products, inverse_norms = _with_dense_rows(products), _with_dense_rows(inverse_norms)
+    products, inverse_norms = _with_dense_rows(products), _with_dense_rows(inverse_norms).expand(products.shape)
+    winner = None if winner is None else winner.contiguous()
     blocks = triton.cdiv(count, _BLOCK)
     best = torch.empty((templates, blocks), dtype=torch.float32, device=products.device)
     indices = torch.empty((templates, blocks), dtype=torch.int64, device=products.device)
@@ -105,6 +109,7 @@ def _launch(
         products.stride(0),
         products.stride(1),
         inverse_norms.stride(0),
+        inverse_norms.stride(1),
         radius_squared,
         BLOCK=_BLOCK,
         enable_fp_fusion=False,  # every rounding is torch's own

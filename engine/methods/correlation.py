@@ -173,9 +173,9 @@ class Correlator:
                 )
             else:
                 scores = self.masked_scores(region, aligned.template[None])
-                if not bool((scores > -1.0).any()):
-                    return None
                 peak = find_peak(scores[0], exclusion_px=exclusion_px)
+                if peak.score <= -1.0:
+                    return None
         x, y = peak.x + region.window.x0, peak.y + region.window.y0
         return Peak(x, y, peak.score, peak.second_score, peak.curvature)
 

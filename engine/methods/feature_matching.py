@@ -16,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from engine.align import Orthophoto, orthorectify
-from engine.features import match, sift
+from engine.device import download, upload
+from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.methods.options import SiftOptions
@@ -134,11 +135,12 @@ def _feature_pairs(
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
+        gray, valid = upload([photo.gray, photo.valid], query.device)
         features = sift(
-            as_picture(photo.gray, query.device),
+            gray[None, None].float() / 255.0,
             max_keypoints=keypoints,
             upright=True,
-            mask=torch.from_numpy(photo.valid).to(query.device)[None, None],
+            mask=valid[None, None],
             upsample=2 if shown_px <= _UPSAMPLED_PX else 1,
             contrast_threshold=options.contrast_threshold,
         )
@@ -149,10 +151,15 @@ def _feature_pairs(
         found = match(
             features, known.features, ratio=options.vote_ratio, max_scale_factor=options.max_scale_factor
         )
-        pairs = found.pairs().cpu().numpy()
-        photo_px = features.xy_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
-        scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
-        return photo_px, known.features.xy_px[0].cpu().numpy()[pairs[:, 1]].astype(np.float64), scale_px
+        photo_px, scale_px, index = _matched(features, found)
+        return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64), scale_px
+
+
+def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
+    """Accepted pairs: (M, 2) pixels of the features, (M,) their scales, (M,) indices on the map; in one copy."""
+    columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
+    xy_px, scale_px, valid, index = download(columns)
+    return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
 
 
 def _voted(
@@ -195,7 +202,7 @@ class _Reduced:
     picture: torch.Tensor
     scale: Array
 
-    def full(self, xy_px: Array) -> Array:
+    def full(self, xy_px: Array | NDArray[np.float32]) -> Array:
         """Places in the frame: edges lie on edges, centres on centres."""
         return np.asarray((xy_px + 0.5) / self.scale - 0.5, dtype=np.float64)
 
@@ -227,10 +234,8 @@ def _by_frame(
                 scale=1.0 / view.pixel_ratio,
                 max_scale_factor=None if hypothesis.height_m is None else options.max_scale_factor,
             )
-            pairs = found.pairs().cpu().numpy()
-            points_px = reduced.full(features.xy_px[0].cpu().numpy()[pairs[:, 0]])
-            scale_px = features.scale_px[0].cpu().numpy()[pairs[:, 0]].astype(np.float64)
-            points_m = known.points_m[pairs[:, 1]]
+            xy_px, scale_px, index = _matched(features, found)
+            points_px, points_m = reduced.full(xy_px), known.points_m[index]
             weights = _weights(query.site, points_m, scale_px)
             matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
     return matched
@@ -277,8 +282,8 @@ def _map_features(
         mask = torch.from_numpy(site.valid(crop, view.level)).to(query.device)[None, None]
     picture = as_picture(site.gray(crop, view.level), query.device)
     features = sift(picture, max_keypoints=int(count), upright=upright, mask=mask)
-    map_px = site.full_from_level(features.xy_px[0].cpu().numpy() + view.corner_px, view.level)
-    return Landmarks(features, lifted(site, map_px))
+    xy_px = download([features.xy_px[0]])[0]
+    return Landmarks(features, xy_px, lifted(site, site.full_from_level(xy_px + view.corner_px, view.level)))
 
 
 def lifted(site: OrthoMap, map_px: Array) -> Array:

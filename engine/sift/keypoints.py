@@ -4,7 +4,7 @@ An extremum is refined by a quadratic; those of low contrast or along an edge ar
 """
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,6 +23,10 @@ _EDGE_RATIO = 10.0
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _PART_PX = 200_000  # pixels of an octave per thread, below which another thread does not pay
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
+# Extrema that tensor ops have room for in an octave: one to so many of its pixels, to four times as many where the
+# picture is doubled, and at least so many. Photographs have half as many or fewer; else the coarsest are left out.
+_PX_PER_EXTREMUM = 16
+_MIN_EXTREMA = 256
 _MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 
 
@@ -38,6 +42,7 @@ class Points:
     growth: Tensor  # sigma over the sigma of the octave's first level
     contrast: Tensor
     pixel_px: Tensor  # image pixels per octave pixel
+    valid: Tensor  # bool; those of tensor ops are fixed in number, and not all of them are keypoints
 
     def take(self, index: Tensor) -> "Points":
         """Select points.
@@ -49,7 +54,20 @@ class Points:
             K points.
         """
         fields = (self.octave, self.image, self.level, self.x, self.y, self.growth, self.contrast, self.pixel_px)
-        return Points(*(field[index] for field in fields))
+        return Points(*(field[index] for field in (*fields, self.valid)))
+
+    def within(self, mask: Tensor) -> "Points":
+        """Keep as valid those whose nearest pixel is allowed.
+
+        Args:
+            mask: (B, 1, H, W) bool.
+
+        Returns:
+            As many points.
+        """
+        x = (self.x * self.pixel_px).round().long().clamp_(0, mask.shape[3] - 1)
+        y = (self.y * self.pixel_px).round().long().clamp_(0, mask.shape[2] - 1)
+        return replace(self, valid=self.valid & mask[self.image, 0, y, x])
 
     @property
     def xy_px(self) -> Tensor:
@@ -93,8 +111,9 @@ def _detect_compiled(image: Tensor, plan: ScaleSpacePlan, contrast_threshold: fl
         found.append(refine_extrema(gaussians.numpy(), (height, width, *layout), voxels, limits, number))
         source = octave.levels(gaussians)[SCALES, :height:2, 0, :width:2].contiguous()
     x, y, growth, contrast, level, of = torch.from_numpy(np.concatenate(found)).unbind(1)
-    pixel = torch.exp2(of) / plan.upsample
-    return gaussians, Points(of.long(), torch.zeros_like(of).long(), level.long(), x, y, growth, contrast, pixel)
+    pixel, which, valid = torch.exp2(of) / plan.upsample, of.long(), torch.ones_like(of, dtype=torch.bool)
+    image = torch.zeros_like(which)
+    return gaussians, Points(which, image, level.long(), x, y, growth, contrast, pixel, valid)
 
 
 def _voxels_compiled(
@@ -126,7 +145,7 @@ def _buffer(size: int) -> Tensor:
 
 
 def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> Points:
-    """Find and refine the points of all octaves in their Gaussian levels, as tensor ops.
+    """Find and refine the points of all octaves in their Gaussian levels, as tensor ops of fixed shapes.
 
     Args:
         gaussians: (N,) float32 from :func:`engine.sift.scale_space.gaussian_levels`.
@@ -134,12 +153,14 @@ def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: flo
         contrast_threshold: Lowe's.
 
     Returns:
-        The points that pass the tests of contrast and edges.
+        As many points as the plan has room for; valid are those that pass the tests of contrast and edges.
     """
     threshold = contrast_threshold / SCALES
-    found = [_extrema(gaussians, octave, _EARLY * threshold) for octave in plan.octaves]
+    found = [_extrema(gaussians, octave, plan.upsample, _EARLY * threshold) for octave in plan.octaves]
     number = torch.cat([torch.full_like(f[:, 0], n) for n, f in enumerate(found)])
     level, y, image, x = torch.cat(found).unbind(1)
+    is_found = level >= 0
+    level, y, x, image = level.clamp_min(0) + 1, y + _BORDER, x + _BORDER, image.clamp_min(0)
     for last in (False,) * _MOVES + (True,):
         value, gradient, hessian, shift = _fit_quadratic(gaussians, plan, number, level, image, y, x)
         if not last:
@@ -151,25 +172,29 @@ def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: flo
     xx, yy, _, xy, _, _ = hessian.unbind(1)
     trace, determinant = xx + yy, xx * yy - xy * xy
     keep = (contrast >= threshold) & (shift.abs().amax(1) < _MAX_SHIFT)
-    keep &= (determinant > 0) & (trace * trace * _EDGE_RATIO < (_EDGE_RATIO + 1) ** 2 * determinant)
+    keep &= is_found & (determinant > 0) & (trace * trace * _EDGE_RATIO < (_EDGE_RATIO + 1) ** 2 * determinant)
+    shift = torch.where(keep[:, None], shift, 0.0)  # what is no keypoint still lies in its octave
     growth = torch.exp2((level + shift[:, 2]) / SCALES)
     pixel = torch.exp2(number.float()) / plan.upsample
-    points = Points(number, image, level, x + shift[:, 0], y + shift[:, 1], growth, contrast, pixel)
-    return points.take(keep.nonzero()[:, 0])
+    return Points(number, image, level, x + shift[:, 0], y + shift[:, 1], growth, contrast, pixel, keep)
 
 
-def _extrema(gaussians: Tensor, octave: Octave, threshold: float) -> Tensor:
-    """Return (M, 4) level, y, image, x where |DoG| is the largest of its 3 x 3 x 3 and above the threshold."""
+def _extrema(gaussians: Tensor, octave: Octave, upsample: int, threshold: float) -> Tensor:
+    """Return (M, 4) level, y, image, x where |DoG| is the largest of its 3 x 3 x 3 and above the threshold.
+
+    They count from the first level and the first pixel that are searched. M is fixed; rows left over are -1.
+    """
     edge = _BORDER - 1
     levels = octave.levels(gaussians)[:, edge : octave.height - edge, :, edge : octave.width - edge]
     if levels.shape[1] < 3 or levels.shape[3] < 3:
-        return torch.zeros(0, 4, dtype=torch.int64, device=gaussians.device)
+        return torch.full((1, 4), -1, device=gaussians.device)
     size = (levels[1:] - levels[:-1]).abs_()
     top = torch.maximum(torch.maximum(size[:-2], size[1:-1]), size[2:])
     top = torch.maximum(torch.maximum(top[:, :-2], top[:, 1:-1]), top[:, 2:])
     top = torch.maximum(torch.maximum(top[..., :-2], top[..., 1:-1]), top[..., 2:]).clamp_min_(threshold)
-    found = (size[1:-1, 1:-1, :, 1:-1] >= top).nonzero()
-    return found + torch.tensor([1, _BORDER, 0, _BORDER], device=gaussians.device)
+    room = octave.height * octave.width // (_PX_PER_EXTREMUM * upsample**2)
+    is_top = size[1:-1, 1:-1, :, 1:-1] >= top
+    return is_top.nonzero_static(size=octave.shape[2] * max(room, _MIN_EXTREMA), fill_value=-1)
 
 
 def _fit_quadratic(
@@ -186,8 +211,9 @@ def _fit_quadratic(
     cube = (voxels[:, 1:] - voxels[:, :-1]).view(-1, 27)
     fit = cube @ stencil
     gradient, hessian = fit[:, :3], fit[:, 3:]
-    rows = hessian[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
-    adjugate = torch.linalg.cross(rows[:, [1, 2, 0]], rows[:, [2, 0, 1]])
+    xx, yy, ss, xy, xs, ys = hessian.unbind(1)
+    rows = torch.stack([xx, xy, xs, xy, yy, ys, xs, ys, ss], dim=1).view(-1, 3, 3)
+    adjugate = torch.linalg.cross(rows.roll(-1, 1), rows.roll(-2, 1))
     determinant = (rows[:, 0] * adjugate[:, 0]).sum(1, keepdim=True)
     shift = -(gradient[:, None, :] @ adjugate)[:, 0] / torch.where(determinant == 0, 1e-30, determinant)
     return cube[:, 13], gradient, hessian, shift.clamp(-9, 9)
@@ -217,23 +243,10 @@ def _quadratic(where: torch.device) -> tuple[Tensor, Tensor]:
     return stencil, torch.from_numpy(gaussians.astype(np.int32)).to(where)
 
 
-def allowed(points: Points, mask: Tensor) -> Tensor:
-    """Return the indices of the points whose nearest pixel is allowed.
-
-    Args:
-        points: M keypoints.
-        mask: (B, 1, H, W) bool.
-
-    Returns:
-        (K,) int64.
-    """
-    x = (points.x * points.pixel_px).round().long().clamp_(0, mask.shape[3] - 1)
-    y = (points.y * points.pixel_px).round().long().clamp_(0, mask.shape[2] - 1)
-    return mask[points.image, 0, y, x].nonzero()[:, 0]
-
-
-def strongest(points: Points, plan: ScaleSpacePlan, max_keypoints: int, spread: int) -> Tensor:
-    """Return the indices of the points to keep, ordered by image and then by precedence.
+def strongest(
+    points: Points, plan: ScaleSpacePlan, batch: int, max_keypoints: int, spread: int
+) -> tuple[Tensor, Tensor]:
+    """Return the points to keep, in slots by image and then by precedence.
 
     Strength is contrast times the root of scale, since of two keypoints of equal contrast the coarser is detected
     more reliably.
@@ -241,22 +254,29 @@ def strongest(points: Points, plan: ScaleSpacePlan, max_keypoints: int, spread: 
     Args:
         points: M keypoints.
         plan: of their images.
-        max_keypoints: per image.
+        batch: number of images.
+        max_keypoints: slots per image.
         spread: cells along each side of the image; keypoints beyond a cell's double share come last.
 
     Returns:
-        (K,) int64.
+        Indices of the points (batch * max_keypoints,) int64, and whether the slot has one, bool.
     """
-    order = (points.contrast * points.scale_px.sqrt()).argsort(descending=True, stable=True)
+    strength = torch.where(points.valid, points.contrast * points.scale_px.sqrt(), -1.0)
+    order = strength.argsort(descending=True, stable=True)  # the invalid are last, and no other's rank counts them
     octave = plan.octaves[0]
-    image = points.image[order]
+    image, valid = points.image[order], points.valid[order]
     x = (points.x * points.pixel_px)[order] * (plan.upsample * spread / octave.width)
     y = (points.y * points.pixel_px)[order] * (plan.upsample * spread / octave.height)
     cell = (image * spread + y.long().clamp_(0, spread - 1)) * spread + x.long().clamp_(0, spread - 1)
     share = 2 * max_keypoints / spread**2
     crowded = rank(cell) >= share if spread > 1 else torch.zeros_like(image, dtype=torch.bool)
-    precedence = (image * 2 + crowded).argsort(stable=True)
-    return order[precedence][rank(image[precedence]) < max_keypoints]
+    precedence = (image * 3 + torch.where(valid, crowded.long(), 2)).argsort(stable=True)
+    order, image, valid = order[precedence], image[precedence], valid[precedence]
+    place = rank(image)
+    slots = batch * max_keypoints
+    slot = torch.where(valid & (place < max_keypoints), image * max_keypoints + place, slots)
+    index = order.new_zeros(slots + 1).scatter_(0, slot, order)[:slots]
+    return index, valid.new_zeros(slots + 1).scatter_(0, slot, True)[:slots]
 
 
 def rank(group: Tensor) -> Tensor:

@@ -123,7 +123,7 @@ def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.
     table = [
         (o.height, o.width, o.offset, math.prod(o.shape[1:]), math.prod(o.shape[2:]), o.shape[3]) for o in octaves
     ]
-    return ScaleSpacePlan(upsample, tuple(octaves), size, torch.tensor(table, device=device))
+    return ScaleSpacePlan(upsample, tuple(octaves), size, torch.tensor(table).to(device))
 
 
 def gaussian_levels(images: Tensor, plan: ScaleSpacePlan) -> Tensor:

@@ -19,7 +19,7 @@ import torch
 from engine.errors import ShapeError
 from engine.kernels import eager
 from engine.kernels import ncc as kernels
-from engine.ncc_fft import _peak_on_device, match_template, prepare, surface
+from engine.ncc_fft import _peaks_on_device, match_template, match_templates, prepare, surface
 from engine.peaks import find_peak
 
 SHAPES = [
@@ -66,7 +66,13 @@ def whole_surface(search, template):
     """The surface by tensor ops, as a device has it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "_by_opencv", lambda *tensors: False)
+        patch.setattr(kernels, "inverse_norm", eager.inverse_norm)
         return surface(search, template[None])[0]
+
+
+def on_device(search, template, exclusion_px):
+    """The peak as a device finds it, wherever the tensors are."""
+    return _peaks_on_device([search], [template], exclusion_px)[0]
 
 
 def fused(name, *args):
@@ -112,7 +118,7 @@ def check_rival(device, shape):
     for place in {0, width - 1, height * width // 2, height * width - 1}:
         distance = (rows - place // width) ** 2 + (columns - place % width) ** 2
         for radius_squared in (0, 2, 25, 1000, 10**10):
-            winner = torch.tensor([place], device=device)
+            winner = torch.tensor([place], device=device).expand(shape[0])
             best = fused("rival", *given, winner, radius_squared)
             outside = np.where(distance > radius_squared, scores, np.float32(-1.0))
             np.testing.assert_array_equal(best.cpu(), outside.max(axis=(1, 2)))
@@ -128,7 +134,35 @@ def check_ties(device):
     best, places = fused("peak", products, norms)
     assert best.tolist() == [0.5, 1.0, -1.0]
     assert places.tolist() == [50 * 90 + 7, 0, 0]
-    assert fused("rival", products, norms, places[:1], 10**10).tolist() == [-1.0] * 3
+    assert fused("rival", products, norms, places, 10**10).tolist() == [-1.0] * 3
+
+
+def check_nan(device):
+    """NaN never wins, and infinities are cut off, by either."""
+    products, norms = draw(device, (3, 63, 65))
+    products[0, 5, 6:9], products[1], products[2, 62, 64] = math.nan, math.nan, math.inf
+    norms[62, 64] = 1.0
+    expected = torch.nan_to_num(products * norms, nan=-1.0).clamp(-1.0, 1.0).flatten(1).max(dim=1)
+    best, places = fused("peak", products, norms)
+    torch.testing.assert_close(best, expected.values, rtol=0, atol=0)
+    assert (best[1].item(), places[1].item(), best[2].item()) == (-1.0, 0, 1.0)
+    for name, more in (("peak", ()), ("rival", (places, 30))):
+        mine, twin = fused(name, products, norms, *more), getattr(eager, name)(products, norms, *more)
+        torch.testing.assert_close(mine, twin, rtol=0, atol=0)
+
+
+def check_batch(device):
+    """Every template with norms and a winner of its own, as one by one."""
+    drawn = [draw(device, (1, 41, 53)) for _ in range(4)]
+    products = torch.cat([p.roll(i, 1) for i, (p, _) in enumerate(drawn)])
+    norms = torch.stack([n.roll(2 * i, 0) for i, (_, n) in enumerate(drawn)])
+    best, places = fused("peak", products, norms)
+    second = fused("rival", products, norms, places, 25)
+    for i in range(4):
+        one = products[i : i + 1], norms[i]
+        torch.testing.assert_close(fused("peak", *one), (best[i : i + 1], places[i : i + 1]), rtol=0, atol=0)
+        alone = eager.rival(*one, places[i : i + 1], 25)
+        torch.testing.assert_close(alone, second[i : i + 1], rtol=0, atol=0)
 
 
 def check_match(device, size, model):
@@ -136,7 +170,7 @@ def check_match(device, size, model):
     expected = find_peak(whole_surface(search, template), exclusion_px=5.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "_by_triton", lambda tensor: True)
-        assert_same(_peak_on_device(search, template, 5.0), expected)
+        assert_same(on_device(search, template, 5.0), expected)
     if device == "cuda":
         assert_same(match_template(search, template, exclusion_px=5.0), expected)
 
@@ -157,6 +191,16 @@ def test_the_rival_is_that_of_plain_torch(on, shape):
 @needs_triton
 def test_of_equal_scores_the_first_is_the_peak(on):
     on(check_ties)
+
+
+@needs_triton
+def test_nan_never_wins(on):
+    on(check_nan)
+
+
+@needs_triton
+def test_a_batch_is_matched_as_its_templates_one_by_one(on):
+    on(check_batch)
 
 
 @needs_triton
@@ -226,25 +270,25 @@ def assert_same(found, expected):
 def test_the_peak_on_a_device_is_that_of_the_whole_surface(size, model, exclusion_px):
     """On the CPU, by the plain torch twins."""
     search, template = picture(size, model)
-    found = _peak_on_device(search, template, exclusion_px)
+    found = on_device(search, template, exclusion_px)
     assert_same(found, find_peak(whole_surface(search, template), exclusion_px=exclusion_px))
 
 
 def test_the_peak_of_a_window_without_texture_is_finite():
-    found = _peak_on_device(prepare(torch.zeros(60, 70)), torch.rand(20, 30), 3.0)
+    found = on_device(prepare(torch.zeros(60, 70)), torch.rand(20, 30), 3.0)
     assert (found.x, found.y, found.score, found.second_score) == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_a_surface_does_not_leave_its_device(monkeypatch):
     copies, real = [], torch.Tensor.cpu
     monkeypatch.setattr(torch.Tensor, "cpu", lambda self: copies.append(self.numel()) or real(self))
-    _peak_on_device(*picture((150, 131), (63, 50)), 5.0)
+    on_device(*picture((150, 131), (63, 50)), 5.0)
     assert copies == [28]
 
 
 def test_a_template_larger_than_the_window_is_refused():
     with pytest.raises(ShapeError, match=r"^templates: expected at most 20 x 20 \(search\), got 21 x 5$"):
-        _peak_on_device(prepare(torch.rand(20, 20)), torch.rand(21, 5), 3.0)
+        match_templates([prepare(torch.rand(20, 20))], [torch.rand(21, 5)], exclusion_px=3.0)
 
 
 def test_the_plain_twins_take_the_first_of_equals():
@@ -252,5 +296,5 @@ def test_the_plain_twins_take_the_first_of_equals():
     products[0, 2, 3] = products[0, 4, 1] = 0.5
     best, places = kernels.peak(products, norms)
     assert (best.tolist(), places.tolist()) == ([0.5, 0.0], [15, 0])
-    assert kernels.rival(products, norms, places[:1], 0).tolist() == [0.5, 0.0]
-    assert kernels.rival(products, norms, places[:1], 99).tolist() == [-1.0, -1.0]
+    assert kernels.rival(products, norms, places, 0).tolist() == [0.5, 0.0]
+    assert kernels.rival(products, norms, places, 99).tolist() == [-1.0, -1.0]

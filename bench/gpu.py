@@ -1,0 +1,230 @@
+"""A GPU beside the CPU, in one table: time of one frame, throughput of batches, agreement, and copies.
+
+    python -m bench.gpu [--device auto|cuda|cpu] [--quick]
+
+Without CUDA it says so and ends; ``--device cpu`` runs the same code there, to see that it runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.inputs.scenes import flight, pair
+from bench.pages.text import table
+from engine import Fix, SceneMatcher
+from engine.device import resolve, synchronise
+from engine.ncc_fft import Search, match_on_device, match_template, match_templates, prepare
+from engine.values import Peak
+
+PAIRS = [(425, 228), (512, 256), (1024, 256), (1024, 512)]  # window and template, px; the first is the paper's
+BATCH = 64
+ROUNDS, QUICK_ROUNDS = 300, 3
+EXCLUSION_PX = 11.0
+COLUMNS = ["task", "p50 ms", "p99 ms", "per s", "batch", "off the CPU's", "copies up", "copies down"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One task: times of single calls, tasks a second, the batch they come in, agreement, and copies per call."""
+
+    task: str
+    times_ms: list[float]
+    batch: int
+    apart: str
+    copies: tuple[int, int]
+
+    def cells(self) -> list[str]:
+        p50, p99 = np.percentile(self.times_ms, [50.0, 99.0])
+        rate = 1e3 * self.batch / float(np.mean(self.times_ms))
+        return [
+            self.task,
+            f"{p50:.3f}",
+            f"{p99:.3f}",
+            f"{rate:.0f}",
+            f"{self.batch}",
+            self.apart,
+            *map(str, self.copies),
+        ]
+
+
+def timed(call: Callable[[], Any], device: torch.device, rounds: int) -> list[float]:
+    """Milliseconds of each of so many calls, every one waited for."""
+    for _ in range(3):
+        call()
+    times = []
+    for _ in range(rounds):
+        synchronise(device)
+        start = time.perf_counter()
+        call()
+        synchronise(device)
+        times.append((time.perf_counter() - start) * 1e3)
+    return times
+
+
+def copies(call: Callable[[], Any], device: torch.device) -> tuple[int, int]:
+    """Copies to the device and from it in one call, as torch's profiler sees them; none on the CPU."""
+    if device.type != "cuda":
+        return 0, 0
+    activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
+        call()
+        synchronise(device)
+    return directions([event.name for event in profile.events()])
+
+
+def directions(names: list[str]) -> tuple[int, int]:
+    """How many of a profile's events copy to the device, and how many from it."""
+    return sum("Memcpy HtoD" in name for name in names), sum("Memcpy DtoH" in name for name in names)
+
+
+Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
+
+
+def captured(work: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
+    """What replays the work on a GPU, and where its result is then."""
+    aside = torch.cuda.Stream()
+    aside.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(aside):
+        for _ in range(3):  # plans, compiled kernels and constants are made outside the capture
+            work()
+    torch.cuda.current_stream().wait_stream(aside)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        output = work()
+    return graph.replay, output
+
+
+class Replayed:
+    """A function of tensors on a GPU as one CUDA graph, or the function itself where that cannot be captured.
+
+    The first replay must give what the function gave, bit for bit.
+
+    Args:
+        function: of tensors of fixed shapes to one tensor; it neither copies to the host nor waits.
+        inputs: an example.
+        capture: how it is captured.
+    """
+
+    def __init__(
+        self, function: Callable[..., Tensor], inputs: tuple[Tensor, ...], capture: Capture = captured
+    ) -> None:
+        self._function = function
+        self._inputs = tuple(tensor.clone() for tensor in inputs)
+        self._replay: Callable[[], None] | None = None
+        expected = function(*inputs).clone()
+        try:
+            replay, self._output = capture(lambda: function(*self._inputs))
+            self._output.zero_()
+            replay()
+        except RuntimeError:  # of CUDA, about what cannot be captured
+            return
+        if torch.equal(self._output, expected):
+            self._replay = replay
+
+    @property
+    def is_captured(self) -> bool:
+        return self._replay is not None
+
+    def __call__(self, *inputs: Tensor) -> Tensor:
+        if self._replay is None:
+            return self._function(*inputs)
+        for own, given in zip(self._inputs, inputs, strict=True):
+            own.copy_(given)
+        self._replay()
+        return self._output
+
+
+def matches(size: tuple[int, int], device: torch.device, rounds: int, batch: int) -> list[Row]:
+    """NCC of one window with one template, the same as a CUDA graph, and a batch of it."""
+    picture, cut = (torch.from_numpy(part) for part in pair(*size))
+    expected = match_template(prepare(picture), cut, exclusion_px=EXCLUSION_PX, exhaustive=True)
+    search, pinned = prepare(picture.to(device)), cut.pin_memory() if device.type == "cuda" else cut
+    name, rows = f"NCC {size[1]} in {size[0]}", []
+
+    def one() -> Peak:
+        there = pinned.to(device, non_blocking=True)
+        return match_template(search, there, exclusion_px=EXCLUSION_PX, exhaustive=True)
+
+    def many() -> list[Peak]:
+        there = torch.stack([pinned] * batch).to(device)
+        return match_templates([search] * batch, list(there), exclusion_px=EXCLUSION_PX)
+
+    rows.append(Row(name, timed(one, device, rounds), 1, apart([one()], expected), copies(one, device)))
+    if device.type == "cuda":
+        rows.append(_by_graph(name, search, pinned, device, rounds))
+    times = timed(many, device, max(1, rounds // 10))
+    rows.append(Row(name, times, batch, apart(many(), expected), copies(many, device)))
+    return rows
+
+
+def _by_graph(name: str, search: Search, template: Tensor, device: torch.device, rounds: int) -> Row:
+    inputs = (search.image[None], search.sums[None], template.to(device)[None])
+    graph = Replayed(lambda *tensors: match_on_device(*tensors, EXCLUSION_PX), inputs)
+    eager = match_on_device(*inputs, EXCLUSION_PX).cpu()
+
+    def one() -> Tensor:
+        return graph(*inputs[:2], template.to(device, non_blocking=True)[None]).cpu()
+
+    off = float((one() - eager).abs().max())
+    task = f"{name}, CUDA graph" if graph.is_captured else f"{name}, not captured"
+    return Row(task, timed(one, device, rounds), 1, f"{off:.0e} (eager)", copies(one, device))
+
+
+def apart(found: list[Peak], expected: Peak) -> str:
+    """The largest distances in pixels and in scores from the CPU's peak."""
+    pixels = max(float(np.hypot(peak.x - expected.x, peak.y - expected.y)) for peak in found)
+    return f"{pixels:.0e} px, {max(abs(peak.score - expected.score) for peak in found):.0e}"
+
+
+def frames(method: str, device: torch.device, rounds: int) -> Row:
+    """Whole frames of the built-in flight, decoded frame to fix."""
+    scene = flight(4 if rounds < 10 else 40)
+    given = list(zip(scene.frames, scene.priors, strict=True))
+    on_cpu = SceneMatcher(scene.site, scene.camera, method, "cpu")
+    matcher = SceneMatcher(scene.site, scene.camera, method, device)
+    metres = 0.0
+    for frame, prior in given:
+        fix, expected = matcher.locate(frame, prior), on_cpu.locate(frame, prior)
+        if not (isinstance(fix, Fix) and isinstance(expected, Fix)):
+            metres = max(metres, 0.0 if type(fix) is type(expected) else np.inf)
+            continue
+        metres = max(metres, float(np.hypot(fix.east_m - expected.east_m, fix.north_m - expected.north_m)))
+    turn = iter(range(10**9))
+    times = timed(lambda: matcher.locate(*given[next(turn) % len(given)]), device, rounds)
+    return Row(f"locate, {method}", times, 1, f"{metres:.0e} m", copies(lambda: matcher.locate(*given[0]), device))
+
+
+def measure(device: torch.device, *, quick: bool) -> list[Row]:
+    """All rows of the table."""
+    rounds, batch = (QUICK_ROUNDS, 3) if quick else (ROUNDS, BATCH)
+    rows = [row for size in PAIRS[: 1 if quick else None] for row in matches(size, device, rounds, batch)]
+    return [*rows, *(frames(method, device, rounds) for method in ("ncc", "sift"))]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print the table, or a line where there is no CUDA."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="auto", choices=["auto", "cuda", "cpu"])
+    parser.add_argument("--quick", action="store_true", help="few rounds of few tasks: does it run?")
+    options = parser.parse_args(arguments)
+    if options.device != "cpu" and not torch.cuda.is_available():
+        print("no GPU was measured: torch finds no CUDA device (--device cpu runs the same code on the CPU)")
+        return
+    device = resolve(options.device)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    print(
+        f"{name}, torch {torch.__version__}; every call is waited for, templates and frames come from the host\n"
+    )
+    print("\n".join(table(COLUMNS, [row.cells() for row in measure(device, quick=options.quick)])))
+
+
+if __name__ == "__main__":
+    main()

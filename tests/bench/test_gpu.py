@@ -1,0 +1,72 @@
+"""The benchmark of GPUs on a machine without one: its table, its counting, and how graphs are replayed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bench import gpu
+
+
+def test_without_cuda_it_says_so_in_one_line(capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    gpu.main([])
+    out = capsys.readouterr().out
+    assert out.startswith("no GPU was measured: ")
+    assert out.count("\n") == 1
+
+
+def test_the_table_has_a_row_for_every_task(capsys):
+    gpu.main(["--device", "cpu", "--quick"])
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert [row[0].strip("| ") for row in rows] == [
+        "task",
+        "NCC 228 in 425",
+        "NCC 228 in 425",
+        "locate, ncc",
+        "locate, sift",
+    ]
+    assert {len(row) for row in rows} == {len(gpu.COLUMNS)}
+    assert [row[5] for row in rows[3:]] == ["0e+00 m"] * 2  # the CPU beside itself
+
+
+def test_rates_are_of_the_whole_batch():
+    row = gpu.Row("x", [2.0, 2.0, 2.0], 64, "0", (1, 1))
+    assert row.cells() == ["x", "2.000", "2.000", "32000", "64", "0", "1", "1"]
+
+
+def test_copies_are_told_apart_by_their_direction():
+    names = [
+        "Memcpy HtoD (Pinned -> Device)",
+        "Memcpy DtoD (Device -> Device)",
+        "Memcpy DtoH (Device -> Pageable)",
+    ]
+    assert gpu.directions([*names, "vectorized_elementwise_kernel", names[0]]) == (2, 1)
+
+
+def doubled(x, y):
+    return 2.0 * x + y
+
+
+def faithful(work):
+    """A capture as CUDA's: the result has a fixed place, and replaying writes it anew."""
+    output = work().clone()
+    return lambda: output.copy_(work()), output
+
+
+def forgetful(work):
+    return lambda: None, work().clone()
+
+
+def refusing(work):
+    raise RuntimeError("operation not permitted when stream is capturing")
+
+
+@pytest.mark.parametrize(("capture", "is_captured"), [(faithful, True), (forgetful, False), (refusing, False)])
+def test_what_cannot_be_replayed_faithfully_is_called_as_it_is(capture, is_captured):
+    x, y = torch.arange(3.0), torch.ones(3)
+    replayed = gpu.Replayed(doubled, (x, y), capture)
+    assert replayed.is_captured is is_captured
+    assert replayed(x, y).tolist() == [1.0, 3.0, 5.0]
+    assert replayed(y, x).tolist() == [2.0, 3.0, 4.0]  # other inputs, no stale result
+    assert y.tolist() == [1.0] * 3  # and the caller's tensors stay the caller's

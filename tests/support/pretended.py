@@ -1,0 +1,147 @@
+"""A pretended device: tensors that say they are elsewhere, hold real values, and count what crosses.
+
+On a machine without a GPU ``.cpu()`` does nothing that could be counted. Tensors of this device are wrappers about
+tensors of the CPU: every operation runs there, and answers are real, while code that asks where a tensor lives is
+told another device and takes its path for GPUs. What would copy to the host, or make the host wait because a shape
+depends on values, is recorded; what CUDA refuses (operands on two devices) is refused.
+
+The device is called "meta", since torch without CUDA makes no tensor that says "cuda".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+DEVICE = torch.device("meta")
+_aten = torch.ops.aten
+# The host waits for these: they return a number, or their shape depends on values.
+_WAITS = {
+    _aten._local_scalar_dense,
+    _aten.equal,
+    _aten.nonzero,
+    _aten.masked_select,
+    _aten._unique2,
+    _aten.unique_dim,
+    _aten.unique_consecutive,
+    _aten.bincount,
+    _aten.histc,
+}
+_INDEXED = {_aten.index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_}
+_COPIES = {_aten._to_copy, _aten.copy_}
+
+
+class Pretended(Tensor):
+    """A tensor of the pretended device; ``inner`` holds its values."""
+
+    inner: Tensor
+
+    @staticmethod
+    def __new__(cls, inner: Tensor) -> Pretended:
+        made = Tensor._make_wrapper_subclass(
+            cls,
+            inner.size(),
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            device=DEVICE,
+        )
+        made.inner = inner
+        return made
+
+    def __repr__(self, *args: Any, **kwargs: Any) -> str:
+        return f"Pretended({tuple(self.shape)}, {self.dtype})"
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        raise RuntimeError(f"{func}: expected inside pretended_device()")
+
+
+class Crossings(TorchDispatchMode):
+    """What crossed between the host and the pretended device.
+
+    Attributes:
+        uploads: numbers per copy to the device.
+        downloads: numbers per copy to the host.
+        waits: operations that the host waits for.
+        trace: every operation on the device with the shapes of its results.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.uploads: list[int] = []
+        self.downloads: list[int] = []
+        self.waits: list[str] = []
+        self.trace: list[tuple[str, tuple[tuple[int, ...], ...]]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        mine = [leaf for leaf in given if isinstance(leaf, Pretended)]
+        on_device = bool(mine)
+        if kwargs.get("device") is not None:
+            on_device = torch.device(kwargs["device"]) == DEVICE
+            kwargs["device"] = torch.device("cpu")
+        packet = func.overloadpacket
+        if packet is _aten.copy_:
+            on_device = isinstance(args[0], Pretended)
+        if mine or on_device:
+            self._record(func, args, given, mine, on_device)
+        # A lazy conjugate is resolved above this level: here it would be lost.
+        func = _aten.conj_physical.default if packet is _aten._conj else func
+        out = func(*_unwrapped(args), **_unwrapped(kwargs))
+        if not on_device:
+            return out
+        self.trace.append((str(func), tuple(tuple(t.shape) for t in tree_leaves(out) if isinstance(t, Tensor))))
+        return tree_map_only(Tensor, lambda t: _wrapped(t, mine), out)
+
+    def _record(self, func: Any, args: Any, given: list[Tensor], mine: list[Any], on_device: bool) -> None:
+        packet = func.overloadpacket
+        if packet in _COPIES:
+            source = args[1] if packet is _aten.copy_ else args[0]
+            if on_device and not isinstance(source, Pretended):
+                self.uploads.append(source.numel())
+            elif not on_device:
+                self.downloads.append(source.numel())
+            return
+        if packet in _WAITS:
+            self.waits.append(str(func))
+        others = [t for t in given if not isinstance(t, Pretended) and t.ndim]
+        if packet in _INDEXED:
+            indices = [t for t in tree_leaves(args[1]) if isinstance(t, Tensor)]
+            if any(t.dtype in (torch.bool, torch.uint8) for t in indices):
+                self.waits.append(str(func))  # by way of nonzero
+            if isinstance(args[0], Pretended):
+                uploaded = [t for t in indices if not isinstance(t, Pretended)]
+                self.uploads += [t.numel() for t in uploaded]
+                others = [t for t in others if all(t is not u for u in uploaded)]
+        if mine and others:
+            raise RuntimeError(
+                f"{func}: expected all tensors on one device, got {[t.shape for t in others]} on cpu"
+            )
+
+
+def _unwrapped(tree: Any) -> Any:
+    return tree_map_only(Pretended, lambda t: t.inner, tree)
+
+
+def _wrapped(out: Tensor, given: list[Any]) -> Pretended:
+    """The wrapper of a result; the operand's own where the operation worked in place."""
+    own = [t for t in given if t.inner is out]
+    return own[0] if own else Pretended(out)
+
+
+@contextmanager
+def pretended_device() -> Iterator[Crossings]:
+    """The block in which tensors of :data:`DEVICE` can be made and used, and its record."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "inference_mode", torch.no_grad)  # which wrappers cannot follow; the values are equal
+        with Crossings() as crossings:
+            yield crossings
