@@ -25,7 +25,7 @@ from engine.errors import BackendError, EngineError
 T = TypeVar("T")
 
 _ALONE_S = 0.05  # of work in this process first
-_WORTH_S = 0.3  # of work that is left; less is done sooner than workers are started
+_WORTH_S = 0.5  # of work that is left; less is done sooner than workers are started
 _AHEAD = 2  # tasks that a worker has: while one result travels, it works on the next
 _Workers = dict[Connection, BaseProcess]
 
