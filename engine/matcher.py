@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -9,10 +10,11 @@ import numpy as np
 import torch
 
 from engine import device as devices
+from engine import workers as processes
 from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
-from engine.errors import OptionError
+from engine.errors import EngineError, OptionError
 from engine.features import plans_created
 from engine.kernels import loops_compiled
 from engine.methods import method_type
@@ -143,6 +145,67 @@ class SceneMatcher:
             detail = "the answer came after the budget"
             return query.refuse(Reason.LATE, detail, result.method, window=result.window)
         return replace(result, timings=query.scheduler.timings)
+
+    def locate_many(
+        self,
+        frames: Sequence[Frame],
+        priors: Sequence[Prior | None],
+        budget: Budget | None = None,
+        *,
+        workers: int | None = None,
+    ) -> list[Fix | NoFix]:
+        """Where the camera was at each of many frames, by all cores: what :meth:`locate` says of each, in order.
+
+        The work is divided among copies of this process (Linux), which share the prepared map. What they cache and
+        learn ends with them: call :meth:`warmup` before. Frames are matched one by one in this process on a GPU,
+        with a map that is too large for memory, and where all are done in a moment.
+
+        Args:
+            frames: of the camera's resolution.
+            priors: one a frame; None searches the whole map.
+            budget: of each frame.
+            workers: as many processes at most. None is one a core, and 1 where other threads of Python run; a
+                number forks all the same, and no other thread may hold a lock then that matching needs.
+
+        Raises:
+            OptionError: frames and priors differ in number, or there can be no such number of workers.
+            CalibrationError: a frame, which is named by its index, is not of the camera's resolution.
+            BackendError: a worker ended.
+        """
+        if len(frames) != len(priors):
+            raise OptionError(f"priors: expected one a frame, {len(frames)}, got {len(priors)}")
+
+        def located(index: int) -> Fix | NoFix:
+            try:
+                return self.locate(frames[index], priors[index], budget)
+            except EngineError as error:
+                raise type(error)(f"frames[{index}]: {error}") from error
+            except Exception as error:
+                error.add_note(f"It is of frames[{index}].")
+                raise
+
+        return list(processes.in_order(located, len(frames), self._workers(workers)))
+
+    def _workers(self, asked: int | None) -> int:
+        """The number of processes that frames are divided among.
+
+        Raises:
+            OptionError: there can be no such number.
+        """
+        if asked is not None and asked < 1:
+            raise OptionError(f"workers: expected 1 or more, got {asked}")
+        alone = None
+        if self.device.type != "cpu":
+            alone = f"on {self.device}"
+        elif self.site.reads_files:
+            alone = f"with {self.site.name}, which is read from its file as it is needed"
+        elif not processes.can_fork():
+            alone = "here: only Linux forks, and daemonic processes may not"
+        if alone is not None and (asked or 1) > 1:
+            raise OptionError(f"workers: expected 1 {alone}, got {asked}")
+        if alone is not None:
+            return 1
+        return processes.safe_count() if asked is None else asked
 
     def explain(self, frame: Frame, window: Window, method: str | None = None) -> Explanation:
         """What the match of a frame in a window looks like: its surface or its matches, for reports.

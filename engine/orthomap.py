@@ -197,6 +197,11 @@ class OrthoMap(Georeference):
         return self._pyramid.is_large
 
     @property
+    def reads_files(self) -> bool:
+        """Whether pixels or heights are read from files whenever they are needed."""
+        return self.is_large or (self._surface is not None and self._surface.reads_files)
+
+    @property
     def is_searchable(self) -> bool:
         """Whether it is small enough to be searched as a whole."""
         return self.width_px * self.height_px <= SEARCH_LIMIT_PX

@@ -144,14 +144,18 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
         errors = replace(errors, unknown_tilt_deg=EXACT, tilt_deg=EXACT, unknown_slope_deg=EXACT)
     matcher = _matcher(flight, method, errors)
     matcher.warmup()
-    out: list[Sample | None] = []
+    frames, priors = [], []
     for frame, true in zip(flight.frames, flight.truth_m, strict=True):
         east, north = true[:2] + rng.normal(0.0, OFF_M, 2)
+        prior = Prior(east_m=float(east), north_m=float(north), sigma_m=SIGMA_M)
         if method == "NCC, no attitude":
             frame = replace(frame, roll_deg=None, pitch_deg=None)
         elif flight.name in MIDDLE and method == "SIFT":
-            frame = _with_own_attitude(flight, frame, Prior(east_m=east, north_m=north, sigma_m=SIGMA_M))
-        fix = matcher.locate(frame, Prior(east_m=float(east), north_m=float(north), sigma_m=SIGMA_M))
+            frame = _with_own_attitude(flight, frame, prior)
+        frames.append(frame)
+        priors.append(prior)
+    out: list[Sample | None] = []
+    for fix, true in zip(matcher.locate_many(frames, priors), flight.truth_m, strict=True):
         if not isinstance(fix, Fix):
             out.append(None)
             continue

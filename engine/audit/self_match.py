@@ -25,6 +25,7 @@ from engine.peaks import fit_summit
 from engine.scores import enhance
 from engine.values import Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
+from engine.workers import in_order, safe_count
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -71,13 +72,20 @@ class SelfMatchStatistics:
 
 
 def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
-    """Yield the statistics of each audited cell, row by row; the map is read on demand."""
+    """Yield the statistics of each audited cell, row by row, by all cores.
+
+    A large map is read on demand, and by one core.
+    """
     options = plan.options.ncc
     prepared = PreparedMap(plan.site, torch.device("cpu"), options.enhance_radius_px, options.score)
-    noise = _noise(plan.shape)
-    with torch.inference_mode():
-        for center_px in plan.centers_px[plan.audited]:
-            yield _measure(plan, prepared, noise, center_px)
+    noise, centers_px = _noise(plan.shape), plan.centers_px[plan.audited]
+
+    def measured(index: int) -> SelfMatchStatistics:
+        with torch.inference_mode():
+            return _measure(plan, prepared, noise, centers_px[index])
+
+    reads_files = any(site is not None and site.reads_files for site in (plan.site, plan.other))
+    yield from in_order(measured, len(centers_px), 1 if reads_files else safe_count())
 
 
 def _noise(shape: tuple[int, int]) -> Pictures:

@@ -6,7 +6,9 @@ rich is imported by what draws with it: neither help nor a pipe of JSON does.
 from __future__ import annotations
 
 import json
+import math
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.table import Table
 
+_DRAWN_EVERY_S = 0.1
 _PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
 
 
@@ -39,6 +42,7 @@ class _ConsoleProgress(Progress):
 
     def __init__(self) -> None:
         self._bars: dict[str, Bars] = {}
+        self._drawn_s = -math.inf
 
     def message(self, text: str) -> None:
         say(as_typed(text))
@@ -50,10 +54,14 @@ class _ConsoleProgress(Progress):
         if bars is None:
             from rich.progress import Progress as Bars
 
-            bars = self._bars[description] = Bars(console=_errors(), transient=True)
+            # Without a thread that draws: beside other threads no workers are forked (engine.workers).
+            bars = self._bars[description] = Bars(console=_errors(), transient=True, auto_refresh=False)
             bars.add_task(description)
             bars.start()
-        bars.update(bars.task_ids[0], completed=done, total=total)
+        is_due = time.monotonic() - self._drawn_s > _DRAWN_EVERY_S
+        if is_due:
+            self._drawn_s = time.monotonic()
+        bars.update(bars.task_ids[0], completed=done, total=total, refresh=is_due)
 
     def finish(self, description: str) -> None:
         bars = self._bars.pop(description, None)

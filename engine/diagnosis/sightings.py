@@ -97,8 +97,7 @@ def _mirrored(frame: Frame) -> Frame:
 
 def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]) -> list[Sighting]:
     out = []
-    for index, (frame, prior) in enumerate(zip(frames, priors, strict=True)):
-        result = matcher.locate(Frame(frame.image), prior)
+    for index, result in enumerate(matcher.locate_many([Frame(frame.image) for frame in frames], priors)):
         if isinstance(result, Fix) and (found := _sighting(index, result, matcher.site)) is not None:
             out.append(found)
     return out
@@ -127,9 +126,9 @@ def _by_correlation(
             break
     if best[0] < 2:
         return []
+    changed = [_changed(frames[k], *best[1:]) for k in usable]
     out = []
-    for k in usable:
-        result = matcher.locate(_changed(frames[k], *best[1:]), priors[k])
+    for k, result in zip(usable, matcher.locate_many(changed, [priors[k] for k in usable]), strict=True):
         if isinstance(result, Fix) and (found := _sighting(k, result, matcher.site)) is not None:
             out.append(found)
     return out

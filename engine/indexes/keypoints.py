@@ -7,6 +7,7 @@ DISK does, still describes a tile a little differently than the level in one pie
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 
 import numpy as np
@@ -41,6 +42,7 @@ class KeypointMap:
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
         self._site, self._matcher = site, matcher
         self._tiles: OrderedDict[_Key, Keypoints] = OrderedDict()  # the most recently used is last
+        self._lock = threading.Lock()  # guards the tiles, not their description, as in PreparedMap
         self.created = 0
         """Tiles described so far."""
 
@@ -69,18 +71,24 @@ class KeypointMap:
         return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
 
     def _tile(self, key: _Key) -> Keypoints:
-        tile = self._tiles.get(key)
-        if tile is None:
+        with self._lock:
+            found = self._tiles.get(key)
+            if found is not None:
+                self._tiles.move_to_end(key)
+                return found
+        tile = self._describe(*key)
+        with self._lock:
             self.created += 1
-            tile = self._tiles[key] = self._describe(*key)
-        self._tiles.move_to_end(key)
+            self._tiles[key] = tile
+            self._tiles.move_to_end(key)
         return tile
 
     def _evict(self, keep: int) -> None:
         """Evict the least recently used tiles down to the limit, but not the last ``keep``."""
-        used = sum(map(len, self._tiles.values()))
-        while used > MAX_KEYPOINTS and len(self._tiles) > keep:
-            used -= len(self._tiles.popitem(last=False)[1])
+        with self._lock:
+            used = sum(map(len, self._tiles.values()))
+            while used > MAX_KEYPOINTS and len(self._tiles) > keep:
+                used -= len(self._tiles.popitem(last=False)[1])
 
     def _describe(self, level: int, row: int, column: int) -> Keypoints:
         """The keypoints of a tile, in pixels of the level."""

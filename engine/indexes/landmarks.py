@@ -8,6 +8,7 @@ edges, so that the tiles together equal the level described in one piece.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -81,6 +82,7 @@ class LandmarkMap:
         self._site, self._device = site, device
         self._tiles: dict[_Key, NamedArrays] = {}  # the most recently used is last
         self._max_landmarks = MAX_LANDMARKS
+        self._lock = threading.Lock()  # guards the tiles, not their description, as in PreparedMap
         self.created = 0
         """Tiles described so far."""
 
@@ -149,23 +151,28 @@ class LandmarkMap:
 
     def _tile(self, key: _Key) -> NamedArrays:
         """A tile, which becomes the most recently used."""
-        tile = self._tiles.pop(key, None)
-        if tile is None:
-            level, upright, row, column = key
+        with self._lock:
+            found = self._tiles.pop(key, None)
+            if found is not None:
+                self._tiles[key] = found
+                return found
+        level, upright, row, column = key
+        tile = self._with_points(self._detect(level, upright, row, column), level)
+        with self._lock:
             self.created += 1
-            tile = self._with_points(self._detect(level, upright, row, column), level)
-        self._tiles[key] = tile
+            self._tiles[key] = tile
         return tile
 
     def _evict(self, keep: int) -> None:
         """Evict the least recently used tiles down to the limit, but not the last ``keep``."""
-        tiles = list(self._tiles.items())
-        used = sum(len(tile["rank"]) for _, tile in tiles)
-        for key, tile in tiles[: len(tiles) - keep]:
-            if used <= self._max_landmarks:
-                break
-            used -= len(tile["rank"])
-            self._tiles.pop(key, None)
+        with self._lock:
+            tiles = list(self._tiles.items())
+            used = sum(len(tile["rank"]) for _, tile in tiles)
+            for key, tile in tiles[: len(tiles) - keep]:
+                if used <= self._max_landmarks:
+                    break
+                used -= len(tile["rank"])
+                del self._tiles[key]
 
     def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
         """Every keypoint on a tile, as it would be detected in the whole level."""

@@ -91,6 +91,11 @@ class SurfaceModel:
             heights_m = np.ascontiguousarray(heights_m, np.float32)
         self._heights_m, self._from_map, self._decimated = heights_m, from_map, decimated
 
+    @property
+    def reads_files(self) -> bool:
+        """Whether heights are read from the file whenever they are needed."""
+        return isinstance(self._heights_m, HeightTiles)
+
     def overview(self, map_xy: Array) -> Array:
         """Heights for samples spread over the whole map: of the decimated surface where there is one.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 
 _MEMORY = 0.93  # weight of a run after the next one: some fourteen runs count
@@ -49,14 +50,16 @@ class _CostModel:
 
 
 class Costs:
-    """Costs of steps by name. A step's work is in units of its own, such as pixels."""
+    """Costs of steps by name, for any number of threads. A step's work is in units of its own, such as pixels."""
 
     def __init__(self) -> None:
         self._models: dict[str, _CostModel] = {}
+        self._lock = threading.Lock()  # a model's sums belong together
 
     def learn(self, step: str, work: float, ms: float) -> None:
         """Note that a step with this much work took so many milliseconds."""
-        self._models.setdefault(step, _CostModel()).learn(work, ms)
+        with self._lock:
+            self._models.setdefault(step, _CostModel()).learn(work, ms)
 
     def note_refusal(self, step: str, *, decay_cost: bool) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
@@ -65,8 +68,10 @@ class Costs:
             step: its name.
             decay_cost: whether the cost itself decays, so that the step is tried again; else only its deviation.
         """
-        known = self._models.get(step)
-        if known is not None:
+        with self._lock:
+            known = self._models.get(step)
+            if known is None:
+                return
             known.square *= _DEVIATION_DECAY**2
             if decay_cost:
                 known.ms *= _COST_DECAY
@@ -74,7 +79,8 @@ class Costs:
 
     def upper_bound_ms(self, step: str, work: float) -> float:
         """The step's expected time and three deviations; 0 where it never ran."""
-        model = self._models.get(step)
-        if model is None:
-            return 0.0
-        return model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
+        with self._lock:
+            model = self._models.get(step)
+            if model is None:
+                return 0.0
+            return model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
