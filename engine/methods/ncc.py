@@ -149,8 +149,7 @@ class Ncc(Method):
         """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
         if not isinstance(result, Fix) or result.stage != "fine" or not self.options.refine:
             return result
-        # A height that was searched for is not the frame's; an unknown slope would pass for a wrong tilt.
-        if not self._trusts(query) or (query.telemetry.has_tilt and not query.site.has_surface):
+        if not self._trusts(query):  # a height that was searched for is not the frame's
             return result
         if result.attitude is not None:  # found by another heading than the frame's own
             heading_deg = result.attitude.heading_deg
