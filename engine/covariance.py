@@ -31,7 +31,8 @@ class AssumedErrors:
         map_m: georeferencing accuracy per axis, where the map does not state it (:func:`with_map_accuracy`): that
             of web maps and of public orthophotos.
         surface_slope_deg: slope accuracy of the surface model under one frame, where it does not state it.
-        unknown_slope_deg: the same where flat ground is assumed.
+        unknown_slope_deg: slope of the ground where flat ground is assumed: the scale of a mixture of slopes from
+            nearly none to larger ones (:mod:`engine.methods.unknown_slope`).
     """
 
     height_m: float = 0.5

@@ -78,9 +78,12 @@ class Ncc(Method):
     def _by_coarse_peak(self, query: Query) -> Fix | None:
         """A refined fix that begins at the peak of the coarsest level, where that is beyond doubt.
 
-        It costs a fraction of a fine one, and what is refined from it is the same pose.
+        It costs a fraction of a fine one, and what is refined from it is the same pose. Where roll and pitch, or
+        the slope of the ground, are unknown, the pose rests on the peak as well, which then must be fine.
         """
         if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
+            return None
+        if not (query.telemetry.has_tilt and query.site.has_surface):
             return None
         step, works = self._step(query)
         coarser = max(works)
@@ -155,12 +158,8 @@ class Ncc(Method):
             return Refinement(query, self.samples, self.options).refine(result)
 
     def _can_refine(self, query: Query) -> bool:
-        """Whether poses are refined: a height that was searched for is not the frame's.
-
-        On a map without a surface model an unknown slope would pass for a wrong tilt.
-        """
-        known = query.telemetry.height_agl_m is not None and self._trusts(query)
-        return self.options.refine and known and not (query.telemetry.has_tilt and not query.site.has_surface)
+        """Whether poses are refined: a height that was searched for is not the frame's."""
+        return self.options.refine and query.telemetry.height_agl_m is not None and self._trusts(query)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The correlation surface of a window at the frame's own height and heading."""

@@ -1,4 +1,4 @@
-"""Dense refinement of a fix by correlation: all of the camera's pose, through the surface model."""
+"""Dense refinement of a fix by correlation: all of the camera's pose, through the surface model or a plane."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from engine.geo import attitude_from_rotation
 from engine.indexes.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
+from engine.methods.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.scores import enhance
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
@@ -65,8 +66,8 @@ class Refinement:
 
         Where the picture does not confirm the telemetry's attitude, that is doubted: the pose is refined once more
         as if roll and pitch were hardly known. Without a known roll and pitch the picture must determine them over
-        a surface model, or the fix is refused: its error is unknown then. Over ground that is taken for flat the
-        fix stays as it was.
+        a surface model, or the fix is refused: its error is unknown then. Over ground that is taken for flat a fix
+        that is not confirmed stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         with query.scheduler.stage("dense"):
@@ -85,9 +86,7 @@ class Refinement:
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
-        """The fix with all of its pose refined on the frame's own level, None where that is not beyond doubt."""
-        if not self._knows_tilt:
-            return None
+        """The fix of a known tilt refined on the frame's own level, None where that is not beyond doubt."""
         with self.query.scheduler.stage("dense"):
             prior = self._prior(fix)
             return self._refined(fix, prior, self._at_once(prior))
@@ -114,10 +113,16 @@ class Refinement:
         pose_covariance = None if fit is None else covariance_of(fit, prior)
         if fit is None or pose_covariance is None:
             return None
+        if self._is_on_unknown_slope:
+            height_m, slope_deg = fit.pose.center_m[2] - query.site.ground_m, errors.unknown_slope_deg
+            over = over_unknown_slope(fit.pose, pose_covariance, prior.pose.center_m[:2], height_m, slope_deg)
+            if over is None:
+                return None
+            fit, pose_covariance = replace(fit, pose=over.pose), over.covariance
         covariance = pose_covariance[:3, :3].copy()
         height_m = fit.pose.center_m[2] - query.site.ground_m
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
-        if not query.site.has_surface:  # a slope of the ground was taken for a tilt
+        if not query.site.has_surface and not self._knows_tilt:  # a slope of the ground was taken for a tilt
             covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
         nadir_px = query.site.pixel_from_enu(fit.pose.center_m[:2])
         doubt_m = query.scale_doubt_m(nadir_px, float(fit.pose.center_m[2]), fit.pose.rotation[2], errors)
@@ -133,6 +138,10 @@ class Refinement:
     @property
     def _knows_tilt(self) -> bool:
         return self.knows_tilt and self.query.telemetry.has_tilt
+
+    @property
+    def _is_on_unknown_slope(self) -> bool:
+        return self._knows_tilt and not self.query.site.has_surface
 
     def _at_once(self, prior: GaussianPrior) -> DenseFit | None:
         return self._through_levels(prior, 0, _MIN_CORRELATION_AT_ONCE)
@@ -177,7 +186,9 @@ class Refinement:
         precision = np.zeros((8, 8))
         precision[2, 2] = errors.height_sigma_m(height_m) ** -2.0
         precision[3:6, 3:6] = attitude_prior.precision
-        precision[[6, 7], [6, 7]] = math.tan(math.radians(errors.surface_slope_deg)) ** -2.0
+        unknown_deg = wide_slope_deg(errors.unknown_slope_deg)
+        slope_deg = unknown_deg if self._is_on_unknown_slope else errors.surface_slope_deg
+        precision[[6, 7], [6, 7]] = math.tan(math.radians(slope_deg)) ** -2.0
         ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
         center = np.array([fix.east_m, fix.north_m, ground_m + height_m])
         return GaussianPrior(Pose(attitude_prior.rotation, center, np.zeros(2)), precision)
