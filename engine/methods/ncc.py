@@ -29,6 +29,7 @@ from engine.methods.oblique import is_ground_below, is_oblique
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
+from engine.methods.scheduler import OutOfTime
 from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
@@ -118,7 +119,7 @@ class Ncc(Method):
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
         if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
-            query.scheduler.note_refusal(step, decay_cost=True)
+            query.scheduler.note_refusal(step)
             return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, step)
@@ -158,10 +159,13 @@ class Ncc(Method):
             query = replace(query, frame=frame)
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
-            query.scheduler.note_refusal("refinement", decay_cost=False)
+            query.scheduler.note_refusal("refinement")
             return result
-        with query.scheduler.costed("refinement", work_px):
-            return Refinement(query, self.samples, self.options).refine(result)
+        try:
+            with query.scheduler.with_fix(), query.scheduler.costed("refinement", work_px):
+                return Refinement(query, self.samples, self.options).refine(result)
+        except OutOfTime:
+            return result
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The correlation surface of a window at the frame's own height and heading."""

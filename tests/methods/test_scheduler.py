@@ -27,7 +27,10 @@ class FixedCosts:
     def learn(self, step, work, ms):
         pass
 
-    def note_refusal(self, step, *, decay_cost):
+    def note_refusal(self, step):
+        pass
+
+    def note_abandoned(self, step, work, ms):
         pass
 
 
