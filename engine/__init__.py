@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from engine.navigator_state import NavigatorState
     from engine.orthomap import OrthoMap
     from engine.pose import PoseOptions
+    from engine.realtime import Realtime, set_realtime
     from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 __all__ = [
@@ -64,6 +65,7 @@ __all__ = [
     "PeakRule",
     "PoseOptions",
     "Prior",
+    "Realtime",
     "Reason",
     "SceneMatcher",
     "ShapeError",
@@ -74,6 +76,7 @@ __all__ = [
     "Window",
     "features",
     "ncc_fft",
+    "set_realtime",
     "set_threads",
 ]
 
@@ -93,6 +96,7 @@ _NAMES = {
     "engine.navigator_state": "NavigatorState",
     "engine.orthomap": "OrthoMap",
     "engine.pose": "PoseOptions",
+    "engine.realtime": "Realtime set_realtime",
     "engine.values": "Attitude Fix Frame NoFix Prior Reason Timings Window",
 }
 """The public names by module. A module is imported when one of its names is used: torch alone takes seconds."""

@@ -214,7 +214,14 @@ def chi_square(difference: Array, covariance: Array) -> float:
 
 
 def inverse_2x2(matrix: Array) -> Array:
-    """The inverse of a (2, 2) matrix that has one, in a tenth of the time of NumPy's."""
+    """The inverse of a small matrix, in a tenth of the time of NumPy's.
+
+    Args:
+        matrix: (2, 2), of a determinant that is not 0.
+
+    Returns:
+        (2, 2).
+    """
     (a, b), (c, d) = matrix.tolist()
     return np.asarray(np.array([[d, -b], [-c, a]]) / (a * d - b * c), np.float64)
 

@@ -12,10 +12,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 from engine.budget import Budget
 from engine.errors import EngineError, OptionError, StateError
 from engine.navigator import Navigator
+from engine.realtime import LoadWatch, Realtime, check_realtime, start_thread
 from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
 
 _log = logging.getLogger("scenematch")
@@ -35,14 +37,16 @@ class LiveOptions:
         patience_ms: beyond the deadline, after which a worker counts as hanging and is replaced. One that creates
             its navigator has as long from its start, and twice as long after each that hung in doing so.
         max_speed_mps: of the vehicle, by which the uncertainty at a new worker's start grows with time.
+        realtime: how the worker and the watchdog are scheduled; None is as usual.
     """
 
     deadline_ms: float = 121.0
     patience_ms: float = 1000.0
     max_speed_mps: float = 15.0
+    realtime: Realtime | None = None
 
     def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
+        check_positive(self, "deadline_ms", "patience_ms", "max_speed_mps")
         for name in ("deadline_ms", "patience_ms"):
             if getattr(self, name) > _MAX_MS:
                 raise OptionError(f"{name}: expected at most {_MAX_MS:g}, got {getattr(self, name):g}")
@@ -94,6 +98,9 @@ class Live:
         options: settings.
         clock_ns: on which frames are captured and grow old, such as a simulator's; None is ``time.monotonic_ns``.
 
+    Raises:
+        OptionError, BackendError: real time was asked for, and the system is not Linux or does not permit it.
+
     Convention:
         Python cannot stop a thread: one that hangs is left behind, and nothing of it is used any more. A hang that
         holds Python's lock stops the whole process.
@@ -120,8 +127,9 @@ class Live:
         self._counts = Counts()
         self._closed = False
         self._threads: list[threading.Thread] = []
+        check_realtime(self._options.realtime)
         self._start_thread(self._work, make_navigator(start), 0)
-        self._start_thread(self._watch)
+        self._start_thread(self._watch, above=1)  # a worker that computes must not keep it from answering
 
     @property
     def counts(self) -> Counts:
@@ -182,6 +190,7 @@ class Live:
         if navigator is None:
             self._replace(number)
             return
+        load = LoadWatch(self._options.realtime)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting is not None or self._closed or self._number != number)
@@ -189,7 +198,9 @@ class Live:
                     return
                 job, self._working, self._waiting = self._waiting, self._waiting, None
                 self._changed.notify_all()
+            begin_s = time.monotonic()
             result, alive = self._match(navigator, job)
+            load.add(begin_s, time.monotonic())
             with self._changed:
                 if self._number != number:
                     return  # replaced meanwhile
@@ -311,9 +322,9 @@ class Live:
     def _count(self, *names: str) -> None:
         self._counts = replace(self._counts, **{name: getattr(self._counts, name) + 1 for name in names})
 
-    def _start_thread(self, target: Callable[..., None], *args: object) -> None:
-        thread = threading.Thread(target=target, args=args, name=f"scenematch-{target.__name__}", daemon=True)
-        thread.start()
+    def _start_thread(self, target: Callable[..., None], *args: object, above: int = 0) -> None:
+        name = f"scenematch-{target.__name__}"
+        thread = start_thread(partial(target, *args), name, self._options.realtime, above=above)
         with self._changed:
             self._threads = [*(other for other in self._threads if other.is_alive()), thread]
 

@@ -23,7 +23,7 @@ from engine.methods.explanation import Explanation
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
-from engine.methods.scheduler import Scheduler
+from engine.methods.scheduler import OutOfTime, Scheduler
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
@@ -140,7 +140,10 @@ class SceneMatcher:
         if prior is None and not self.site.is_searchable:
             detail = f"the map of {self.site.size_km} is not searched as a whole; a position to begin at is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
-        result = self._method.locate(query)
+        try:
+            result = self._method.locate(query)
+        except OutOfTime:
+            return query.refuse(Reason.LATE, "the budget was spent before there was a fix", self.method)
         if isinstance(result, Fix) and not deadline.met:
             detail = "the answer came after the budget"
             return query.refuse(Reason.LATE, detail, result.method, window=result.window)

@@ -44,6 +44,7 @@ PUBLIC = [
     "PeakRule",
     "PoseOptions",
     "Prior",
+    "Realtime",
     "Reason",
     "SceneMatcher",
     "ShapeError",
@@ -54,6 +55,7 @@ PUBLIC = [
     "Window",
     "features",
     "ncc_fft",
+    "set_realtime",
     "set_threads",
 ]
 MODULES = {

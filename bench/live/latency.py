@@ -1,6 +1,8 @@
 """The latency budget: whether an answer comes on time, every time, what it is worth, and what it costs to start.
 
-    python -m bench.live.latency [budgets|hogs|slow|queue|soak|tradeoff|startup|entries|all] [--quick] [--docs DIR]
+    python -m bench.live.latency [SECTION] [--quick] [--docs DIR]
+
+A section is budgets, hogs, embedded, slow, queue, soak, tradeoff, startup, entries or all.
 
 Figures go to .benchmarks/latency.json, section by section; ``all`` writes docs/latency.md from its own as well.
 """
@@ -19,6 +21,7 @@ from typing import Any
 
 from bench import DOCS, ROOT
 from bench.live.burden import PERIOD_S, hogs, throttle
+from bench.live.embedded import embedded
 from bench.live.endless import Course, draw, fly, summary, warm
 from bench.live.soak import Growth, queue, soak
 from bench.live.startup import entries, startup
@@ -99,6 +102,7 @@ def _fly_what_is_asked(asked: Connection, drawn: int) -> None:
 SECTIONS: dict[str, Callable[..., Any]] = {
     "budgets": budgets,
     "hogs": beside_hogs,
+    "embedded": lambda _, **sizes: embedded(**sizes),
     "slow": slow,
     "queue": queue,
     "soak": soak,
@@ -109,6 +113,7 @@ SECTIONS: dict[str, Callable[..., Any]] = {
 QUICK: dict[str, dict[str, Any]] = {
     "budgets": {"auto_frames": 60, "other_frames": 20},
     "hogs": {"frames": 40},
+    "embedded": {"frames": 20},
     "slow": {"frames": 10},
     "queue": {"seconds": 0.3},
     "soak": {"frames": 120},

@@ -48,6 +48,7 @@ from engine.evidence import position_of
 from engine.live import Answer, Live, LiveOptions
 from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
+from engine.realtime import start_thread
 from engine.track_guard import TrackGuard
 from engine.values import Fix, Prior
 
@@ -142,8 +143,8 @@ class MavlinkBridge:
         self._link: Link | None = connection.open()
         self._decoder = self._new_decoder(self._link)
         self._live = Live(self._new_navigator, self.deliver, start, live)
-        self._reader = threading.Thread(target=self._read, name="scenematch-mavlink", daemon=True)
-        self._reader.start()
+        # A reader that holds Python's lock while it waits for a core would keep the worker waiting.
+        self._reader = start_thread(self._read, "scenematch-mavlink", None if live is None else live.realtime)
 
     def __enter__(self) -> MavlinkBridge:
         return self

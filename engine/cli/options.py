@@ -151,6 +151,17 @@ RerunConnectOption = Annotated[
     typer.Option("--rerun-connect", metavar="HOST:PORT", help="Show it live in a viewer of rerun that listens."),
 ]
 
+RealtimeOption = Annotated[
+    bool, typer.Option("--realtime", help="Match with a real-time priority and locked memory (Linux).")
+]
+NiceOption = Annotated[
+    int | None,
+    typer.Option("--nice", metavar="N", help="With --realtime: a nice value, -20 to -1, in place of SCHED_FIFO."),
+]
+CoresOption = Annotated[
+    str | None, typer.Option("--cores", metavar="N,N", help="With --realtime: the cores that match.")
+]
+
 
 def use_threads(count: int) -> None:
     """Threads of torch and OpenCV."""

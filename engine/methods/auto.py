@@ -15,6 +15,7 @@ from engine.methods.method import Method
 from engine.methods.ncc import Ncc
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
+from engine.methods.scheduler import OutOfTime
 from engine.methods.sift import Sift
 from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Reason, Result, Window
@@ -61,21 +62,22 @@ class Auto(Method):
     def locate(self, query: Query) -> Result:
         """The more accurate of two fixes that agree, or the only one.
 
-        Refinement comes last: it makes a fix more accurate, where the second method makes it more certain.
+        The second method makes a fix more certain. It comes last, so that for lack of time nothing is lost to it.
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        first = self.ncc.correlate(query, try_turns=False)  # SIFT finds the heading by itself
-        second = self.sift.locate(query, is_second=isinstance(first, Fix))
+        at_once = self.ncc.by_coarse_peak(query)
+        first = at_once or self.ncc.correlate(query, try_turns=False)  # SIFT finds the heading by itself
+        # A wrong attitude displaces the peak; refinement, which measures it, leads back.
+        refined = at_once or self.ncc.refine(query, first)
+        second = self._second(query, refined)
         if isinstance(first, NoFix):
             if isinstance(second, Fix):
                 return second
             both = first.candidates + second.candidates
             return replace(first if second.reason is Reason.LATE else second, candidates=both)
         if isinstance(second, NoFix):
-            return self.ncc.refine(query, first)
-        # A wrong attitude displaces the peak; refinement, which measures it, leads back.
-        refined = self.ncc.refine(query, first)
+            return refined
         if isinstance(refined, Fix) and refined.stage == "refined":
             first = refined
         apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
@@ -91,6 +93,15 @@ class Auto(Method):
         stated = [fix.confidence for fix in fixes if fix.confidence is not None]
         best = min(fixes, key=lambda fix: fix.sigma_m)
         return replace(best, stage="verified", confidence=max(stated, default=None))
+
+    def _second(self, query: Query, first: Result) -> Result:
+        if not isinstance(first, Fix):
+            return self.sift.locate(query)
+        try:
+            with query.scheduler.with_fix():
+                return self.sift.locate(query)
+        except OutOfTime:
+            return query.refuse(Reason.LATE, "the budget was spent before there was a second fix", "sift")
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""

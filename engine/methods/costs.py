@@ -7,11 +7,12 @@ import threading
 from dataclasses import dataclass
 
 _MEMORY = 0.93  # weight of a run after the next one: some fourteen runs count
-_MAX_SURPRISE = 2.0  # a run counts for at most this factor of the expected cost: one interruption changes little
+_MAX_SURPRISE = 2.0  # a run counts for at most this factor of the expected cost: one outlier changes little
 _SIGMAS = 3.0
 _MIN_MS = 0.05
 _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for its cost
-_COST_DECAY = 0.99  # of the cost itself
+_COST_DECAY = 0.99  # of the cost itself, until the step is tried
+_ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
 
 
 @dataclass(slots=True)
@@ -24,6 +25,7 @@ class _CostModel:
     work_work: float = 0.0
     work_ms: float = 0.0
     square: float = 0.0
+    trust: float = 1.0  # share of the cost that is still believed after refusals
 
     def expected_ms(self, work: float) -> float:
         """The line's value, neither of its two parts negative."""
@@ -39,9 +41,13 @@ class _CostModel:
 
     def learn(self, work: float, ms: float) -> None:
         if self.weight > 0.0:
+            if ms <= self.trust * self.expected_ms(work):  # it has become cheaper, as was tried
+                self.ms *= self.trust
+                self.work_ms *= self.trust
             expected = self.expected_ms(work)
             ms = min(ms, _MAX_SURPRISE * expected + _MIN_MS)
             self.square = _MEMORY * self.square + (1.0 - _MEMORY) * (ms - expected) ** 2
+        self.trust = 1.0
         self.weight = _MEMORY * self.weight + 1.0
         self.work = _MEMORY * self.work + work
         self.ms = _MEMORY * self.ms + ms
@@ -61,21 +67,25 @@ class Costs:
         with self._lock:
             self._models.setdefault(step, _CostModel()).learn(work, ms)
 
-    def note_refusal(self, step: str, *, decay_cost: bool) -> None:
+    def note_abandoned(self, step: str, work: float, ms: float) -> None:
+        """Note that a step was abandoned after so many milliseconds: it costs more than these."""
+        with self._lock:
+            known = self._models.setdefault(step, _CostModel())
+            known.trust = 1.0
+            expected_ms = known.expected_ms(work) if known.weight > 0.0 else 0.0
+            known.learn(work, max(_ABANDONED * ms, expected_ms))
+
+    def note_refusal(self, step: str) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
 
-        Args:
-            step: its name.
-            decay_cost: whether the cost itself decays, so that the step is tried again; else only its deviation.
+        Its deviation decays, and so does its cost until it is tried once; if it was not cheaper, that is undone.
         """
         with self._lock:
             known = self._models.get(step)
             if known is None:
                 return
             known.square *= _DEVIATION_DECAY**2
-            if decay_cost:
-                known.ms *= _COST_DECAY
-                known.work_ms *= _COST_DECAY
+            known.trust *= _COST_DECAY
 
     def upper_bound_ms(self, step: str, work: float) -> float:
         """The step's expected time and three deviations; 0 where it never ran."""
@@ -83,4 +93,4 @@ class Costs:
             model = self._models.get(step)
             if model is None:
                 return 0.0
-            return model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
+            return model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)

@@ -21,6 +21,7 @@ from engine.methods.options import MatcherOptions
 from engine.methods.peak_evidence import PeakCandidate, agreement_of, features_of, fix_of, with_confidence
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
+from engine.methods.scheduler import OutOfTime
 from engine.methods.second_look import second_look
 from engine.orthomap import OrthoMap
 from engine.peaks import best_positions
@@ -73,9 +74,9 @@ class Ncc(Method):
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
-        return self._by_coarse_peak(query) or self.refine(query, self.correlate(query))
+        return self.by_coarse_peak(query) or self.refine(query, self.correlate(query))
 
-    def _by_coarse_peak(self, query: Query) -> Fix | None:
+    def by_coarse_peak(self, query: Query) -> Fix | None:
         """A refined fix that begins at the peak of the coarsest level, where that is beyond doubt.
 
         It costs a fraction of a fine one, and what is refined from it is the same pose. Where roll and pitch, or
@@ -115,7 +116,7 @@ class Ncc(Method):
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
         if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
-            query.scheduler.note_refusal(step, decay_cost=True)
+            query.scheduler.note_refusal(step)
             return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, step)
@@ -152,10 +153,13 @@ class Ncc(Method):
             query = replace(query, frame=frame)
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
-            query.scheduler.note_refusal("refinement", decay_cost=False)
+            query.scheduler.note_refusal("refinement")
             return result
-        with query.scheduler.costed("refinement", work_px):
-            return Refinement(query, self.samples, self.options).refine(result)
+        try:
+            with query.scheduler.with_fix(), query.scheduler.costed("refinement", work_px):
+                return Refinement(query, self.samples, self.options).refine(result)
+        except OutOfTime:
+            return result
 
     def _can_refine(self, query: Query) -> bool:
         """Whether poses are refined: a height that was searched for is not the frame's."""

@@ -274,9 +274,9 @@ class Query:
         """The refusal of a frame whose window has nothing in common with the map."""
         return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
 
-    def refuse_late(self, method: str, step: str, *, decay_cost: bool = True) -> NoFix:
+    def refuse_late(self, method: str, step: str) -> NoFix:
         """The refusal of a frame for whose quickest variant of a step there is no time, see :class:`Scheduler`."""
-        self.scheduler.note_refusal(step, decay_cost=decay_cost)
+        self.scheduler.note_refusal(step)
         left_ms = self.scheduler.deadline.remaining_ms
         detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
         return self.refuse(Reason.LATE, detail, method)

@@ -20,6 +20,10 @@ from engine.values import Timings
 _T = TypeVar("_T")
 
 
+class OutOfTime(Exception):  # noqa: N818 - no error, and never seen by a caller of the engine
+    """The deadline has passed within a step, which is abandoned."""
+
+
 class Scheduler:
     """Times the stages of one frame, and decides which steps there is time for.
 
@@ -34,6 +38,8 @@ class Scheduler:
         self._device = device
         self._costs = costs or Costs()
         self._stages_ms: dict[str, float] = {}
+        self._step: tuple[str, float] | None = None  # that is being done, and its work
+        self._has_fix = self._is_under_way = False
 
     def can_afford(self, step: str, work: float) -> bool:
         """Whether the time that is left suffices for a step of this much work; True for one that never ran."""
@@ -43,24 +49,58 @@ class Scheduler:
         """The first variant of a step, by its work, that there is time for; None where there is none."""
         return next((variant for variant, work in works.items() if self.can_afford(step, work)), None)
 
-    def note_refusal(self, step: str, *, decay_cost: bool) -> None:
+    def note_refusal(self, step: str) -> None:
         """Note that a step could not be afforded, see :meth:`engine.methods.costs.Costs.note_refusal`."""
-        self._costs.note_refusal(step, decay_cost=decay_cost)
+        self._costs.note_refusal(step)
 
     @contextmanager
     def costed(self, step: str, work: float) -> Iterator[None]:
         """Learn what a step of this much work costs."""
-        start_ms = self.deadline.elapsed_ms
-        yield
+        start_ms, outer, self._step = self.deadline.elapsed_ms, self._step, (step, work)
+        self._is_under_way = False
+        try:
+            yield
+        except OutOfTime:
+            self._costs.note_abandoned(step, work, self.deadline.elapsed_ms - start_ms)
+            raise
+        finally:
+            self._step = outer
         self._costs.learn(step, work, self.deadline.elapsed_ms - start_ms)
 
     @contextmanager
+    def with_fix(self) -> Iterator[None]:
+        """Within it there is a fix already: what would make it late is abandoned before the deadline."""
+        self._has_fix = True
+        try:
+            yield
+        finally:
+            self._has_fix = False
+
+    @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time one stage; stages of one name add up."""
+        """Time one stage; stages of one name add up.
+
+        Raises:
+            OutOfTime: the deadline has passed before it; or it would pass within it, and there is a fix.
+        """
         start_ms = self.deadline.elapsed_ms
-        yield
-        synchronise(self._device)
-        self._stages_ms[name] = self._stages_ms.get(name, 0.0) + self.deadline.elapsed_ms - start_ms
+        step, work = self._step or ("", 0.0)
+        stage = f"{step}: {name}"
+        if not self.deadline.met:
+            raise OutOfTime
+        # Whether the first stage of a step can be afforded was asked when the step began.
+        if self._has_fix and self._is_under_way and not self.can_afford(stage, work):
+            self.note_refusal(stage)
+            raise OutOfTime
+        self._is_under_way = True
+        try:
+            yield
+        finally:
+            synchronise(self._device)
+            took_ms = self.deadline.elapsed_ms - start_ms
+            self._stages_ms[name] = self._stages_ms.get(name, 0.0) + took_ms
+        if self._step is not None:
+            self._costs.learn(stage, work, took_ms)
 
     @property
     def timings(self) -> Timings:

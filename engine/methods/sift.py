@@ -59,20 +59,15 @@ class Sift(Method):
             with query.scheduler.costed("sift", work_px):
                 self._at_scale(query, share)
 
-    def locate(self, query: Query, *, is_second: bool = False) -> Result:
-        """A fix at the highest resolution of the frame that there is time for.
-
-        Args:
-            query: the frame.
-            is_second: a fix by another method is there already and must not be lost to an attempt that is late.
-        """
+    def locate(self, query: Query) -> Result:
+        """A fix at the highest resolution of the frame that there is time for."""
         step = "sift"
         if query.prior is None or query.telemetry.height_agl_m is None:
             step = "sift search" if query.prior is None else "sift heights"
         works = self._work_px(query)
         share = query.scheduler.first_affordable(step, works)
         if share is None:
-            return query.refuse_late(METHOD, step, decay_cost=not is_second)
+            return query.refuse_late(METHOD, step)
         with query.scheduler.costed(step, works[share]):
             return self._at_scale(query, share)
 

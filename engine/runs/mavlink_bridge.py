@@ -22,6 +22,7 @@ from engine.matcher import SceneMatcher
 from engine.methods import METHODS
 from engine.methods.options import MatcherOptions
 from engine.orthomap import OrthoMap
+from engine.realtime import Realtime, check_realtime, set_realtime
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
@@ -192,10 +193,12 @@ class BridgeSettings:
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
         seconds: ends after this time; None ends with the pictures.
+        realtime: how the threads that match are scheduled; None is as usual.
 
     Raises:
-        OptionError: a word or a number is none of those that are expected.
+        OptionError: a word or a number is none of those that are expected, or real time is not this system's.
         DeviceError: the device is missing.
+        BackendError: real time is not permitted.
     """
 
     method: str = "auto"
@@ -204,6 +207,7 @@ class BridgeSettings:
     start: str | None = None
     deadline_ms: float | None = None
     seconds: float | None = None
+    realtime: Realtime | None = None
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
@@ -211,6 +215,7 @@ class BridgeSettings:
         check_device(self.device)
         parse_position("start", self.start)
         self.live_options()
+        check_realtime(self.realtime)
 
     def matcher_options(self) -> MatcherOptions:
         """What of it is the matcher's."""
@@ -218,7 +223,8 @@ class BridgeSettings:
 
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, with the one that counts where none was set."""
-        return LiveOptions(deadline_ms=deadline_ms if self.deadline_ms is None else self.deadline_ms)
+        deadline_ms = deadline_ms if self.deadline_ms is None else self.deadline_ms
+        return LiveOptions(deadline_ms=deadline_ms, realtime=self.realtime)
 
 
 def run_mavlink_bridge(
@@ -287,6 +293,8 @@ def run_mavlink_bridge(
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
+            if settings.realtime is not None:  # this thread, too, may hold Python's lock
+                set_realtime(settings.realtime)
             pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
             with (
                 closing(pictures),

@@ -12,6 +12,7 @@ from engine.camera import Camera
 from engine.errors import BackendError, OptionError
 from engine.formats.ros.messages import camera_from_message
 from engine.matcher import SceneMatcher
+from engine.realtime import set_realtime
 from engine.runs.arguments import parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import check_position
@@ -130,6 +131,8 @@ def run_ros_bridge(
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:
+            if settings.realtime is not None:  # this thread, too, may hold Python's lock
+                set_realtime(settings.realtime)
             node.spin(bridge.handlers(ros.topics), bridge.check_input, settings.seconds)
         finally:
             bridge.close()

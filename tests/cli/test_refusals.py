@@ -39,6 +39,12 @@ def said(capsys, arguments, code=2):
         *((command, "--map-sigma-m", value) for command in (TRACK, LOCATE) for value in ("nan", "0", "1e200")),
         *((command, "--start", "48,16,1e200") for command in (PLAYED, ROS, TRACK)),
         *((TRACK, "--log-offset-s", value) for value in ("nan", "inf", "1e10")),
+        *(([*command, "--realtime"], "--nice", value) for command in (PLAYED, ROS) for value in ("0", "5", "-21")),
+        *(
+            ([*command, "--realtime"], "--cores", value)
+            for command in (PLAYED, ROS)
+            for value in ("x", "-1", "99999")
+        ),
         (LOCATE, "--near", "48,16,1e200"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
@@ -63,6 +69,8 @@ def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, t
         ([*LIVE, "--telemetry=t.csv"], "--telemetry", "--frames"),
         ([*LIVE, "--rate-hz=3"], "--rate-hz", "--frames"),
         ([*PLAYED, "--exposure-to-grab-ms=3"], "--exposure-to-grab-ms", "--camera-source"),
+        ([*PLAYED, "--nice=-5"], "--nice", "--realtime"),
+        ([*ROS, "--cores=0"], "--cores", "--realtime"),
         ([*PLAYED, "--no-set-origin", "--origin-alt-m=3"], "--origin-alt-m", "--set-origin"),
         ([*SIMULATE, "--device=cpu"], "--device", "--closed-loop"),
         ([*SIMULATE, "--minutes=1"], "--minutes", "--closed-loop"),

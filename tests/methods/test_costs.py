@@ -76,11 +76,37 @@ def test_the_cost_of_a_step_that_is_refused_decays():
     costs = learned([1.0, 1.0, 1.0], lambda work: 5.0)
     costs.learn("step", 1.0, 9.0)
     high = costs.upper_bound_ms("step", 1.0)
-    for _ in range(50):
-        costs.note_refusal("step", decay_cost=False)
-    assert 5.0 <= costs.upper_bound_ms("step", 1.0) < high  # the spread is gone, the cost is not
+    for _ in range(20):
+        costs.note_refusal("step")
+    assert costs.upper_bound_ms("step", 1.0) < 0.9 * high
     for _ in range(300):
-        costs.note_refusal("step", decay_cost=True)
+        costs.note_refusal("step")
     assert costs.upper_bound_ms("step", 1.0) < 1.0
-    costs.note_refusal("other", decay_cost=True)
+    costs.note_refusal("other")
     assert costs.upper_bound_ms("other", 1.0) == 0.0
+
+
+def refused(costs, times, step="step"):
+    for _ in range(times):
+        costs.note_refusal(step)
+
+
+def test_a_step_that_was_tried_in_vain_is_as_dear_as_before():
+    for end in ("runs", "abandoned"):
+        costs = learned([1.0] * 50, lambda work: 5.0)
+        refused(costs, 100)
+        assert costs.upper_bound_ms("step", 1.0) < 2.0
+        if end == "runs":
+            costs.learn("step", 1.0, 5.0)
+        else:
+            costs.note_abandoned("step", 1.0, 3.0)
+        assert costs.upper_bound_ms("step", 1.0) == pytest.approx(5.0)
+    costs.note_abandoned("step", 1.0, 8.0)  # after 8 ms: it takes at least these
+    assert costs.upper_bound_ms("step", 1.0) > 5.2
+
+
+def test_a_step_that_was_tried_and_is_cheap_again_stays_so():
+    costs = learned([1.0] * 50, lambda work: 5.0)
+    refused(costs, 100)  # it was dear, because it was preempted
+    costs.learn("step", 1.0, 1.0)
+    assert costs.upper_bound_ms("step", 1.0) < 3.0

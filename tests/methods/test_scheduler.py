@@ -28,7 +28,10 @@ class FixedCosts:
     def learn(self, step, work, ms):
         pass
 
-    def note_refusal(self, step, *, decay_cost):
+    def note_refusal(self, step):
+        pass
+
+    def note_abandoned(self, step, work, ms):
         pass
 
 
@@ -106,7 +109,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
     """Where there is no time for the finest level; and where there is, the coarse one is enough."""
     hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc", "ncc")).locate(frame, prior, HURRY)
     by_coarse = make("ncc").locate(frame, prior)
-    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda self, query: None)
+    monkeypatch.setattr(Ncc, "by_coarse_peak", lambda self, query: None)
     by_fine = make("ncc").locate(frame, prior)
     for fix in (hurried, by_coarse, by_fine):
         assert off_m(ground, fix) < 0.3

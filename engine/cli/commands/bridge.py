@@ -13,6 +13,7 @@ from engine.cli.options import (
     BridgeDeadlineOption,
     CameraOption,
     CameraPitchOption,
+    CoresOption,
     DeadlineOption,
     DeviceOption,
     FirmwareOption,
@@ -27,6 +28,8 @@ from engine.cli.options import (
     MessageOption,
     MethodOption,
     MountOption,
+    NiceOption,
+    RealtimeOption,
     RerunConnectOption,
     RerunOption,
     SecondsOption,
@@ -112,6 +115,9 @@ def mavlink(
     ] = False,
     recording: RerunOption = None,
     viewer: RerunConnectOption = None,
+    realtime: RealtimeOption = False,
+    nice: NiceOption = None,
+    cores: CoresOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -120,6 +126,7 @@ def mavlink(
     Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
     played at their own pace, until they end.
     """
+    from engine.runs.arguments import parse_realtime
     from engine.runs.live_viewing import LiveViewTarget
     from engine.runs.mavlink_bridge import BridgeFiles, BridgeSettings, MavlinkSettings, run_mavlink_bridge
 
@@ -137,7 +144,7 @@ def mavlink(
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
-        seconds=seconds,
+        seconds=seconds, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_mavlink_bridge(
@@ -272,6 +279,9 @@ def ros(
     seconds: SecondsOption = None,
     recording: RerunOption = None,
     viewer: RerunConnectOption = None,
+    realtime: RealtimeOption = False,
+    nice: NiceOption = None,
+    cores: CoresOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -281,6 +291,7 @@ def ros(
     An empty name of a topic leaves it out.
     """
     from engine.adapters.ros import RosTopics
+    from engine.runs.arguments import parse_realtime
     from engine.runs.live_viewing import LiveViewTarget
     from engine.runs.mavlink_bridge import BridgeSettings
     from engine.runs.ros_bridge import RosSettings, run_ros_bridge
@@ -292,7 +303,7 @@ def ros(
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
-        seconds=seconds,
+        seconds=seconds, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,

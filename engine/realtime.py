@@ -1,0 +1,241 @@
+"""Real-time scheduling on Linux of the threads that match frames, so that other work does not make them late.
+
+Convention:
+    Threads and processes that such a thread starts are scheduled as usual: a camera's command or a simulator does
+    not get in the way of the frames.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from engine.errors import BackendError, OptionError
+
+_log = logging.getLogger("scenematch")
+
+_MLOCK_CURRENT, _MLOCK_FUTURE, _MLOCK_ON_FAULT = 1, 2, 4  # of mlockall(2); the last: only pages that are used
+_CAP_IPC_LOCK = 14
+_KERNEL = Path("/proc/sys/kernel")
+_MAX_LOAD = 0.9  # of a core: above it the kernel's limit for real-time threads is near
+_LOAD_OVER_S = 2.0
+_FIFO_CURE = "CAP_SYS_NICE, `ulimit -r 20`, or in a unit of systemd LimitRTPRIO=20"
+_NICE_CURE = "CAP_SYS_NICE, `ulimit -e 40`, or in a unit of systemd LimitNICE=40"
+_MEMORY_CURE = "CAP_IPC_LOCK, `ulimit -l unlimited`, or in a unit of systemd LimitMEMLOCK=infinity"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Realtime:
+    """How threads that match frames are scheduled.
+
+    Attributes:
+        priority: of SCHED_FIFO, 1 to 98: such a thread runs before all that are scheduled as usual. The watchdog
+            of :class:`engine.Live` has one more.
+        nice: -20 to -1, a greater share of the processor in place of SCHED_FIFO; None takes SCHED_FIFO.
+        cores: that the threads run on; () leaves them those of the process.
+        lock_memory: whether the pages that the process has used are kept in memory.
+
+    Raises:
+        OptionError: a number is out of its range, or this machine has no such core.
+    """
+
+    priority: int = 10
+    nice: int | None = None
+    cores: tuple[int, ...] = ()
+    lock_memory: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.priority <= 98:
+            raise OptionError(f"priority: expected 1 to 98, got {self.priority}")
+        if self.nice is not None and not -20 <= self.nice <= -1:
+            raise OptionError(f"nice: expected -20 to -1, got {self.nice}")
+        last = (os.cpu_count() or 1) - 1
+        if any(not 0 <= core <= last for core in self.cores):
+            raise OptionError(f"cores: expected numbers from 0 to {last}, got {_listed(self.cores)}")
+
+
+def set_realtime(realtime: Realtime | None = None) -> None:
+    """Schedule the calling thread in real time, and lock the memory of its process.
+
+    The kernel takes the processor from threads of SCHED_FIFO that compute without a pause, by default for 50 ms of
+    each second (``kernel.sched_rt_runtime_us``): leave a tenth of the time.
+
+    Args:
+        realtime: settings; None is the defaults.
+
+    Raises:
+        OptionError: this system is not Linux.
+        BackendError: the system does not permit it; the message says which right is missing.
+    """
+    realtime = realtime or Realtime()
+    _check_system()
+    if realtime.cores:
+        _pin(realtime.cores)
+    if realtime.nice is None:
+        _use_fifo(realtime.priority)
+    else:
+        _use_nice(realtime.nice)
+    if realtime.lock_memory:
+        _check_lockable()
+        _lock_memory()
+
+
+def check_realtime(realtime: Realtime | None) -> None:
+    """Refuse what is not permitted before anything depends on it: tried in a thread that ends at once.
+
+    Raises:
+        OptionError, BackendError: as of :func:`set_realtime`.
+    """
+    if realtime is None:
+        return
+    refused: list[OptionError | BackendError] = []
+
+    def attempt() -> None:
+        try:
+            set_realtime(replace(realtime, lock_memory=False))
+            if realtime.lock_memory:
+                _check_lockable()
+        except (OptionError, BackendError) as error:
+            refused.append(error)
+
+    thread = threading.Thread(target=attempt, name="scenematch-realtime")
+    thread.start()
+    thread.join()
+    if refused:
+        raise refused[0]
+
+
+def start_thread(
+    target: Callable[[], None], name: str, realtime: Realtime | None, *, above: int = 0
+) -> threading.Thread:
+    """Start a daemon thread, in real time where that is wanted.
+
+    Args:
+        target: what it runs.
+        name: of the thread.
+        realtime: how it is scheduled; None is as usual. What is no longer permitted is logged.
+        above: added to the priority.
+    """
+
+    def run() -> None:
+        if realtime is not None:
+            try:
+                set_realtime(realtime)
+                if realtime.nice is None and above:
+                    _use_fifo(realtime.priority + above)
+            except BackendError:
+                _log.exception("%s is scheduled as usual", name)
+        target()
+
+    thread = threading.Thread(target=run, name=name, daemon=True)
+    thread.start()
+    return thread
+
+
+class LoadWatch:
+    """Says once that a thread computes so much of the time that the kernel's limit is near.
+
+    Args:
+        realtime: of the thread; None and a nice value know no limit.
+    """
+
+    def __init__(self, realtime: Realtime | None) -> None:
+        self._watches = realtime is not None and realtime.nice is None and limited_share() < 1.0
+        self._begin_s: float | None = None
+        self._busy_s = 0.0
+
+    def add(self, begin_s: float, end_s: float) -> None:
+        """Note that the thread was busy, from and until a time in seconds."""
+        if not self._watches:
+            return
+        if self._begin_s is None:
+            self._begin_s = begin_s
+        self._busy_s += end_s - begin_s
+        over_s = end_s - self._begin_s
+        if over_s < _LOAD_OVER_S:
+            return
+        if self._busy_s > _MAX_LOAD * over_s:
+            self._watches = False
+            _log.warning(
+                "real time: frames are matched for %.0f %% of the time; the kernel stops real-time threads that "
+                "run for more than %.0f %% (kernel.sched_rt_runtime_us): take fewer frames",
+                100.0 * self._busy_s / over_s,
+                100.0 * limited_share(),
+            )
+        self._begin_s, self._busy_s = None, 0.0
+
+
+def limited_share() -> float:
+    """The share of the time that the kernel gives real-time threads at most; 1 where it does not limit them."""
+    try:
+        runtime, period = (int((_KERNEL / f"sched_rt_{name}_us").read_text()) for name in ("runtime", "period"))
+    except (OSError, ValueError):
+        return 1.0
+    return 1.0 if runtime < 0 else runtime / period
+
+
+# ------------------------------------------------------------------------------------------------- system calls
+
+
+def _check_system() -> None:
+    if sys.platform != "linux":
+        raise OptionError(f"realtime: expected Linux, got {sys.platform}")
+
+
+def _pin(cores: tuple[int, ...]) -> None:
+    try:
+        os.sched_setaffinity(0, cores)
+    except OSError as error:
+        raise BackendError(f"cores: {_listed(cores)} cannot be had: {error.strerror}") from None
+    if (had := os.sched_getaffinity(0)) != set(cores):
+        raise BackendError(f"cores: expected {_listed(cores)}, got {_listed(tuple(sorted(had)))} only")
+
+
+def _use_fifo(priority: int) -> None:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except PermissionError:
+        where = ""
+        if os.geteuid() == 0:  # a kernel with RT_GROUP_SCHED
+            where = "; root may where the control group has real time (cpu.rt_runtime_us)"
+        raise BackendError(f"realtime: SCHED_FIFO is not permitted; it needs {_FIFO_CURE}{where}") from None
+
+
+def _use_nice(nice: int) -> None:
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, nice)  # on Linux of the calling thread
+    except PermissionError:
+        raise BackendError(f"realtime: a nice value of {nice} is not permitted; it needs {_NICE_CURE}") from None
+
+
+def _check_lockable() -> None:
+    import resource  # which other systems lack
+
+    # With a limit the lock might succeed now, and memory run out in flight.
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit != resource.RLIM_INFINITY and not _has_capability(_CAP_IPC_LOCK):
+        allowed = f"{limit >> 10} KiB may be"
+        raise BackendError(f"realtime: memory cannot be locked, {allowed}; it needs {_MEMORY_CURE}")
+
+
+def _lock_memory() -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MLOCK_CURRENT | _MLOCK_FUTURE | _MLOCK_ON_FAULT) != 0:
+        cause = os.strerror(ctypes.get_errno())
+        raise BackendError(f"realtime: memory cannot be locked ({cause}); it needs {_MEMORY_CURE}")
+
+
+def _has_capability(number: int) -> bool:
+    status = Path("/proc/thread-self/status").read_text()
+    effective = next(line.split()[1] for line in status.splitlines() if line.startswith("CapEff:"))
+    return bool(int(effective, 16) >> number & 1)
+
+
+def _listed(cores: tuple[int, ...]) -> str:
+    return ",".join(map(str, cores))
