@@ -273,7 +273,8 @@ class Fix:
         covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
         attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
             only the heading is measured; roll and pitch are the frame's, or 0.
-        score: NCC in [-1, 1], or of matched points the share of inliers.
+        score: NCC in [-1, 1]: of the peak, or of picture and map at a refined pose; the share of inliers of
+            matched points.
         method: "ncc", "sift" or "learned".
         window: the crop of the map that was searched.
         timings: milliseconds per stage.

@@ -67,7 +67,7 @@ def test_a_frame_with_its_true_heading_lies_on_the_map(make, polar, frame, metho
 def test_the_planes_heading_in_its_place_is_off(make, polar, frame):
     """What the above would be without: the test can fail."""
     told = replace(frame, heading_deg=PLANE_DEG)
-    assert make("ncc").locate(told, polar.prior(NADIR)).score < 0.9
+    assert make("ncc", profile="paper").locate(told, polar.prior(NADIR)).score < 0.9
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])

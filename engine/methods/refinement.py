@@ -222,7 +222,7 @@ class Refinement:
             fix.method,
             query.site.pixel_from_enu(center_m[:2]),
             covariance_m2,
-            score=fix.score,
+            score=fit.correlation,
             window=fix.window,
             east_north_m=center_m[:2],
             up_m=float(center_m[2]),

@@ -81,12 +81,13 @@ class Scheduler:
         """Time one stage; stages of one name add up.
 
         Raises:
-            OutOfTime: the deadline has passed before it; or it would pass within it, and there is a fix.
+            OutOfTime: it is part of a step, and the deadline has passed before it; or it would pass within it, and
+                there is a fix.
         """
         start_ms = self.deadline.elapsed_ms
         step, work = self._step or ("", 0.0)
         stage = f"{step}: {name}"
-        if not self.deadline.met:
+        if self._step is not None and not self.deadline.met:
             raise OutOfTime
         # Whether the first stage of a step can be afforded was asked when the step began.
         if self._has_fix and self._is_under_way and not self.can_afford(stage, work):
