@@ -184,29 +184,41 @@ def ncc_covariance_m2(
     attitude, height = pose.grid_attitude, pose.height_agl_m
     if attitude is None or height is None:
         raise OptionError("pose: expected a height and a heading for a fix by correlation")
-    values = np.array([height, attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg])
+    values = (height, attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
     height_sigma = errors.height_sigma_m(height)
-    sigmas = np.array([height_sigma, *errors.tilts_deg(pose), errors.heading_deg])
-    aims = _aim_m(camera, np.concatenate([values + np.diag(sigmas), values - np.diag(sigmas)]))
-    spread = (aims[:4] - aims[4:]).T / 2.0  # each column is already scaled by its sigma
+    sigmas = (height_sigma, *errors.tilts_deg(pose), errors.heading_deg)
+    spread = np.empty((2, 4))  # each column is already scaled by its sigma
+    axis = camera.mount[:, 2].tolist()
+    for column, sigma in enumerate(sigmas):
+        more, less = list(values), list(values)
+        more[column] += sigma
+        less[column] -= sigma
+        (east, north), (other_east, other_north) = _aim_m(axis, *more), _aim_m(axis, *less)
+        spread[:, column] = 0.5 * (east - other_east), 0.5 * (north - other_north)
     horizontal = spread @ spread.T + transport_covariance(enu_jacobian, peak_px2) + errors.map_m**2 * np.eye(2)
     covariance = np.diag([0.0, 0.0, height_sigma**2])
     covariance[:2, :2] = horizontal
     return covariance
 
 
-def _aim_m(camera: Camera, values: Array) -> Array:
-    """Where the optical axis meets the ground, (N, 2) metres east and north of the nadir.
+def _aim_m(
+    axis: list[float], height_m: float, roll_deg: float, pitch_deg: float, heading_deg: float
+) -> tuple[float, float]:
+    """Where the optical axis meets the ground, in metres east and north of the nadir.
 
     Args:
-        camera: its mount gives the direction of the optical axis.
-        values: (N, 4) height in metres; roll, pitch and heading in degrees.
+        axis: forward, right and down in the body.
+        height_m: above the ground.
+        roll_deg: of the body.
+        pitch_deg: likewise.
+        heading_deg: likewise.
     """
-    forward, right, down = camera.mount[:, 2]
-    sr, sp, sh = np.sin(np.radians(values[:, 1:])).T
-    cr, cp, ch = np.cos(np.radians(values[:, 1:])).T
+    forward, right, down = axis
+    roll, pitch, heading = math.radians(roll_deg), math.radians(pitch_deg), math.radians(heading_deg)
+    sr, sp, sh = math.sin(roll), math.sin(pitch), math.sin(heading)
+    cr, cp, ch = math.cos(roll), math.cos(pitch), math.cos(heading)
     ahead = cp * forward + sp * (sr * right + cr * down)  # along the heading, see engine.geo.enu_from_body
     aside = cr * right - sr * down
     below = -sp * forward + cp * (sr * right + cr * down)
-    reach = values[:, 0] / np.maximum(below, 1e-3)
-    return np.stack([(sh * ahead + ch * aside) * reach, (ch * ahead - sh * aside) * reach], axis=1)
+    reach_m = height_m / max(below, 1e-3)
+    return (sh * ahead + ch * aside) * reach_m, (ch * ahead - sh * aside) * reach_m
