@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, NccOptions, SceneMatcher, Window
-from engine.methods.options import NccOptions
 from tests.support.ground import Ground
 
 HEIGHT_M = 80.0
