@@ -85,18 +85,17 @@ class SceneMatcher:
         a map that comes from a file are kept for the next start. The frames that are matched are the map's own.
         """
         self._method.prepare()
-        for rounds in (
-            1,
-            self._method.warmup_rounds,
-        ):  # what compiles and plans in the first is no cost of a flight's
+        # What compiles and plans in the first pass is no cost of a flight's.
+        for rounds in (1, self._method.warmup_rounds):
             self._costs = Costs()
             for share in _WARMUP_SHARES:
                 frame, prior = self._synthetic_frame(share)
                 for _ in range(rounds):
                     self.locate(frame, prior)
                     self._method.warmup(self._query(frame, prior, Deadline(Budget())))
+                self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
             if self.site.is_searchable:
-                self._method.warmup(self._query(frame, None, Deadline(Budget())))
+                self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
 
     def _synthetic_frame(self, share: float) -> tuple[Frame, Prior]:
         """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""

@@ -158,10 +158,40 @@ def _biweight(differences, weights):
             if index % _MEDIAN_STEP == 0:
                 sizes[index // _MEDIAN_STEP] = abs(differences[n])
             index += 1
-    typical = np.median(sizes[: (index + _MEDIAN_STEP - 1) // _MEDIAN_STEP])
+    typical = median(sizes[: (index + _MEDIAN_STEP - 1) // _MEDIAN_STEP])
     far = _BIWEIGHT * _MAD * max(typical, 1e-6)
     out = np.empty(weights.size)
     for n in range(weights.size):
         agreement = max(1.0 - (differences[n] / far) ** 2, 0.0)
         out[n] = weights[n] * agreement * agreement
     return out
+
+
+@compiled
+def median(values):
+    """The median of values (N,), NaN of none, by Hoare's selection, which reorders them.
+
+    NumPy's takes seconds to compile.
+    """
+    middle, low, high = values.size // 2, 0, values.size - 1
+    if values.size == 0:
+        return np.nan
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if middle > j and middle < i:
+            break
+        low, high = (low, j) if middle <= j else (i, high)
+    if values.size % 2 == 1:
+        return values[middle]
+    below = values[0]
+    for n in range(1, middle):
+        below = max(below, values[n])
+    return 0.5 * (below + values[middle])

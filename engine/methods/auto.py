@@ -52,12 +52,16 @@ class Auto(Method):
             part.prepare()
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step of both methods; without a prior, the search of the map."""
-        if query.prior is None:
-            self.locate(query)
-            return
+        """Run every variant of every step of both methods."""
         self.ncc.warmup(query)
         self.sift.warmup(query)
+
+    def warmup_search(self, query: Query) -> None:
+        """Search the whole map by both, or headings and heights about the prior by NCC."""
+        if query.prior is None:
+            self.locate(query)
+        else:
+            self.ncc.warmup_search(query)
 
     def locate(self, query: Query) -> Result:
         """The more accurate of two fixes that agree, or the only one.

@@ -44,9 +44,13 @@ class Method(ABC):
         """Prepare what is looked up of the map, before take-off."""
 
     def warmup(self, query: Query) -> None:  # noqa: B027
-        """Run every variant of every step, so that it is compiled and its cost known; not called in flight.
+        """Run every variant of every step of a frame with a prior, so that it is compiled and its cost known."""
 
-        A query without a prior runs the search of the whole map.
+    def warmup_search(self, query: Query) -> None:  # noqa: B027
+        """Run a search once; it takes long, and few frames need one.
+
+        Args:
+            query: without a prior, of the whole map; with one, of headings and heights where the method has that.
         """
 
     @abstractmethod

@@ -58,19 +58,20 @@ class Ncc(Method):
         return {"map regions": self.prepared.created, "sampled cells": self.samples.created}
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step, so that it is compiled and its cost known.
-
-        A query without a prior runs the search of the whole map.
-        """
-        if query.prior is None or not self._trusts(query):
+        """Run every variant of every step, so that it is compiled and its cost known."""
+        if not self._trusts(query):
             self.locate(query)  # a search has one variant
             return
         for coarser in expected_window_px(query, self.options):
             self.refine(query, self.correlate(query, coarser))
-        self.correlate(replace(query, frame=replace(query.frame, is_doubted=True)))
         found = self.find(query)
         if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
             self._costed_second_look(query, found, found.fix.window)
+
+    def warmup_search(self, query: Query) -> None:
+        """Search the whole map, or headings and heights about the prior."""
+        doubted = replace(query, frame=replace(query.frame, is_doubted=True))
+        self.locate(query if query.prior is None else doubted)
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""

@@ -45,19 +45,18 @@ class Sift(Method):
             self.landmarks.prepare()
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step, so that it is compiled and its cost known.
-
-        A query without a prior runs the search of the whole map.
-        """
-        if query.prior is None:
-            self.locate(query)
-            return
+        """Run every variant of every step, so that it is compiled and its cost known."""
         # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
         longest_px = min(3 * max(query.gray.shape), math.isqrt(MAX_PICTURE_PX))
         prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), query.device)
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed("sift", work_px):
                 self._at_scale(query, share)
+
+    def warmup_search(self, query: Query) -> None:
+        """Search the whole map."""
+        if query.prior is None:
+            self.locate(query)
 
     def locate(self, query: Query) -> Result:
         """A fix at the highest resolution of the frame that there is time for."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from engine.kernels import dense_loops
+from engine.kernels.dense_loops import median
 from engine.kernels.gauss_newton import by_parameters
 from engine.kernels.lower_plane import lower_plane
 
@@ -138,3 +141,13 @@ def test_heights_of_a_plane_have_that_plane():
     plane, known = lower_plane(offsets, heights_m, 0.2, 0.3, 8)
     np.testing.assert_allclose(plane, [5, 1, 2], atol=1e-9)
     assert known == np.isfinite(heights_m).sum()
+
+
+@given(values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60))
+def test_the_median_is_numpys(values):
+    assert median(np.array(values)) == pytest.approx(np.median(values), abs=1e-9)
+
+
+def test_the_median_of_equal_values_and_of_none():
+    assert median(np.full(1000, 3.0)) == 3.0
+    assert np.isnan(median(np.zeros(0)))
