@@ -19,9 +19,10 @@ from matplotlib.figure import Figure
 from bench import DOCS
 from bench.pages import sift
 from bench.pages.text import machine, table
-from bench.speed import growth, whole_map
+from bench.speed import growth, stages, whole_map
 from engine import device
 
+STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
 INTRO = (
     "Made by `make bench`; every figure below comes from one run of it, on {machine}. A time is the median of the "
@@ -46,17 +47,20 @@ def main() -> None:
     rows = [_row(entry) for entry in run["benchmarks"]]
     curves = [] if options.quick else growth.curves()
     big = [] if options.quick else whole_map.run()
+    flown = [] if options.quick else stages.run()
     charts = sift.charts(rows)
     if any(row["task"] == "peak" for row in rows):
         charts["ncc-ratio.png"] = _ratio_chart(rows)
+    if flown:
+        charts["frame-stages.png"] = _stages_chart(_before(), flown)
     if curves:
         charts["ncc-growth.png"] = _growth_chart(curves)
     (options.docs / "img").mkdir(parents=True, exist_ok=True)
     for name, figure in charts.items():
         figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
     page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=machine()), 115), ""]
-    page += _peak_section(rows) + _step_section(rows) + _hypotheses_section(rows)
-    page += _map_section(big) + _growth_section(curves) + sift.sections(rows)
+    page += _stages_section(_before(), flown) + _peak_section(rows) + _step_section(rows)
+    page += _hypotheses_section(rows) + _map_section(big) + _growth_section(curves) + sift.sections(rows)
     (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
 
 
@@ -72,6 +76,66 @@ def _row(entry: dict[str, Any]) -> dict[str, Any]:
 def _baseline(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
     peer = BASELINE[row["task"]]
     return next(r["median_ms"] for r in rows if r["group"] == row["group"] and r["peer"] == peer)
+
+
+def _before() -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(STAGES_BEFORE.read_text(encoding="utf-8"))
+    return found
+
+
+def _stages_section(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
+    """A tracked flight by the engine, before and now, each in turns with OpenCV's step."""
+    cells = [
+        [
+            f"{row['flight']}, {row['method']}{when}",
+            f"{row['p50_ms']:.2f}",
+            f"{row['p99_ms']:.2f}",
+            f"{row['opencv_p50_ms']:.2f}",
+            f"{row['opencv_p50_ms'] / row['p50_ms']:.2f}",
+            f"{row['fixed']} of {row['frames']}",
+            f"{row['rms_m']:.3f}",
+            f"{row['nees']:.2f}",
+        ]
+        for index, row in enumerate(now)
+        for row, when in ((before[index], ", before"), (row, ""))
+    ]
+    if not now:
+        return []
+    columns = ["flight, method", "p50 ms", "p99 ms", "OpenCV's step ms", "ratio to it", "fixed", "RMS m", "NEES"]
+    text = (
+        "`SceneMatcher.locate` of a tracked flight, one thread: a refined and verified pose with its covariance. "
+        "OpenCV's step (grey, enhance, warp, match; no check and no refinement, 1.1 to 1.3 m off) has the same "
+        "frames in turns of twenty. *Before* is the engine before poses were refined from the coarsest level, measured "
+        "likewise."
+    )
+    return [
+        "## A frame of a tracked flight",
+        "",
+        *textwrap.wrap(text, 115),
+        "",
+        "![stages of a frame, before and now](img/frame-stages.png)",
+        "",
+        *table(columns, cells),
+    ]
+
+
+def _stages_chart(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> Figure:
+    """Stacked bars of the stages' medians, over the time of OpenCV's step in the same run."""
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    axes = figure.subplots()
+    bars = [pair for pairs in zip(before, now, strict=True) for pair in zip(pairs, (" before", ""), strict=True)]
+    labels = [f"{row['flight']}, {row['method']}{when}" for row, when in bars]
+    names = list(dict.fromkeys(name for row, _ in bars for name in row["stages_ms"] if name != "rest"))
+    left = np.zeros(len(bars))
+    for index, name in enumerate([*names, "rest"]):
+        share = np.array([row["stages_ms"].get(name, 0.0) / row["opencv_p50_ms"] for row, _ in bars])
+        axes.barh(labels, share, left=left, label=name, color=f"C{index % 10}", alpha=1.0 if index < 10 else 0.5)
+        left += share
+    axes.axvline(1.0, color="black", linewidth=1.0)
+    axes.set_xlabel("median time of a frame over that of OpenCV's plain step (line)")
+    axes.invert_yaxis()
+    figure.legend(loc="outside upper left", ncols=7, frameon=False, fontsize=8)
+    return figure
 
 
 def _memory(row: dict[str, Any]) -> str:
