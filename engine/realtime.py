@@ -129,7 +129,7 @@ def start_thread(
                 set_realtime(realtime)
                 if realtime.nice is None and above:
                     _use_fifo(realtime.priority + above)
-            except BackendError:
+            except (OptionError, BackendError):
                 _log.exception("%s is scheduled as usual", name)
         target()
 
@@ -200,7 +200,9 @@ def _pin(cores: tuple[int, ...]) -> None:
 def _use_fifo(priority: int) -> None:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
-    except PermissionError:
+    except OSError as error:
+        if not isinstance(error, PermissionError):
+            raise BackendError(f"realtime: this system has no SCHED_FIFO: {error.strerror}") from None
         where = ""
         if os.geteuid() == 0:  # a kernel with RT_GROUP_SCHED
             where = "; root may where the control group has real time (cpu.rt_runtime_us)"
@@ -209,8 +211,12 @@ def _use_fifo(priority: int) -> None:
 
 def _use_nice(nice: int) -> None:
     try:
+        # What the thread starts has a nice value of 0 again.
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
         os.setpriority(os.PRIO_PROCESS, 0, nice)  # on Linux of the calling thread
-    except PermissionError:
+    except OSError as error:
+        if not isinstance(error, PermissionError):
+            raise BackendError(f"realtime: a nice value of {nice} cannot be had: {error.strerror}") from None
         raise BackendError(f"realtime: a nice value of {nice} is not permitted; it needs {_NICE_CURE}") from None
 
 

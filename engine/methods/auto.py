@@ -99,9 +99,9 @@ class Auto(Method):
         return replace(best, stage="verified", confidence=max(stated, default=None))
 
     def _second(self, query: Query, first: Result) -> Result:
-        if not isinstance(first, Fix):
-            return self.sift.locate(query)
         try:
+            if not isinstance(first, Fix):
+                return self.sift.locate(query)
             with query.scheduler.with_fix():
                 return self.sift.locate(query)
         except OutOfTime:

@@ -75,17 +75,20 @@ class Costs:
             expected_ms = known.expected_ms(work) if known.weight > 0.0 else 0.0
             known.learn(work, max(_ABANDONED * ms, expected_ms))
 
-    def note_refusal(self, step: str) -> None:
+    def note_refusal(self, step: str, *, keeps_cost: bool = False) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
 
-        Its deviation decays, and so does its cost until it is tried once; if it was not cheaper, that is undone.
+        Args:
+            step: its name.
+            keeps_cost: only the deviation of its cost decays, since to try it may lose a fix that is there. Else
+                the cost decays as well until it is tried once; if it was not cheaper, that is undone.
         """
         with self._lock:
             known = self._models.get(step)
             if known is None:
                 return
             known.square *= _DEVIATION_DECAY**2
-            known.trust *= _COST_DECAY
+            known.trust *= 1.0 if keeps_cost else _COST_DECAY
 
     def upper_bound_ms(self, step: str, work: float) -> float:
         """The step's expected time and three deviations; 0 where it never ran."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +31,7 @@ from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Win
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _MAX_CANDIDATES = 4  # of a refused frame
-_SECOND_LOOK = "ncc second look"
+_SECOND_LOOK, _AT_ONCE = "ncc second look", "refinement at once"  # steps
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
 _TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
 _TURNED_SIGMA_DEG = 2.0  # of the heading then
@@ -81,26 +82,30 @@ class Ncc(Method):
         """A refined fix that begins at the peak of the coarsest level, where that is beyond doubt.
 
         It costs a fraction of a fine one, and what is refined from it is the same pose. Where roll and pitch, or
-        the slope of the ground, are unknown, the pose rests on the peak as well, which then must be fine.
+        the slope of the ground, are unknown, the pose rests on the peak as well, which then must be fine. An
+        accepted peak that is not refined is the fix where there is no time for another one.
         """
         if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
             return None
-        if not (query.telemetry.has_tilt and query.site.has_surface):
-            return None
         step, works = self._step(query)
-        coarser = max(works)
-        if not coarser or not query.scheduler.can_afford(step, works[coarser]):
+        coarser, work_px = max(works), float(query.gray.size)
+        is_wide = query.site.is_large and works[coarser] > MAX_WINDOW_PX
+        if not (coarser and query.telemetry.has_tilt and query.site.has_surface) or is_wide:
+            return None
+        if not query.scheduler.can_afford_all({step: works[coarser], _AT_ONCE: work_px}):
             return None
         with query.scheduler.costed(step, works[coarser]):
             found = self.find(query, coarser=coarser)
             result = found if isinstance(found, NoFix) else self.judge(query, found)
-        if isinstance(result, NoFix) or (result.confidence or 0.0) < _MIN_CONFIDENCE_COARSE:
+        if isinstance(result, NoFix):
             return None
-        work_px = float(query.gray.size)
-        if not query.scheduler.can_afford("refinement", work_px):
-            return None
-        with query.scheduler.costed("refinement", work_px):
-            return Refinement(query, self.samples, self.options).refine_at_once(result)
+        refined = None
+        if (result.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE:
+            with query.scheduler.costed(_AT_ONCE, work_px):
+                refined = Refinement(query, self.samples, self.options).refine_at_once(result)
+        if refined is None and query.scheduler.first_affordable(step, works) is None:
+            return replace(result, stage="coarse")
+        return refined
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
@@ -125,9 +130,10 @@ class Ncc(Method):
             found = self.find(query, coarser=coarser)
             result = found if isinstance(found, NoFix) else self.judge(query, found)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
-            result = self._look_again(query, found, result)
-            if isinstance(result, NoFix) and try_turns and found.features is not None:
-                result = self._look_turned(query, coarser, works[coarser], result)
+            with suppress(OutOfTime):  # the refusal that there is stands
+                result = self._look_again(query, found, result)
+                if isinstance(result, NoFix) and try_turns and found.features is not None:
+                    result = self._look_turned(query, coarser, works[coarser], result)
             if isinstance(result, NoFix):
                 result = replace(result, candidates=self._candidates(query, found))
         if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
@@ -154,7 +160,7 @@ class Ncc(Method):
             query = replace(query, frame=frame)
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
-            query.scheduler.note_refusal("refinement")
+            query.scheduler.note_refusal("refinement", has_fix=True)
             return result
         try:
             with query.scheduler.with_fix(), query.scheduler.costed("refinement", work_px):

@@ -70,10 +70,9 @@ class Refinement:
         that is not confirmed stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
-        with query.scheduler.stage("dense"):
-            refined = self._through_all(fix)
-            if refined is None and has_tilt and query.site.has_surface:
-                refined = self._doubting()._through_all(fix)
+        refined = self._through_all(fix)
+        if refined is None and has_tilt and query.site.has_surface:
+            refined = self._doubting()._through_all(fix)
         if refined is not None:
             return refined
         if not query.site.has_surface:
@@ -87,9 +86,8 @@ class Refinement:
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
         """The fix of a known tilt refined on the frame's own level, None where that is not beyond doubt."""
-        with self.query.scheduler.stage("dense"):
-            prior = self._prior(fix)
-            return self._refined(fix, prior, self._at_once(prior))
+        prior = self._prior(fix)
+        return self._refined(fix, prior, self._at_once(prior))
 
     def _doubting(self) -> Refinement:
         """The same, of a frame whose attitude is hardly known."""
@@ -148,6 +146,12 @@ class Refinement:
 
     def _through_levels(
         self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None
+    ) -> DenseFit | None:
+        with self.query.scheduler.stage("dense"):  # one a pass, before each of which it may be abandoned
+            return self._timed_through_levels(prior, coarser, min_correlation)
+
+    def _timed_through_levels(
+        self, prior: GaussianPrior, coarser: int, min_correlation: float | None
     ) -> DenseFit | None:
         """Refine on levels coarser than the frame's, where a few pixels reach farther; then on its own.
 

@@ -43,15 +43,20 @@ class Scheduler:
 
     def can_afford(self, step: str, work: float) -> bool:
         """Whether the time that is left suffices for a step of this much work; True for one that never ran."""
-        return self._costs.upper_bound_ms(step, work) <= self.deadline.remaining_ms
+        return self.can_afford_all({step: work})
+
+    def can_afford_all(self, works: Mapping[str, float]) -> bool:
+        """Whether the time that is left suffices for several steps, by their work, one after the other."""
+        needed_ms = sum(self._costs.upper_bound_ms(step, work) for step, work in works.items())
+        return needed_ms <= self.deadline.remaining_ms
 
     def first_affordable(self, step: str, works: Mapping[_T, float]) -> _T | None:
         """The first variant of a step, by its work, that there is time for; None where there is none."""
         return next((variant for variant, work in works.items() if self.can_afford(step, work)), None)
 
-    def note_refusal(self, step: str) -> None:
+    def note_refusal(self, step: str, *, has_fix: bool = False) -> None:
         """Note that a step could not be afforded, see :meth:`engine.methods.costs.Costs.note_refusal`."""
-        self._costs.note_refusal(step)
+        self._costs.note_refusal(step, keeps_cost=has_fix)
 
     @contextmanager
     def costed(self, step: str, work: float) -> Iterator[None]:
@@ -87,13 +92,14 @@ class Scheduler:
         start_ms = self.deadline.elapsed_ms
         step, work = self._step or ("", 0.0)
         stage = f"{step}: {name}"
-        if self._step is not None and not self.deadline.met:
-            raise OutOfTime
-        # Whether the first stage of a step can be afforded was asked when the step began.
-        if self._has_fix and self._is_under_way and not self.can_afford(stage, work):
-            self.note_refusal(stage)
-            raise OutOfTime
-        self._is_under_way = True
+        if self._step is not None:
+            if not self.deadline.met:
+                raise OutOfTime
+            # Whether the first stage of a step can be afforded was asked when the step began.
+            if self._has_fix and self._is_under_way and not self.can_afford(stage, work):
+                self.note_refusal(stage)
+                raise OutOfTime
+            self._is_under_way = True
         try:
             yield
         finally:

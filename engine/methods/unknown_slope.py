@@ -28,6 +28,7 @@ _WIDTHS = (0.175, 0.35, 0.7, 1.4)
 # The refinement without its prior of the slope and the peak rest on the same attitude: over level simulated towns
 # 98 % of poses agreed to this share of the height (the peak is as inexact), over hills of 8 to 30 m 19 to 33 %.
 _MAX_APART_SHARE = 0.0067
+_MAX_DEG = 20.0  # of the assumed slope: twice as much is a wall
 _REACH_SHARE = 1.0  # of the height: ground that slopes by so much rises or falls by that times its slope beside it
 
 
@@ -46,7 +47,7 @@ class SlopeFit:
 
 def wide_slope_deg(unknown_slope_deg: float) -> float:
     """Standard deviation of the slope with which a pose is to be refined first, in degrees."""
-    return _WIDE * unknown_slope_deg
+    return _WIDE * min(unknown_slope_deg, _MAX_DEG)
 
 
 def over_unknown_slope(
@@ -73,7 +74,7 @@ def over_unknown_slope(
         return None
     steps, covariances, log_weights = [], [], []
     for width in _WIDTHS:
-        sigma = math.tan(math.radians(width * unknown_slope_deg))
+        sigma = math.tan(math.radians(width * min(unknown_slope_deg, _MAX_DEG)))
         variance = 1.0 / (sigma**-2 - wide**-2)  # of the measurement that makes the wide prior this one
         total = covariance[6:, 6:] + variance * np.eye(2)
         gain = np.linalg.solve(total, covariance[6:]).T

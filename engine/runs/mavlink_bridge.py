@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -294,7 +294,7 @@ def run_mavlink_bridge(
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
-                set_realtime(settings.realtime)
+                set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
             pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
             with (
                 closing(pictures),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from engine.adapters.ros import RosBridge, RosNode, RosStatus, RosTopics
@@ -132,7 +132,7 @@ def run_ros_bridge(
         progress.message(f"listening to {ros.topics.image}")
         try:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
-                set_realtime(settings.realtime)
+                set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
             node.spin(bridge.handlers(ros.topics), bridge.check_input, settings.seconds)
         finally:
             bridge.close()

@@ -23,12 +23,12 @@ class FixedCosts:
         self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
 
     def upper_bound_ms(self, step, work):
-        return self.per_unit.get(step, 0.0) * work
+        return self.per_unit.get(step.removesuffix(" at once"), 0.0) * work  # refinement, in both of its ways
 
     def learn(self, step, work, ms):
         pass
 
-    def note_refusal(self, step):
+    def note_refusal(self, step, *, keeps_cost=False):
         pass
 
     def note_abandoned(self, step, work, ms):
