@@ -62,7 +62,8 @@ def export_track(
 def _poses(folder: Path, track: list[TrackRow]) -> list[PoseRow]:
     """The track with what the run noted of the rest of each pose."""
     notes = read_notes(folder / NOTES) if (folder / NOTES).is_file() else None
-    return pose_rows(track, notes)
+    is_amsl = (folder / SUMMARY).is_file() and read_record(folder / SUMMARY).surface_datum is not None
+    return pose_rows(track, notes, is_amsl=is_amsl)
 
 
 def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:

@@ -1,6 +1,8 @@
 """A tracked flight and its truth as TUM, read back: the same errors as the summary's, in position and attitude."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,3 +91,15 @@ def test_a_run_of_before_is_exported_without_what_it_did_not_note(finished, tmp_
     assert "quaternion is unity" in text.splitlines()[0]
     measured = [row.up_m for row in read_track(tmp_path / "track.csv") if row.fixed]
     assert tum(tmp_path / "track.tum")[1][:, 2] == pytest.approx(measured, abs=1e-3)
+
+
+def test_heights_are_above_the_sea_where_the_surface_says_so(finished, tmp_path):
+    assert "<ele>" not in Path(export_track(finished, "gpx")["file"]).read_text()
+    for name in ("track.csv", "summary.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary["settings"]["surface_datum"] = "EGM96 height"
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    text = Path(export_track(tmp_path, "gpx")["file"]).read_text()
+    measured = [row.up_m for row in read_track(tmp_path / "track.csv") if row.up_m is not None]
+    assert [float(each) for each in re.findall("<ele>(.+)</ele>", text)] == pytest.approx(measured, abs=1e-3)
