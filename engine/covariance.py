@@ -60,6 +60,17 @@ class AssumedErrors:
         return (unknown if pose.roll_deg is None else known, unknown if pose.pitch_deg is None else known)
 
 
+def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
+    """(3, 3) covariance in rad^2, about the camera's axes, of a tilt by a standard deviation per horizontal axis.
+
+    Args:
+        cam_from_map: (3, 3) rotation of the camera.
+        sigma_rad: of the tilt about east and about north.
+    """
+    horizontal = cam_from_map[:, :2]
+    return np.asarray(sigma_rad**2 * horizontal @ horizontal.T)
+
+
 def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
     """The errors with the accuracy that the map states in place of the one assumed of any map."""
     return replace(

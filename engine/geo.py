@@ -193,6 +193,25 @@ def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
     return roll, pitch, heading
 
 
+def angle_covariance_deg2(turn_covariance_rad2: Array, roll_deg: float, pitch_deg: float) -> Array:
+    """Covariance of roll, pitch and heading from that of a small turn about the body's axes.
+
+    Args:
+        turn_covariance_rad2: (3, 3) about forward, right and down.
+        roll_deg: of the body.
+        pitch_deg: of the body; near +-90 degrees roll and heading are not separable, and their variances grow.
+
+    Returns:
+        (3, 3) in square degrees.
+    """
+    sr, cr = math.sin(math.radians(roll_deg)), math.cos(math.radians(roll_deg))
+    sp, cp = math.sin(math.radians(pitch_deg)), max(math.cos(math.radians(pitch_deg)), 1e-6)
+    angles_by_turn = np.array(
+        [[1.0, sr * sp / cp, cr * sp / cp], [0.0, cr, -sr], [0.0, sr / cp, cr / cp]]
+    )  # fmt: skip
+    return transport_covariance(math.degrees(1.0) * angles_by_turn, turn_covariance_rad2)
+
+
 def wrap_heading_deg(heading_deg: float) -> float:
     """Wrap to [0, 360); twice, since the remainder of a tiny negative angle rounds to 360."""
     return heading_deg % 360.0 % 360.0

@@ -35,6 +35,9 @@ class PoseRow(TrackRow):
         roll_deg: positive right side down.
         pitch_deg: positive nose up.
         heading_deg: clockwise from true north.
+        roll_sigma_deg: standard deviation of the roll.
+        pitch_sigma_deg: of the pitch.
+        heading_sigma_deg: of the heading.
     """
 
     alt_amsl_m: float | None = None
@@ -42,6 +45,9 @@ class PoseRow(TrackRow):
     roll_deg: float | None = None
     pitch_deg: float | None = None
     heading_deg: float | None = None
+    roll_sigma_deg: float | None = None
+    pitch_sigma_deg: float | None = None
+    heading_sigma_deg: float | None = None
 
     @property
     def angles_deg(self) -> tuple[float, float, float] | None:
@@ -52,7 +58,8 @@ class PoseRow(TrackRow):
 
 
 Segment = list[PoseRow]
-_NOTED = ("sigma_up_m", "roll_deg", "pitch_deg", "heading_deg")
+_ANGLES = ("roll_deg", "pitch_deg", "heading_deg", "roll_sigma_deg", "pitch_sigma_deg", "heading_sigma_deg")
+_NOTED = ("sigma_up_m", *_ANGLES)
 
 
 def pose_rows(
@@ -139,9 +146,7 @@ def _properties(row: PoseRow) -> dict[str, object]:
         "time": None if time is None else _iso(time),
         "up_m": row.up_m,
         "alt_amsl_m": row.alt_amsl_m,
-        "roll_deg": row.roll_deg,
-        "pitch_deg": row.pitch_deg,
-        "heading_deg": row.heading_deg,
+        **{name: getattr(row, name) for name in _ANGLES},
         "sigma_east_m": row.sigma_east_m,
         "sigma_north_m": row.sigma_north_m,
         "sigma_up_m": row.sigma_up_m,

@@ -27,6 +27,9 @@ class FrameNote:
         sigma_up_m: standard deviation of the height, where it was measured.
         roll_deg: of the whole pose, where that was measured; positive right side down.
         pitch_deg: the same; positive nose up.
+        roll_sigma_deg: standard deviation of the roll, where it is known, as of the next two.
+        pitch_sigma_deg: of the pitch.
+        heading_sigma_deg: of the heading.
     """
 
     frame: str
@@ -40,11 +43,14 @@ class FrameNote:
     sigma_up_m: float | None = None
     roll_deg: float | None = None
     pitch_deg: float | None = None
+    roll_sigma_deg: float | None = None
+    pitch_sigma_deg: float | None = None
+    heading_sigma_deg: float | None = None
 
 
 COLUMNS = tuple(f.name for f in fields(FrameNote))
 """The header of notes.csv."""
-_LATER = ("sigma_up_m", "roll_deg", "pitch_deg")  # columns that older runs lack
+_LATER = COLUMNS[COLUMNS.index("sigma_up_m") :]  # columns that older runs lack
 
 
 def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
@@ -60,6 +66,7 @@ def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
         return FrameNote(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
     # Where no height was measured, roll and pitch are the telemetry's, or none.
     tilt = None if result.up_m is None else result.attitude
+    roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)
     return FrameNote(
         frame=name,
         state=state,
@@ -69,6 +76,9 @@ def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
         sigma_up_m=None if result.up_m is None else math.sqrt(result.covariance_m2[2, 2]),
         roll_deg=None if tilt is None else float(tilt.roll_deg),
         pitch_deg=None if tilt is None else float(tilt.pitch_deg),
+        roll_sigma_deg=roll_sigma_deg,
+        pitch_sigma_deg=pitch_sigma_deg,
+        heading_sigma_deg=heading_sigma_deg,
         stage=result.stage,
         confidence=None if result.confidence is None else float(result.confidence),
     )
