@@ -16,6 +16,7 @@ from engine.geo import (
     chi_square,
     ecef_from_geodetic,
     enu_from_body,
+    enu_turn_covariance_rad2,
     geodetic_from_ecef,
     transport_covariance,
     wrap_heading_deg,
@@ -206,3 +207,6 @@ def test_the_covariance_of_angles_is_that_of_small_turns_about_the_body(angles):
     covariance = angle_covariance_deg2(root @ root.T, *angles[:2])
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), off.T)
     assert np.cov(whitened) == pytest.approx(np.eye(3), abs=0.08)
+    turn = enu_from_body(*angles)
+    about_enu = enu_turn_covariance_rad2(covariance, angles)
+    assert about_enu == pytest.approx(turn @ root @ root.T @ turn.T, rel=1e-9, abs=1e-15)
