@@ -61,11 +61,14 @@ class AssumedErrors:
 
 
 def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
-    """(3, 3) covariance in rad^2, about the camera's axes, of a tilt by a standard deviation per horizontal axis.
+    """Covariance of an unknown tilt.
 
     Args:
         cam_from_map: (3, 3) rotation of the camera.
-        sigma_rad: of the tilt about east and about north.
+        sigma_rad: standard deviation of the tilt about east and about north.
+
+    Returns:
+        (3, 3) in rad^2, of a small turn about the camera's axes.
     """
     horizontal = cam_from_map[:, :2]
     return np.asarray(sigma_rad**2 * horizontal @ horizontal.T)
