@@ -60,6 +60,20 @@ class AssumedErrors:
         return (unknown if pose.roll_deg is None else known, unknown if pose.pitch_deg is None else known)
 
 
+def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
+    """Covariance of an unknown tilt.
+
+    Args:
+        cam_from_map: (3, 3) rotation of the camera.
+        sigma_rad: standard deviation of the tilt about east and about north.
+
+    Returns:
+        (3, 3) in rad^2, of a small turn about the camera's axes.
+    """
+    horizontal = cam_from_map[:, :2]
+    return np.asarray(sigma_rad**2 * horizontal @ horizontal.T)
+
+
 def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
     """The errors with the accuracy that the map states in place of the one assumed of any map."""
     return replace(

@@ -193,6 +193,42 @@ def attitude_from_rotation(enu_from_body_: Array) -> tuple[float, float, float]:
     return roll, pitch, heading
 
 
+def angle_covariance_deg2(turn_covariance_rad2: Array, roll_deg: float, pitch_deg: float) -> Array:
+    """Covariance of roll, pitch and heading from that of a small turn about the body's axes.
+
+    Args:
+        turn_covariance_rad2: (3, 3) about forward, right and down.
+        roll_deg: of the body.
+        pitch_deg: of the body; near +-90 degrees roll and heading are not separable, and their variances grow.
+
+    Returns:
+        (3, 3) in square degrees.
+    """
+    by_turn = np.asarray(np.linalg.inv(_turn_by_angles(roll_deg, pitch_deg)), np.float64)
+    return transport_covariance(math.degrees(1.0) * by_turn, turn_covariance_rad2)
+
+
+def enu_turn_covariance_rad2(angle_covariance: Array, angles_deg: tuple[float, float, float]) -> Array:
+    """Covariance of a small turn about east, north and up from that of roll, pitch and heading.
+
+    Args:
+        angle_covariance: (3, 3) in square degrees.
+        angles_deg: roll, pitch and heading of the body.
+
+    Returns:
+        (3, 3) in rad^2.
+    """
+    turn_by_angles = enu_from_body(*angles_deg) @ _turn_by_angles(*angles_deg[:2])
+    return transport_covariance(math.radians(1.0) * turn_by_angles, angle_covariance)
+
+
+def _turn_by_angles(roll_deg: float, pitch_deg: float) -> Array:
+    """(3, 3) turn about the body's axes by a small change of roll, pitch and heading."""
+    sr, cr = math.sin(math.radians(roll_deg)), math.cos(math.radians(roll_deg))
+    sp, cp = math.sin(math.radians(pitch_deg)), max(math.cos(math.radians(pitch_deg)), 1e-6)
+    return np.array([[1.0, 0.0, -sp], [0.0, cr, sr * cp], [0.0, -sr, cr * cp]])
+
+
 def wrap_heading_deg(heading_deg: float) -> float:
     """Wrap to [0, 360); twice, since the remainder of a tiny negative angle rounds to 360."""
     return heading_deg % 360.0 % 360.0

@@ -30,6 +30,7 @@ from engine.maps.rasters import (
     Source,
     open_source,
     stated_sigma,
+    vertical_datum,
 )
 from engine.maps.surface import GROUND_PERCENT, SurfaceModel, open_surface
 from engine.values import Window
@@ -60,6 +61,7 @@ class OrthoMap(Georeference):
             part of the map, below most roofs and crowns; 0.0 without a surface.
         levels: number of levels of the pyramid.
         georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None where unknown.
+        surface_datum: vertical system of a surface in metres above the sea, by its file; None where unknown.
         slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None where unknown.
     """
 
@@ -73,6 +75,7 @@ class OrthoMap(Georeference):
         self.name, self.source_crs, self._facts = name, source_crs, facts or {}
         self._surface: SurfaceModel | None = None
         self.has_surface, self.ground_m = False, 0.0
+        self.surface_datum: str | None = None
         self._pyramid = Pyramid(grid.width_px, grid.height_px, reader)
         self.levels = self._pyramid.levels
 
@@ -117,6 +120,7 @@ class OrthoMap(Georeference):
         site._set_accuracy(georeference_sigma_m, slope_sigma_deg, original, heights_file)
         if heights_file is not None:
             site._attach(*open_surface(heights_file, site._grid))
+            site.surface_datum = vertical_datum(heights_file)
         return site
 
     def _set_accuracy(
@@ -368,6 +372,7 @@ class OrthoMap(Georeference):
             "convergence_deg": math.degrees(math.atan2(east, north)),
             "nodata_share": self._pyramid.nodata_share,
             "surface_range_m": None if surface is None else list(surface.range_m),
+            "surface_datum": self.surface_datum,
             "ground_m": self.ground_m,
             "georeference_sigma_m": self.georeference_sigma_m,
             "slope_sigma_deg": self.slope_sigma_deg,

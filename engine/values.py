@@ -273,6 +273,7 @@ class Fix:
         covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
         attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
             only the heading is measured; roll and pitch are the frame's, or 0.
+        attitude_covariance_deg2: (3, 3) in roll, pitch, heading where the whole pose was solved, else None.
         score: NCC in [-1, 1]: of the peak, or of picture and map at a refined pose; the share of inliers of
             matched points.
         method: "ncc", "sift" or "learned".
@@ -303,6 +304,13 @@ class Fix:
     stage: str = "fine"
     confidence: float | None = None
     map_sigma_m: float = 0.0
+    attitude_covariance_deg2: NDArray[np.float64] | None = None
+
+    @property
+    def attitude_sigma_deg(self) -> tuple[float, ...] | None:
+        """Standard deviations of roll, pitch and heading; None where the whole pose was not solved."""
+        covariance = self.attitude_covariance_deg2
+        return None if covariance is None else tuple(np.sqrt(np.diag(covariance)).tolist())
 
     @property
     def relative_covariance_m2(self) -> NDArray[np.float64]:

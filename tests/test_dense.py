@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -302,3 +303,25 @@ def test_rough_ground_counts_less(ground):
     assert wall.any()
     assert samples.weights[wall].max() < 0.1
     np.testing.assert_allclose(samples.weights[level], 1.0)
+
+
+@pytest.mark.parametrize(("method", "has_surface"), [("ncc", True), ("ncc", False), ("sift", True)])
+def test_attitudes_are_as_wrong_as_their_covariance_says(sim_flight, sim_site, method, has_surface):
+    """Normalised squared errors of three angles: 3 in the mean where honest, less where cautious."""
+    site, town = sim_site, sim_flight.town
+    if not has_surface:
+        gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
+        site = OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}")
+    matcher, squared = SceneMatcher(site, sim_flight.camera, method, "cpu"), []
+    for frame, truth in zip(sim_flight.frames[::2], sim_flight.truth[::2], strict=True):
+        place = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
+        fix = matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0))
+        if not isinstance(fix, Fix) or fix.attitude_covariance_deg2 is None:
+            continue  # a peak that was not refined has no whole pose
+        off = [fix.attitude.roll_deg - truth.roll_deg, fix.attitude.pitch_deg - truth.pitch_deg,
+               math.remainder(fix.attitude.heading_deg - truth.heading_deg, 360.0)]  # fmt: skip
+        squared.append(off @ np.linalg.solve(fix.attitude_covariance_deg2, off))
+        assert fix.attitude_sigma_deg == pytest.approx(np.sqrt(np.diag(fix.attitude_covariance_deg2)))
+    assert len(squared) > 8
+    assert 0.3 < np.mean(squared) < 6.0
+    assert max(squared) < 21.1  # three degrees of freedom, once in ten thousand

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,10 +11,12 @@ from pyproj import Transformer
 
 from engine.geo import (
     LocalFrame,
+    angle_covariance_deg2,
     attitude_from_rotation,
     chi_square,
     ecef_from_geodetic,
     enu_from_body,
+    enu_turn_covariance_rad2,
     geodetic_from_ecef,
     transport_covariance,
     wrap_heading_deg,
@@ -193,3 +196,17 @@ def test_covariance_transport_is_first_order_and_symmetric():
     assert np.array_equal(moved, moved.T)
     samples = rng.normal(size=(200_000, 3)) @ root.T @ jacobian.T
     np.testing.assert_allclose(np.cov(samples.T), moved, rtol=0.05, atol=0.05)
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (10.0, -20.0, 250.0), (-40.0, 60.0, 5.0)])
+def test_the_covariance_of_angles_is_that_of_small_turns_about_the_body(angles):
+    root = np.array([[2.0, 0.3, 0.1], [0.0, 1.0, -0.4], [0.0, 0.0, 0.5]]) * 1e-3
+    turns = np.random.default_rng(3).normal(size=(4000, 3)) @ root.T
+    turned = [attitude_from_rotation(enu_from_body(*angles) @ cv2.Rodrigues(turn)[0]) for turn in turns]
+    off = (np.array(turned) - angles + 180.0) % 360.0 - 180.0
+    covariance = angle_covariance_deg2(root @ root.T, *angles[:2])
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), off.T)
+    assert np.cov(whitened) == pytest.approx(np.eye(3), abs=0.08)
+    turn = enu_from_body(*angles)
+    about_enu = enu_turn_covariance_rad2(covariance, angles)
+    assert about_enu == pytest.approx(turn @ root @ root.T @ turn.T, rel=1e-9, abs=1e-15)

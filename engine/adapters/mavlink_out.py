@@ -16,10 +16,10 @@ from engine.adapters.fix_velocity import GroundVelocity
 from engine.adapters.mavlink_in import MAV_AUTOPILOTS, GnssFix
 from engine.adapters.packets import AUTOPILOT_COMPONENT
 from engine.adapters.parameters import MAX_DELAY_MS
-from engine.adapters.vehicle import ANGLE_VARIANCE, NedOrigin, VehicleState, north_east_m
+from engine.adapters.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
 from engine.errors import OptionError
 from engine.geo import enu_from_body
-from engine.values import Fix, check_positive
+from engine.values import Attitude, Fix, check_positive
 
 MESSAGES = {
     "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
@@ -116,7 +116,8 @@ class FixReport:
 def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
     """Reason for which a fix is not sent, or None where it is sent."""
     vehicle, fix = report.vehicle, report.fix
-    if not all(map(math.isfinite, (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel()))):
+    numbers = (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel(), *(fix.attitude_sigma_deg or ()))
+    if not all(map(math.isfinite, numbers)):
         return "not finite"
     if fix.sigma_m > options.max_sigma_m:
         return "too uncertain"
@@ -200,11 +201,15 @@ def no_position_message(now_ns: int) -> Any:
     )  # fmt: skip
 
 
-def pose_covariance(fix: Fix) -> list[float]:
+def pose_covariance(fix: Fix, *, with_attitude: bool = False) -> list[float]:
     """Upper triangle, row by row, of the (6, 6) covariance of north, east, down, roll, pitch and yaw.
 
     ArduPilot combines the three position variances into one scalar. The height comes from another sensor, and a
     large variance of it would dominate: it gets the horizontal one.
+
+    Args:
+        fix: with its covariance.
+        with_attitude: whether its own attitude is sent; the autopilot's, sent back, counts for little.
 
     Returns:
         21 values in m^2, rad^2 and their products.
@@ -213,17 +218,26 @@ def pose_covariance(fix: Fix) -> list[float]:
     pose = np.zeros((6, 6))
     pose[0, 0], pose[0, 1], pose[1, 1] = c[1, 1], c[0, 1], c[0, 0]
     pose[2, 2] = fix.sigma_m**2
-    pose[3, 3] = pose[4, 4] = pose[5, 5] = ANGLE_VARIANCE
+    pose[3:, 3:] = ANGLE_VARIANCE * np.eye(3)
+    if with_attitude and fix.attitude_covariance_deg2 is not None:
+        pose[3:, 3:] = fix.attitude_covariance_deg2 * math.radians(1.0) ** 2 + MOUNT_VARIANCE * np.eye(3)
     return [float(v) for v in pose[np.triu_indices(6)]]
 
 
-def _angles(vehicle: VehicleState) -> tuple[float, float, float]:
-    """Roll, pitch and yaw in radians, yaw in [-pi, pi]."""
-    assert vehicle.roll_deg is not None  # checked by withhold_reason
-    assert vehicle.pitch_deg is not None
-    assert vehicle.heading_deg is not None
-    yaw = math.remainder(math.radians(vehicle.heading_deg), 2.0 * math.pi)
-    return math.radians(vehicle.roll_deg), math.radians(vehicle.pitch_deg), yaw
+def _measured_attitude(report: FixReport) -> Attitude | None:
+    """The attitude of the fix where it solved the whole pose and the camera does not hang on a gimbal."""
+    is_whole = report.fix.attitude_covariance_deg2 is not None and report.vehicle.holder is None
+    return report.fix.attitude if is_whole else None
+
+
+def _angles(report: FixReport) -> tuple[float, float, float]:
+    """Roll, pitch and yaw in radians, yaw in [-pi, pi]: as measured by the fix, else the vehicle's."""
+    source = _measured_attitude(report) or report.vehicle
+    assert source.roll_deg is not None  # checked by withhold_reason
+    assert source.pitch_deg is not None
+    assert source.heading_deg is not None
+    yaw = math.remainder(math.radians(source.heading_deg), 2.0 * math.pi)
+    return math.radians(source.roll_deg), math.radians(source.pitch_deg), yaw
 
 
 def _ned(report: FixReport, firmware: str) -> tuple[float, float, float]:
@@ -237,8 +251,8 @@ def _vision_position_estimate(report: FixReport, firmware: str) -> Any:
     return mavlink.MAVLink_vision_position_estimate_message(
         report.captured_ns // 1000,
         *_ned(report, firmware),
-        *_angles(report.vehicle),
-        pose_covariance(report.fix),
+        *_angles(report),
+        pose_covariance(report.fix, with_attitude=_measured_attitude(report) is not None),
         report.reset_counter,
     )
 
@@ -257,10 +271,10 @@ def _odometry(report: FixReport, firmware: str) -> Any:
         frame,
         mavlink.MAV_FRAME_BODY_FRD,
         *_ned(report, firmware),
-        _quaternion(*_angles(report.vehicle)),
+        _quaternion(*_angles(report)),
         *velocity,
         *(nan, nan, nan),
-        pose_covariance(report.fix),
+        pose_covariance(report.fix, with_attitude=_measured_attitude(report) is not None),
         covariance,
         report.reset_counter,
         mavlink.MAV_ESTIMATOR_TYPE_VISION,
@@ -269,7 +283,7 @@ def _odometry(report: FixReport, firmware: str) -> Any:
 
 
 def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[float]:
-    """Velocity in m/s along the body's forward, right and down axes."""
+    """Velocity in m/s along the body's axes, by the autopilot's own attitude, with which it is turned back."""
     assert vehicle.roll_deg is not None  # checked by withhold_reason
     assert vehicle.pitch_deg is not None
     assert vehicle.heading_deg is not None

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.adapters.vehicle import ANGLE_VARIANCE, NedOrigin, VehicleState, north_east_m
+from engine.adapters.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
 from engine.errors import OptionError
 from engine.formats.ros.messages import MessageFactory
-from engine.geo import LocalFrame
+from engine.geo import LocalFrame, enu_turn_covariance_rad2
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Window
 
@@ -48,7 +48,8 @@ class RosOptions:
 
 def is_finite(fix: Fix) -> bool:
     """Whether the position and covariance of a fix are finite."""
-    numbers = (fix.lat_deg, fix.lon_deg, fix.east_m, fix.north_m, *fix.covariance_m2.ravel())
+    angles = fix.attitude_sigma_deg or ()
+    numbers = (fix.lat_deg, fix.lon_deg, fix.east_m, fix.north_m, *fix.covariance_m2.ravel(), *angles)
     return all(map(math.isfinite, numbers))
 
 
@@ -112,7 +113,7 @@ def pose_covariance(
         fix: with its covariance.
         firmware: one of :data:`FIRMWARES`.
         knows_up: whether the pose has a height.
-        angles: roll, pitch and heading in degrees; an unknown one is None.
+        angles: roll, pitch and heading in degrees; an unknown one is None. Those of a fix have its own covariance.
 
     Returns:
         (6, 6) in m^2 and rad^2.
@@ -125,6 +126,11 @@ def pose_covariance(
     elif not knows_up:
         covariance[2, :2] = covariance[:2, 2] = 0.0
         covariance[2, 2] = _UNKNOWN_HEIGHT_M2
+    if fix.attitude is not None and fix.attitude_covariance_deg2 is not None:
+        measured = fix.attitude.roll_deg, fix.attitude.pitch_deg, fix.attitude.heading_deg
+        covariance[3:, 3:] = enu_turn_covariance_rad2(fix.attitude_covariance_deg2, measured)
+        covariance[3:, 3:] += MOUNT_VARIANCE * np.eye(3)
+        return covariance
     variances_rad2 = [_UNKNOWN_ANGLE_VARIANCE if angle is None else ANGLE_VARIANCE for angle in angles]
     # Roll and pitch mix into both horizontal axes, depending on the heading.
     covariance[3, 3] = covariance[4, 4] = max(variances_rad2[:2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -23,6 +24,12 @@ class FrameNote:
         stage: last stage of the search that the budget allowed.
         confidence: probability that the fix is correct.
         detail: one sentence with figures on why the frame was refused.
+        sigma_up_m: standard deviation of the height, where it was measured.
+        roll_deg: of the whole pose, where that was measured; positive right side down.
+        pitch_deg: the same; positive nose up.
+        roll_sigma_deg: standard deviation of the roll, where it is known, as of the next two.
+        pitch_sigma_deg: of the pitch.
+        heading_sigma_deg: of the heading.
     """
 
     frame: str
@@ -33,10 +40,17 @@ class FrameNote:
     stage: str | None = None
     confidence: float | None = None
     detail: str | None = None
+    sigma_up_m: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_sigma_deg: float | None = None
+    pitch_sigma_deg: float | None = None
+    heading_sigma_deg: float | None = None
 
 
 COLUMNS = tuple(f.name for f in fields(FrameNote))
 """The header of notes.csv."""
+_LATER = COLUMNS[COLUMNS.index("sigma_up_m") :]  # columns that older runs lack
 
 
 def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
@@ -50,12 +64,21 @@ def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
     x0, y0 = (None, None) if result.window is None else (result.window.x0, result.window.y0)
     if isinstance(result, NoFix):
         return FrameNote(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
+    # Where no height was measured, roll and pitch are the telemetry's, or none.
+    tilt = None if result.up_m is None else result.attitude
+    roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)
     return FrameNote(
         frame=name,
         state=state,
         window_x0_px=x0,
         window_y0_px=y0,
         heading_deg=None if result.attitude is None else float(result.attitude.heading_deg),
+        sigma_up_m=None if result.up_m is None else math.sqrt(result.covariance_m2[2, 2]),
+        roll_deg=None if tilt is None else float(tilt.roll_deg),
+        pitch_deg=None if tilt is None else float(tilt.pitch_deg),
+        roll_sigma_deg=roll_sigma_deg,
+        pitch_sigma_deg=pitch_sigma_deg,
+        heading_sigma_deg=heading_sigma_deg,
         stage=result.stage,
         confidence=None if result.confidence is None else float(result.confidence),
     )
@@ -86,6 +109,7 @@ def read_notes(path: str | Path) -> list[FrameNote]:
             stage=csv_row.values["stage"] or None,
             confidence=csv_row.number("confidence"),
             detail=csv_row.values["detail"] or None,
+            **{name: csv_row.number(name) for name in _LATER},
         )
-        for csv_row in read_table(path, COLUMNS)
+        for csv_row in read_table(path, [name for name in COLUMNS if name not in _LATER], _LATER)
     ]

@@ -156,6 +156,22 @@ def open_source(
     return Source(file, dataset, _checked(grid, argument, file))
 
 
+def vertical_datum(source: Source) -> str | None:
+    """Name of the system in which the heights in a file are metres above the sea; None where it names no such one.
+
+    Only a compound CRS does, such as EPSG:32636+5773; heights above the ellipsoid are the third axis of another.
+    """
+    from pyproj import CRS
+
+    own = source.dataset.crs
+    crs = CRS.from_wkt(own.to_wkt()) if own else None
+    vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None) if crs is not None else None
+    if vertical is None or "ellips" in vertical.name.lower():  # which older files name a datum of the sea
+        return None
+    axis = vertical.axis_info[0]
+    return str(vertical.name) if axis.direction == "up" and axis.unit_conversion_factor == 1.0 else None
+
+
 def _open_dataset(file: Path, argument: str) -> Any:
     """The rasterio dataset of a file or folder, or a tile cache."""
     import rasterio

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from engine.acceptance import judge_pose
 from engine.confidence import PoseFeatures, prior_agreement, probability
-from engine.covariance import AssumedErrors
+from engine.covariance import AssumedErrors, tilt_covariance
 from engine.geo import attitude_from_rotation
 from engine.indexes.landmarks import LandmarkMap
 from engine.methods.feature_matching import NOMINAL_SCALE, Matched, match_views
@@ -209,9 +209,12 @@ class FeatureMatcher:
             detail = f"the pose is {tilt:.0f} degrees off level at a height of {up:.0f} m"
             return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
+        turns_rad2 = stats.covariance[3:, 3:] + tilt_covariance(stats.rotation, _slope_rad(site, options.errors))
         if not query.telemetry.has_tilt:  # features of a coarse picture err together, as a tilt would
-            covariance *= max(1.0, NOMINAL_SCALE / options.scale) ** 2
+            wider = max(1.0, NOMINAL_SCALE / options.scale) ** 2
+            covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
         doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
+        above_m = up - float(site.surface_at(nadir))
         return query.fix(
             self.method,
             nadir,
@@ -221,6 +224,7 @@ class FeatureMatcher:
             east_north_m=stats.center_m[:2],
             up_m=up,
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
+            turn_covariance_rad2=turns_rad2 + tilt_covariance(stats.rotation, doubt_m / above_m),
             map_sigma_m=options.errors.map_m,
         )
 
@@ -250,6 +254,10 @@ class FeatureMatcher:
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
     """(3, 3) of the map: its georeferencing accuracy, and a slope of the ground that PnP takes for a tilt."""
-    slope_deg = errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg
-    horizontal = errors.map_m**2 + (height_m * math.radians(slope_deg)) ** 2
+    horizontal = errors.map_m**2 + (height_m * _slope_rad(site, errors)) ** 2
     return np.diag([horizontal, horizontal, errors.map_m**2])
+
+
+def _slope_rad(site: OrthoMap, errors: AssumedErrors) -> float:
+    """Standard deviation of the ground's slope against that of the map's heights."""
+    return math.radians(errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.covariance import AssumedErrors, with_frame_accuracy
-from engine.geo import enu_from_body, inverse_2x2, wrap_heading_deg
+from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
 from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior
@@ -196,6 +196,7 @@ class Query:
         east_north_m: Array | None = None,
         up_m: float | None = None,
         grid_attitude: Attitude | None = None,
+        turn_covariance_rad2: Array | None = None,
         map_sigma_m: float = 0.0,
     ) -> Fix:
         """A fix of this frame; its heading counts from true north there.
@@ -209,10 +210,15 @@ class Query:
             east_north_m: (2,) of the nadir where it is known in metres; None computes it.
             up_m: height of the camera, or None where it is not measured.
             grid_attitude: the heading from grid north; None where it is not measured.
+            turn_covariance_rad2: (3, 3) of a small turn about the camera's axes, with a measured attitude.
             map_sigma_m: the part of the covariance that is the map's georeference.
         """
         east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
         lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
+        angles_deg2 = None
+        if grid_attitude is not None and turn_covariance_rad2 is not None:
+            about_body = transport_covariance(self.camera.mount, turn_covariance_rad2)
+            angles_deg2 = angle_covariance_deg2(about_body, grid_attitude.roll_deg, grid_attitude.pitch_deg)
         return Fix(
             timestamp_ns=self.frame.timestamp_ns,
             lat_deg=lat,
@@ -228,6 +234,7 @@ class Query:
             timings=self.scheduler.timings,
             map_xy_px=(float(nadir_px[0]), float(nadir_px[1])),
             map_sigma_m=map_sigma_m,
+            attitude_covariance_deg2=angles_deg2,
         )
 
     def _true_attitude(self, grid_attitude: Attitude | None, lat_deg: float, lon_deg: float) -> Attitude | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from engine.acceptance import are_consistent
 from engine.align import shrink
+from engine.covariance import tilt_covariance
 from engine.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, correlation_at, covariance_of, refine
 from engine.geo import attitude_from_rotation
 from engine.indexes.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
@@ -120,18 +121,22 @@ class Refinement:
         covariance = pose_covariance[:3, :3].copy()
         height_m = fit.pose.center_m[2] - query.site.ground_m
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
+        slope_rad = 0.0
         if not query.site.has_surface and not self._knows_tilt:  # a slope of the ground was taken for a tilt
-            covariance[:2, :2] += (height_m * math.radians(errors.unknown_slope_deg)) ** 2 * np.eye(2)
+            slope_rad = math.radians(errors.unknown_slope_deg)
+        covariance[:2, :2] += (height_m * slope_rad) ** 2 * np.eye(2)
         nadir_px = query.site.pixel_from_enu(fit.pose.center_m[:2])
         doubt_m = query.scale_doubt_m(nadir_px, float(fit.pose.center_m[2]), fit.pose.rotation[2], errors)
         covariance[:2, :2] += doubt_m**2 * np.eye(2)
+        tilt_rad = math.hypot(doubt_m / height_m, slope_rad)
+        turns_rad2 = pose_covariance[3:6, 3:6] + tilt_covariance(fit.pose.rotation, tilt_rad)
         moved = (fit.pose.center_m - prior.pose.center_m)[:2]
         allowed_m2 = fix.relative_covariance_m2 + covariance[:2, :2]
         if not self.knows_tilt:  # by which the peak was displaced
             allowed_m2 += (height_m * math.radians(errors.tilt_deg)) ** 2 * np.eye(2)
         if not are_consistent(moved, allowed_m2):
             return None
-        return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3))
+        return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
 
     @property
     def _knows_tilt(self) -> bool:
@@ -220,7 +225,7 @@ class Refinement:
         enhanced = enhance(gray, radius_px=radius_px, score=options.score)
         return EnhancedFrame(enhanced, smaller @ query.camera.matrix)
 
-    def _refined_fix(self, fix: Fix, fit: DenseFit, covariance_m2: Array) -> Fix:
+    def _refined_fix(self, fix: Fix, fit: DenseFit, covariance_m2: Array, turns_rad2: Array) -> Fix:
         query, center_m = self.query, fit.pose.center_m
         refined = query.fix(
             fix.method,
@@ -231,6 +236,7 @@ class Refinement:
             east_north_m=center_m[:2],
             up_m=float(center_m[2]),
             grid_attitude=Attitude(*attitude_from_rotation(fit.pose.rotation.T @ query.camera.mount.T)),
+            turn_covariance_rad2=turns_rad2,
             map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)

@@ -15,7 +15,7 @@ from engine.formats.corrections import Corrections
 _TEXTS = ("map", "method", "profile")
 _TEXTS_OR_NONE = (
     "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "device", "start",
-    "map_bounds", "map_crs", "mount",
+    "map_bounds", "map_crs", "mount", "surface_datum",
 )  # fmt: skip
 _NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")
 
@@ -51,6 +51,7 @@ class RunRecord:
         origin: ``lat_deg`` and ``lon_deg`` of the plane of the track.
         ground_m: height of the ground on the map.
         ground_amsl_m: the same above the sea, by the telemetry.
+        surface_datum: vertical system of the heights, where the surface is above the sea by its file.
         attitude: what the fixes said of the telemetry's attitude.
         diagnosis: where few frames were fixed, what of the inputs does not fit, sentences by cause.
         more: what else stands in the file, by name.
@@ -85,6 +86,7 @@ class RunRecord:
     origin: Mapping[str, float]
     ground_m: float
     ground_amsl_m: float | None
+    surface_datum: str | None = None
     attitude: Mapping[str, Any] | None = None
     diagnosis: Mapping[str, str] | None = None
     more: Mapping[str, Any] = field(default_factory=dict)

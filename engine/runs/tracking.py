@@ -152,6 +152,7 @@ def _record(
         origin={"lat_deg": inputs.site.frame.lat_deg, "lon_deg": inputs.site.frame.lon_deg},
         ground_m=ground.ground_m,
         ground_amsl_m=ground.ground_amsl_m,
+        surface_datum=inputs.site.surface_datum,
         attitude=None if attitude is None else asdict(attitude),
     )
 

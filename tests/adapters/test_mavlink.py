@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,7 +49,7 @@ from engine.camera import mount_rotation
 from engine.cli.app import run as main
 from engine.errors import OptionError
 from engine.geo import LocalFrame
-from engine.values import Fix, NoFix, Reason, Timings, Window
+from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.support.paths import ROOT
 
 GOLDEN = ROOT / "tests" / "golden" / "mavlink"
@@ -194,6 +195,30 @@ def test_attitude_is_in_radians_and_the_same_in_both_forms(message):
         assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
     else:
         assert m.q == pytest.approx(list(Quaternion(angles).q))
+
+
+@pytest.mark.parametrize("message", ["vision_position_estimate", "odometry"])
+def test_a_whole_pose_is_sent_with_the_attitude_that_was_measured(message):
+    angles_deg2 = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 0.25]])
+    whole = fix(attitude=Attitude(1.0, 2.0, 300.0), up_m=120.0, attitude_covariance_deg2=angles_deg2)
+    options, angles = MavlinkOptions(message=message), np.radians([1.0, 2.0, -60.0])
+    m, own = fix_message(sending(fix=whole), options), fix_message(sending(), options)
+    held = replace(VEHICLE, holder=Attitude(0.0, -45.0, 90.0))  # by a gimbal, which is not the vehicle's attitude
+    gimbal = fix_message(sending(fix=whole, vehicle=held), options)
+    if message == "vision_position_estimate":
+        assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
+        assert (gimbal.roll, gimbal.pitch, gimbal.yaw) == (own.roll, own.pitch, own.yaw)
+        flat, flat_gimbal, flat_own = m.covariance, gimbal.covariance, own.covariance
+    else:
+        assert m.q == pytest.approx(list(Quaternion(angles).q))
+        assert gimbal.q == own.q
+        assert (m.vx, m.vy, m.vz) == (own.vx, own.vy, own.vz)  # about the autopilot's own axes
+        flat, flat_gimbal, flat_own = m.pose_covariance, gimbal.pose_covariance, own.pose_covariance
+    # Of the upper triangle the last six are roll, pitch and yaw; a degree each is the mount's.
+    expected_deg2 = [1.04, 0.01, 0.0, 1.09, 0.0, 1.25]
+    assert np.array(flat[15:]) * math.degrees(1.0) ** 2 == pytest.approx(expected_deg2)
+    assert flat_gimbal == flat_own
+    assert withhold_reason(sending(fix=replace(whole, attitude_covariance_deg2=angles_deg2 * math.nan)), options)
 
 
 def test_odometry_frames_are_those_that_each_firmware_takes():

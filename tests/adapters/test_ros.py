@@ -344,6 +344,18 @@ def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
     assert message.pose.pose.position.z == pytest.approx(80.0)
 
 
+def test_a_whole_pose_has_the_covariance_of_its_attitude_about_east_north_up(maker, sim_site):
+    # Heading east: a roll is a turn about east, a pitch one about north.
+    known = {"attitude": Attitude(0.0, 0.0, 90.0), "attitude_covariance_deg2": np.diag([4.0, 9.0, 16.0])}
+    message = pose(maker, a_fix(sim_site, **known), VEHICLE, NOW_NS, sim_site, RosOptions())
+    turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
+    assert turns_deg2 == pytest.approx(np.diag([5.0, 10.0, 17.0]))  # a degree is the mount's
+    north = known | {"attitude": Attitude(0.0, 0.0, 0.0)}
+    message = pose(maker, a_fix(sim_site, **north), VEHICLE, NOW_NS, sim_site, RosOptions())
+    turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
+    assert turns_deg2 == pytest.approx(np.diag([10.0, 5.0, 17.0]))
+
+
 def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
     message = pose(maker, a_fix(sim_site), VehicleState(), NOW_NS, sim_site, RosOptions())
     variances = np.diag(np.asarray(message.pose.covariance).reshape(6, 6))

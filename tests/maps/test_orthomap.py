@@ -700,3 +700,25 @@ def test_what_stands_at_a_wall_is_not_to_be_relied_on():
     at = np.array([[5.0, 5.0], [30.0, 30.0], [20.0, 30.0], [18.0, 30.0], [17.0, 30.0]])
     np.testing.assert_allclose(site.roughness_weight_at(at, 2.0), [1.0, 1.0, 1 / 101, 1 / 101, 1.0], rtol=1e-9)
     assert OrthoMap.from_arrays(noise(60, 60), CENTRED, UTM).roughness_weight_at(at, 2.0).tolist() == [1.0] * 5
+
+
+@pytest.mark.parametrize(
+    ("crs", "datum"),
+    [
+        ("EPSG:32633+5773", "EGM96 height"),
+        ("EPSG:32633", None),
+        ("EPSG:32633+6360", None),  # feet, where heights are taken for metres
+        ("EPSG:4979", None),  # above the ellipsoid
+    ],
+)
+def test_a_surface_is_above_the_sea_where_its_crs_says_so(tmp_path, crs, datum):
+    affine = CENTRED if crs != "EPSG:4979" else np.array([[1e-5, 0.0, 15.0], [0.0, -1e-5, 48.0]])
+    write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, 4326 if crs == "EPSG:4979" else 32633)
+    corner = affine[:, 2] - 0.5 * (affine[:, 0] + affine[:, 1])
+    transform = rasterio.Affine(*np.column_stack([affine[:, :2], corner]).ravel())
+    profile = {"driver": "GTiff", "height": 40, "width": 50, "count": 1, "dtype": "float32", "crs": crs}
+    with rasterio.open(tmp_path / "dsm.tif", "w", transform=transform, **profile) as file:
+        file.write(np.full((1, 40, 50), 150.0, np.float32))
+    site = OrthoMap.open(tmp_path / "map.tif", surface=tmp_path / "dsm.tif", cache_dir=tmp_path / "cache")
+    assert site.surface_datum == datum
+    assert site.info()["surface_datum"] == datum

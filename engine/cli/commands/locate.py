@@ -98,6 +98,7 @@ def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:
     if as_json:
         facts["covariance_m2"] = fix.covariance_m2.tolist()
         facts["attitude"] = None if fix.attitude is None else asdict(fix.attitude)
+        facts["attitude_sigma_deg"] = None if fix.attitude_sigma_deg is None else list(fix.attitude_sigma_deg)
     return facts
 
 

@@ -1,0 +1,105 @@
+"""A tracked flight and its truth as TUM, read back: the same errors as the summary's, in position and attitude."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from engine.formats.notes import read_notes
+from engine.formats.track import read_track
+from engine.runs import TrackSettings, export_track, track
+from engine.runs.simulation import write_flight
+from engine.sim import plan_flight
+from tests.support.runs import bare_runs
+from tests.support.towns import drawn_town
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Flight folder and output folder of a flight, tracked by NCC, with both TUM files."""
+    folder = tmp_path_factory.mktemp("export")
+    files = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
+    out = folder / "out"
+    with bare_runs():
+        track(files, out, TrackSettings(device="cpu"))
+    export_track(out, "tum")
+    export_track(out, "tum", truth=folder / "flight" / "truth.csv")
+    return out
+
+
+def tum(path):
+    """Stamps (N,), places (N, 3) and rotations of a file."""
+    table = np.loadtxt(path, ndmin=2)
+    return table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:])
+
+
+def test_the_two_files_differ_by_the_errors_of_the_summary(finished):
+    summary = json.loads((finished / "summary.json").read_text())
+    (stamps, places, _), (true_stamps, true_places, _) = (tum(finished / f"{n}.tum") for n in ("track", "truth"))
+    assert len(stamps) == summary["fixes"] > 2
+    assert stamps.tolist() == true_stamps.tolist()
+    off_m = places - true_places
+    assert np.sqrt((off_m[:, :2] ** 2).sum(axis=1).mean()) == pytest.approx(summary["rms_m"], abs=2e-4)
+    assert np.sqrt((off_m[:, 2] ** 2).mean()) == pytest.approx(summary["height_rms_m"], abs=1e-3)
+
+
+def test_the_attitude_is_that_of_the_fixes_and_near_the_truth(finished):
+    (_, _, turns), (_, _, true_turns) = (tum(finished / f"{name}.tum") for name in ("track", "truth"))
+    assert np.degrees((turns * true_turns.inv()).magnitude()).max() < 2.0
+    assert np.degrees(turns.magnitude()).max() > 1.0  # no identity among them
+    notes = [note for note in read_notes(finished / "notes.csv") if note.roll_deg is not None]
+    for note, turn in zip(notes, turns, strict=True):
+        forward_left_up = turn.as_matrix()
+        assert np.degrees(np.arcsin(forward_left_up[2, 0])) == pytest.approx(note.pitch_deg, abs=1e-3)
+        assert np.degrees(np.arctan2(forward_left_up[0, 0], forward_left_up[1, 0])) % 360.0 == pytest.approx(
+            note.heading_deg, abs=1e-3
+        )
+        assert note.sigma_up_m > 0.0
+
+
+def test_evo_reports_the_rms_of_the_summary(finished):
+    pytest.importorskip("evo", reason="evo is not installed")
+    from evo.core import metrics, sync
+    from evo.core.trajectory import Plane
+    from evo.tools import file_interface
+
+    paths = (finished / f"{name}.tum" for name in ("truth", "track"))
+    pair = sync.associate_trajectories(*(file_interface.read_tum_trajectory_file(str(path)) for path in paths))
+    for trajectory in pair:
+        trajectory.project(Plane.XY)  # the summary's error is horizontal
+    error = metrics.APE(metrics.PoseRelation.translation_part)
+    error.process_data(pair)
+    summary = json.loads((finished / "summary.json").read_text())
+    assert error.get_statistic(metrics.StatisticsType.rmse) == pytest.approx(summary["rms_m"], abs=2e-4)
+
+
+def test_a_run_of_before_is_exported_without_what_it_did_not_note(finished, tmp_path):
+    for name in ("track.csv", "summary.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    lines = (finished / "notes.csv").read_text().splitlines()
+    (tmp_path / "notes.csv").write_text("\n".join(",".join(line.split(",")[:7]) + "," for line in lines[1:]))
+    head = "frame,state,window_x0_px,window_y0_px,heading_deg,stage,confidence,detail"
+    (tmp_path / "notes.csv").write_text(f"{head}\n{(tmp_path / 'notes.csv').read_text()}\n")
+    told = export_track(tmp_path, "tum")
+    assert told["left_out"] == 0
+    text = (tmp_path / "track.tum").read_text()
+    assert "quaternion is unity" in text.splitlines()[0]
+    measured = [row.up_m for row in read_track(tmp_path / "track.csv") if row.fixed]
+    assert tum(tmp_path / "track.tum")[1][:, 2] == pytest.approx(measured, abs=1e-3)
+
+
+def test_heights_are_above_the_sea_where_the_surface_says_so(finished, tmp_path):
+    assert "<ele>" not in Path(export_track(finished, "gpx")["file"]).read_text()
+    for name in ("track.csv", "summary.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary["settings"]["surface_datum"] = "EGM96 height"
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    text = Path(export_track(tmp_path, "gpx")["file"]).read_text()
+    measured = [row.up_m for row in read_track(tmp_path / "track.csv") if row.up_m is not None]
+    assert [float(each) for each in re.findall("<ele>(.+)</ele>", text)] == pytest.approx(measured, abs=1e-3)
