@@ -48,7 +48,7 @@ def mavlink(
         typer.Option(
             "--connect",
             metavar="LINK",
-            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+            help="udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
         ),
     ],
     map_path: MapOption,
