@@ -1,5 +1,5 @@
-# make demo | test | test-all | check | package | extras | bench | bench-gpu | bench-flights | bench-latency: each sets itself up
-# in .venv and is quick the second time.
+# make demo | test | test-all | check | package | extras | sbom | bench | bench-gpu | bench-flights | bench-latency: each
+# sets itself up in .venv and is quick the second time.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +9,7 @@ WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test test-slow test-all check package extras docs bench bench-gpu integrity simulated bench-flights bench-latency clean
+.PHONY: demo test test-slow test-all check package extras sbom docs bench bench-gpu integrity simulated bench-flights bench-latency clean
 
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
@@ -53,6 +53,16 @@ package: $(VENV)/dev.stamp
 
 extras: package
 	.ci/extras
+
+# What is installed beside the wheel of `make package`, or in SBOM_OF's environment, as CycloneDX.
+SBOM_OF ?= build/clean/bin/python
+sbom:
+	test -x $(SBOM_OF) || { echo "expected $(SBOM_OF): run make package first"; exit 1; }
+	$(PYTHON) -m venv build/sbom
+	build/sbom/bin/pip --disable-pip-version-check install --quiet 'cyclonedx-bom>=7,<8'
+	mkdir -p dist
+	build/sbom/bin/cyclonedx-py environment --pyproject pyproject.toml --mc-type library --output-reproducible \
+		--output-file dist/sbom.cdx.json $(SBOM_OF)
 
 docs: $(VENV)/dev.stamp
 	$(BIN)/python -m mkdocs build --quiet

@@ -17,7 +17,9 @@ PeerAddress = tuple[str, int] | None
 
 _DATAGRAM_BYTES = 65535
 _MAX_DATAGRAMS = 256  # per call, so that a flood cannot starve the reader's other work
-_SYNTAX = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+_SYNTAX = "udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+_KINDS = {"udp": "udpin", "udpin": "udpin", "udpout": "udpout", "tcp": "tcp", "tcpout": "tcp", "serial": "serial"}
+"""Kinds of links by their names here, in pymavlink and MAVProxy (udp listens) and in MAVSDK (tcpout)."""
 
 
 class Link(Protocol):
@@ -73,26 +75,34 @@ class Connection:
 
 
 def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
-    """Read a connection string.
+    """Read a connection string, in the forms of pymavlink, MAVProxy and MAVSDK, too.
 
     Args:
-        text: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
+        text: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD. ``udp`` is udpin; two slashes
+            may stand before the host or device (udp://:14540), a comma before the baud rate, and a device may come
+            without its kind (/dev/ttyACM0,57600). Without a host, udpin listens on 127.0.0.1, and with
+            ``listen_anywhere`` on every IPv4 address.
         listen_anywhere: permits listening on addresses that other machines can reach.
 
     Raises:
         OptionError: the syntax is wrong, or the address is not loopback and ``listen_anywhere`` is off.
     """
-    kind, _, rest = text.partition(":")
-    host, _, number_text = rest.rpartition(":")
+    name, _, rest = ("serial", "", text) if text.startswith("/dev/") else text.partition(":")
+    kind = _KINDS.get(name)
+    is_url = rest.startswith("//")
+    rest = rest.removeprefix("//")
+    host, separator, number_text = (rest.replace(",", ":") if kind == "serial" else rest).rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
+    if kind == "udpin" and not host and (is_url or not separator):
+        host = "0.0.0.0" if listen_anywhere else "127.0.0.1"
     number = int(number_text) if number_text.isascii() and number_text.isdecimal() else 0
     max_number = 10_000_000 if kind == "serial" else 65535
-    if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not 0 < number <= max_number:
+    if kind is None or not host or not 0 < number <= max_number:
         raise OptionError(f"connect: expected {_SYNTAX}, got {text!r}")
     if kind == "udpin" and not listen_anywhere and not _is_loopback(host):
         raise OptionError(
             f"connect: expected a loopback address to listen on, got {host!r}; "
-            "add `listen_anywhere` to be reached from other machines"
+            "add `listen_anywhere` to be reached from other machines, or send there by udpout"
         )
     return Connection(kind, host, number)
 

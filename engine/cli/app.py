@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
 from typer.main import get_command
 
 from engine.cli import console
-from engine.cli.argument_names import Command, error_as_typed, ros_arguments_last
+from engine.cli.argument_names import (
+    Command,
+    argument_of,
+    error_as_typed,
+    ros_arguments_last,
+    typed_name,
+    urls_as_typed,
+)
 from engine.cli.commands import (
     bag,
     bridge,
@@ -70,21 +78,27 @@ INTERRUPTED = 130
 
 
 def run(arguments: list[str]) -> int:
-    """Run the command line and return its exit code."""
+    """Run the command line and return its exit code.
+
+    What is wrong is one line on standard error and, with --json, an object on standard output as well.
+    """
+    given = arguments
     if arguments[:2] == ["bridge", "ros"]:
         arguments = [*arguments[:2], *ros_arguments_last(arguments[2:])]
     try:
         result = get_command(app).main(args=arguments or ["--help"], prog_name="scenematch", standalone_mode=False)
     except _UsageError as error:
-        return _fail(_usage(error), 2)
+        return _fail(_usage(error), 2, given, _usage_argument(error))
     except EngineError as error:
-        return _fail(error_as_typed(error), 2 if isinstance(error, OptionError) else 1)
+        text = error_as_typed(error)
+        return _fail(text, 2 if isinstance(error, OptionError) else 1, given, argument_of(text))
     except OSError as error:
-        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 1)
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        return _fail(text, 1, given, argument_of(text))
     except (KeyboardInterrupt, typer.Abort):
         result = INTERRUPTED
     if result == INTERRUPTED:
-        return _fail("interrupted", INTERRUPTED)
+        return _fail("interrupted", INTERRUPTED, given)
     if not arguments:
         return 2
     return result if isinstance(result, int) else 0
@@ -96,8 +110,18 @@ def _usage(error: Any) -> str:
     return f"{error.format_message().rstrip('.')} (see {where} --help)"
 
 
-def _fail(text: str, code: int) -> int:
+def _usage_argument(error: Any) -> str | None:
+    """The argument that is wrong, missing or unknown; None where it is something else."""
+    parameter = getattr(error, "param", None)
+    return getattr(error, "option_name", None) if parameter is None else typed_name(parameter)
+
+
+def _fail(text: str, code: int, given: list[str], argument: str | None = None) -> int:
+    text = urls_as_typed(text, given)
     console.say(f"scenematch: {text}")
+    if "--json" in given:
+        with suppress(OSError):  # standard output may be what failed
+            console.print_json({"error": text, "argument": argument})
     return code
 
 

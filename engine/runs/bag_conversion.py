@@ -8,7 +8,7 @@ from typing import Any
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.flight import open_flight
-from engine.formats.ros.bag_writer import BAG_KINDS, check_replaceable, write_bag
+from engine.formats.ros.bag_writer import BAG_FILES, BAG_KINDS, check_name, check_replaceable, write_bag
 from engine.formats.truth import read_truth
 from engine.runs.arguments import check_choice
 from engine.runs.folders import StrPath
@@ -24,9 +24,9 @@ def convert_to_bag(
 
     Args:
         folder: the flight folder.
-        out: the bag.
-        kind: one of :data:`engine.formats.ros.bag_writer.BAG_KINDS`; None is ros1 for a name in .bag, else
-            ros2-mcap.
+        out: the bag: one file X.bag, X.db3 or X.mcap, or a folder.
+        kind: one of :data:`engine.formats.ros.bag_writer.BAG_KINDS`; None is that of the suffix in
+            :data:`engine.formats.ros.bag_writer.BAG_FILES`, else ros2-mcap.
         force: whether the bag may be there already; it stays until the new one is whole.
         progress: is shown the frames.
 
@@ -38,15 +38,12 @@ def convert_to_bag(
         TelemetryError, CalibrationError: the folder is no flight, or the bag cannot be written.
     """
     out = Path(out)
-    kind = ("ros1" if out.suffix.lower() == ".bag" else "ros2-mcap") if kind is None else kind
+    kind = BAG_FILES.get(out.suffix.lower(), "ros2-mcap") if kind is None else kind
     check_choice("kind", kind, BAG_KINDS)
-    if (out.suffix.lower() == ".bag") != (kind == "ros1"):
-        raise OptionError(f"out: expected a name that ends in .bag for ros1 and for no other format, got {out}")
-    if out.suffix.lower() in (".db3", ".mcap"):
-        raise OptionError(f"out: expected the name of a folder, which a bag of ROS 2 is, got {out}")
     if not Path(folder).is_dir():
         raise OptionError(f"folder: expected a flight folder, got {folder}; `track` reads a bag as it is")
     with renamed_in_errors(path="out", replace="force"):
+        check_name(out, kind)
         check_replaceable(out, force)
     paths = {name: Path(folder) / file for name, file in FOLDER_LAYOUT.items()}
     camera = Camera.load(paths["camera"])

@@ -121,7 +121,7 @@ class MavlinkSettings:
     """How the autopilot is reached and what it is sent.
 
     Attributes:
-        connect: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
+        connect: as :func:`engine.adapters.links.parse_connection` reads it.
         listen_anywhere: allow udpin on addresses that other machines reach.
         system_id: of the vehicle; others are not heard.
         key: secret of MAVLink's signing; with it unsigned packets are ignored.

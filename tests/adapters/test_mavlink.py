@@ -25,7 +25,7 @@ from pymavlink.quaternion import Quaternion
 
 from engine.adapters.delay_memory import remember_delay
 from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
-from engine.adapters.links import parse_connection
+from engine.adapters.links import Connection, parse_connection
 from engine.adapters.mavlink import CONFIRM_COMMAND, MavlinkBridge
 from engine.adapters.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
@@ -552,18 +552,48 @@ def test_random_and_mutated_packets_harm_nothing():
 
 @pytest.mark.parametrize(
     "text",
-    ["", "udp:127.0.0.1:1", "udpin:127.0.0.1", "udpin::1", "udpin:127.0.0.1:0", "tcp:host:65536",
-     "serial:/dev/x:a", "tcp:host:１２"],
+    ["", "udp:127.0.0.1", "udpin:127.0.0.1", "udpin::1", "udpin:127.0.0.1:0", "tcp:host:65536", "udp:", "udp://",
+     "serial:/dev/x:a", "serial:/dev/x", "/dev/x", "tcp:host:１２", "127.0.0.1:14550", "tcp:5760", "udpout:14550"],
 )  # fmt: skip
 def test_bad_connection_strings_are_refused_in_one_line(text):
     with pytest.raises(OptionError, match=r"connect: expected udpin:HOST:PORT"):
         parse_connection(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "kind", "host", "number"),
+    [
+        ("udp:127.0.0.1:14550", "udpin", "127.0.0.1", 14550),  # pymavlink, MAVProxy
+        ("udp:14550", "udpin", "127.0.0.1", 14550),
+        ("udpin:14550", "udpin", "127.0.0.1", 14550),
+        ("udp://:14540", "udpin", "127.0.0.1", 14540),  # MAVSDK
+        ("udp://127.0.0.1:14540", "udpin", "127.0.0.1", 14540),
+        ("udpin://[::1]:14540", "udpin", "::1", 14540),
+        ("udpout://192.168.1.12:14550", "udpout", "192.168.1.12", 14550),
+        ("tcp:localhost:5760", "tcp", "localhost", 5760),
+        ("tcpout://127.0.0.1:5760", "tcp", "127.0.0.1", 5760),
+        ("serial:/dev/ttyACM0:57600", "serial", "/dev/ttyACM0", 57600),
+        ("serial:///dev/ttyACM0:57600", "serial", "/dev/ttyACM0", 57600),  # MAVSDK
+        ("/dev/ttyACM0,57600", "serial", "/dev/ttyACM0", 57600),  # MAVProxy
+        ("/dev/ttyACM0:57600", "serial", "/dev/ttyACM0", 57600),
+        ("serial:COM3:115200", "serial", "COM3", 115200),
+    ],
+)
+def test_connection_strings_are_read_as_people_type_them(text, kind, host, number):
+    assert parse_connection(text) == Connection(kind, host, number)
+
+
+def test_without_a_host_only_this_machine_is_heard():
+    assert parse_connection("udp:14550").host == "127.0.0.1"
+    assert parse_connection("udp://:14540", listen_anywhere=True).host == "0.0.0.0"
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.2", "[::]", "example.org"])
 def test_nothing_listens_off_loopback_unless_told(host):
     with pytest.raises(OptionError, match="`listen_anywhere`"):
         parse_connection(f"udpin:{host}:14550")
+    with pytest.raises(OptionError, match="`listen_anywhere`"):
+        parse_connection(f"udp://{host}:14550")
     assert parse_connection(f"udpin:{host}:14550", listen_anywhere=True).number == 14550
     assert parse_connection(f"udpout:{host}:14550").kind == "udpout"
 

@@ -226,6 +226,22 @@ def test_what_counts_as_a_bag(tmp_path):
     assert len(BagFrames(next(path.glob("*.mcap"))).names) == 5
 
 
+@pytest.mark.parametrize(("name", "kind"), [("b.mcap", "ros2-mcap"), ("b.db3", "ros2-sqlite3")])
+def test_a_bag_of_ros_2_is_one_file_where_its_name_says_so(tmp_path, name, kind):
+    frames, truth = a_flight(3)
+    path = tmp_path / "deep" / name
+    for replace in (False, True):
+        assert write_bag(path, ((f, None) for f in frames), CAMERA, kind=kind, truth=truth, replace=replace) == 3
+        assert path.is_file()
+        assert list(path.parent.iterdir()) == [path]
+    read = BagFrames(path)
+    for frame, number in zip(frames, read.names, strict=True):
+        np.testing.assert_array_equal(read.read(number), frame.image)
+    other = "ros2-mcap" if kind == "ros2-sqlite3" else "ros2-sqlite3"
+    with pytest.raises(OptionError, match=r"path: expected a name that ends in .* or is a folder's for ros2"):
+        write_bag(tmp_path / name, [], CAMERA, kind=other)
+
+
 def test_misuse_is_named(tmp_path):
     frames, _ = a_flight(1)
     with pytest.raises(OptionError, match="kind: expected one of ros1"):
@@ -300,6 +316,8 @@ def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     assert main(["bag", str(folder), "--out", str(bag)]) == 2
     assert main(["bag", str(folder), "--out", str(bag), "--force"]) == 0
     assert main(["bag", str(folder), "--out", str(tmp_path / "x"), "--format", "ros1"]) == 2
+    assert main(["bag", str(folder), "--out", str(tmp_path / "b.mcap")]) == 0
+    assert (tmp_path / "b.mcap").is_file()
     world = ["--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif")]
     inputs = {
         "folder": ["--frames", str(folder / "frames"), "--telemetry", str(folder / "telemetry.csv"),

@@ -13,11 +13,13 @@ from engine.cli.options import JsonOption
 
 def bag(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Flight folder.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE|DIR", help="The bag; a file X.bag for ros1.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE|DIR", help="One file X.bag, X.mcap or X.db3, or a folder.")
+    ],
     kind: Annotated[
         str | None,
         typer.Option(
-            "--format", metavar="ros1|ros2-sqlite3|ros2-mcap", help="Without it ros1 for X.bag, else ros2-mcap."
+            "--format", metavar="ros1|ros2-sqlite3|ros2-mcap", help="Without it as the file ends, else ros2-mcap."
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a bag that exists.")] = False,

@@ -48,7 +48,7 @@ def mavlink(
         typer.Option(
             "--connect",
             metavar="LINK",
-            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+            help="udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
         ),
     ],
     map_path: MapOption,
@@ -206,6 +206,7 @@ def mavlink_params(
     ] = None,
     max_sigma_m: MaxSigmaOption = 10.0,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Parameters for an autopilot.
 
@@ -223,7 +224,10 @@ def mavlink_params(
         max_sigma_m=max_sigma_m,
         force=force,
     )
-    console.say(f"written to {out}, for a delay of {written.delay_ms} ms ({written.delay_source})")
+    if as_json:
+        console.print_json({"parameters": str(out)} | asdict(written))
+    else:
+        console.say(f"written to {out}, for a delay of {written.delay_ms} ms ({written.delay_source})")
 
 
 def ros(

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from engine.cli import console
+from engine.cli.options import JsonOption
 
 _HEAD = """\
 # Settings of scenematch: every option with its default. Take the # off a key to change it; what stays commented
@@ -19,6 +20,7 @@ _HEAD = """\
 def init(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file.")] = Path("scenematch.toml"),
     force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Settings file with every option.
 
@@ -30,4 +32,7 @@ def init(
 
     check_file(out, force)
     out.write_text(_HEAD + settings_text(TrackSettings()), encoding="utf-8")
-    console.say(f"settings: {out}")
+    if as_json:
+        console.print_json({"settings": str(out)})
+    else:
+        console.say(f"settings: {out}")

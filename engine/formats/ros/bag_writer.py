@@ -32,6 +32,10 @@ from engine.values import Frame, Prior, Truth
 BAG_KINDS = ("ros1", "ros2-sqlite3", "ros2-mcap")
 """Kinds of bags that can be written."""
 
+BAG_FILES = {".bag": "ros1", ".db3": "ros2-sqlite3", ".mcap": "ros2-mcap"}
+"""Kinds of bags by the suffix of the one file that they can be, in lower or upper case."""
+
+_PART_SUFFIXES = (".db3", ".mcap")
 _PARTS = ("metadata.yaml", "*.mcap", "*.db3")  # the files of a ROS 2 bag
 
 Write = Callable[[str, int, Any], None]
@@ -52,7 +56,8 @@ def write_bag(
     The bag is written to a temporary folder and moved into place when complete; until then an older one stays.
 
     Args:
-        path: a file for ros1, a folder for the others.
+        path: a file X.bag for ros1; for the others a folder, or one file X.db3 (ros2-sqlite3) or X.mcap
+            (ros2-mcap), which lacks the folder's metadata.yaml.
         frames: stamped frames with their prior positions, consumed one at a time before ``truth``.
         camera: written with every frame; bags have no message for its mount.
         kind: one of :data:`BAG_KINDS`.
@@ -70,8 +75,7 @@ def write_bag(
     path = Path(path)
     if kind not in BAG_KINDS:
         raise OptionError(f"kind: expected one of {', '.join(BAG_KINDS)}, got {kind!r}")
-    if (path.suffix.lower() == ".bag") != (kind == "ros1"):
-        raise OptionError(f"path: expected a name that ends in .bag for ros1 and for no other kind, got {path}")
+    check_name(path, kind)
     check_replaceable(path, replace)
     count = 0
     with _replaced(path, replace) as unfinished, _bag_writer(path, unfinished, kind) as (write, messages):
@@ -83,6 +87,19 @@ def write_bag(
         for row in truth:
             _write_truth(write, messages, row)
     return count
+
+
+def check_name(path: Path, kind: str) -> None:
+    """Check that the name of a bag goes with its kind.
+
+    Raises:
+        OptionError: the suffix is that of another kind, or a bag of ros1 has none.
+    """
+    of_a_folder = None if kind == "ros1" else kind
+    if BAG_FILES.get(path.suffix.lower(), of_a_folder) != kind:
+        suffix = next(suffix for suffix, each in BAG_FILES.items() if each == kind)
+        wanted = f"a name that ends in {suffix}" + (" or is a folder's" if of_a_folder else "")
+        raise OptionError(f"path: expected {wanted} for {kind}, got {path}")
 
 
 def check_replaceable(path: Path, replace: bool) -> None:
@@ -110,8 +127,11 @@ def _replaced(path: Path, replace: bool) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         # A folder of its own beside the target: the files of a bag contain its name.
         with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
-            unfinished = Path(folder) / path.name
+            is_part = path.suffix.lower() in _PART_SUFFIXES  # of a ROS 2 bag, whose files have the folder's name
+            unfinished = Path(folder) / (path.stem if is_part else path.name)
             yield unfinished
+            if is_part:
+                unfinished = next(unfinished.glob(f"*{path.suffix.lower()}"))
             check_replaceable(path, replace)  # once more: writing takes time
             older = Path(folder) / "older"
             if path.exists():

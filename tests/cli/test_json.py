@@ -1,0 +1,92 @@
+"""With --json standard output holds one JSON value: the result, or what is wrong and of which argument."""
+
+import json
+
+import pytest
+from typer.main import get_command
+
+from engine.cli.app import app, run
+
+
+def leaves(command, path=()):
+    """Every command that can be run, by its words."""
+    if not hasattr(command, "commands"):
+        yield path, command
+        return
+    for name, each in command.commands.items():
+        yield from leaves(each, (*path, name))
+
+
+LEAVES = list(leaves(get_command(app)))
+
+
+@pytest.mark.parametrize("command", [pytest.param(command, id=" ".join(words)) for words, command in LEAVES])
+def test_every_command_takes_json(command):
+    assert any("--json" in option.opts for option in command.params)
+
+
+def spoken(capsys, arguments, code):
+    """The object on standard output, and the line on standard error."""
+    assert run([*arguments, "--json"]) == code
+    printed = capsys.readouterr()
+    assert printed.err.startswith("scenematch: ")
+    found = json.loads(printed.out)
+    assert list(found) == ["error", "argument"]
+    assert printed.err == f"scenematch: {found['error']}\n"
+    return found
+
+
+@pytest.mark.parametrize(
+    ("arguments", "argument", "code"),
+    [
+        (["track"], "--map", 2),  # the first that is missing
+        (["track", "--nonsense"], "--nonsense", 2),
+        (["evaluate"], "DIR", 2),
+        (["nonsense"], None, 2),
+        (["demo", "--frames=x"], "--frames", 2),
+        (["demo", "--frames=1"], "--frames", 2),
+        (["demo", "--device=gpu", "--out=o"], "--device", 2),
+        (["simulate", "--out=o", "--minutes=1"], "--minutes", 2),
+        (["map", "info", "m.tif"], "MAP", 1),
+        (["track", "--map=m.tif", "--frames=f", "--out=o", "--telemetry=no.csv"], "--map", 1),
+        (["evaluate", "nothing/here"], "DIR", 1),
+        (["campaign", "no.toml", "--out=o"], "FILE", 1),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_an_error_names_its_argument(arguments, argument, code, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert spoken(capsys, arguments, code)["argument"] == argument
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "https://tiles.example.org/a[b]/map.tif",
+        "s3://bucket//key",
+        "file:///[red]m[/red].tif",
+        "rtsp://[::1]:8554/x?a=b",
+    ],
+)
+def test_a_url_is_repeated_as_it_was_typed(url, capsys):
+    for arguments in (
+        ["map", "info", url],
+        ["campaign", url, "--out=o"],
+        ["track", f"--map={url}", "--frames=f", "--out=o"],
+        ["track", "--map", url, "--frames=f", "--out=o"],
+    ):
+        assert url in spoken(capsys, arguments, 1)["error"]
+
+
+def test_files_that_commands_write_are_named(tmp_path, capsys):
+    settings = tmp_path / "s.toml"
+    assert run(["init", f"--out={settings}", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert (json.loads(printed.out), printed.err) == ({"settings": str(settings)}, "")
+    assert spoken(capsys, ["init", f"--out={settings}"], 2)["argument"] == "--out"
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    parameters = tmp_path / "p.param"
+    assert run(["bridge", "mavlink-params", f"--out={parameters}", "--delay-ms=90", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "parameters": str(parameters), "delay_ms": 90, "delay_source": "given"
+    }  # fmt: skip
