@@ -138,24 +138,19 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
-        """Read a ROS camera_info YAML file, with an optional ``mount``.
+        """Read a calibration: ROS camera_info, a file of OpenCV's or Kalibr's, with an optional ``mount``.
 
         That is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
 
-        Raises:
-            CalibrationError: the file is missing or not YAML, or a field is missing or invalid.
-        """
-        import yaml
+        Args:
+            path: see :func:`engine.calibration_files.read_calibration`.
 
-        try:
-            content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise CalibrationError(f"camera: no such file: {path}") from None
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            reason = str(error).splitlines()[0]
-            raise CalibrationError(f"camera: {path} is not a readable YAML file: {reason}") from None
-        if not isinstance(content, dict):
-            raise CalibrationError(f"camera: {path} holds no camera_info mapping")
+        Raises:
+            CalibrationError: the file is missing or in no such format, or a field is missing or invalid.
+        """
+        from engine.calibration_files import read_calibration
+
+        content = read_calibration(path)
         try:
             return cls._from_camera_info(content)
         except KeyError as error:

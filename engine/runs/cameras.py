@@ -20,7 +20,7 @@ class CameraFiles:
     """What is said of a camera; None where it is not.
 
     Attributes:
-        calibration: a ROS camera_info YAML file, or a bag that has the calibration.
+        calibration: a file of ROS, OpenCV or Kalibr, or a bag that has the calibration.
         image_topic: of the pictures, where it is a bag with several.
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: a key of :data:`engine.camera.MOUNTS`; None is the calibration's, else nadir.

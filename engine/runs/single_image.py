@@ -48,7 +48,7 @@ def locate_image(
     Args:
         image: the file.
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration, a ROS camera_info YAML file; None takes ``hfov_deg`` or the photograph's EXIF.
+        camera: calibration file of ROS, OpenCV or Kalibr; None takes ``hfov_deg`` or the photograph's EXIF.
         surface: surface model, a GeoTIFF of heights.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
