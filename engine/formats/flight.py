@@ -18,7 +18,7 @@ from engine.formats.logs.readers import AS_LOGGED, LogClock, is_log, open_log, s
 from engine.formats.photos import photo_telemetry
 from engine.formats.resampling import telemetry_at
 from engine.formats.ros.bags import BagFrames, is_bag
-from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
+from engine.formats.telemetry import TelemetryRow, open_telemetry, write_telemetry
 from engine.formats.truth import write_truth
 from engine.geo import wrap_heading_deg
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
@@ -145,7 +145,8 @@ def open_flight(
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
-        rows = read_telemetry(telemetry, source, source.description)
+        table = open_telemetry(telemetry, source, source.description)
+        rows, remarks = table.rows, table.remarks
     elif isinstance(source, VideoFile):
         rows = []
     else:

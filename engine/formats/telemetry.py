@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import TelemetryError
+from engine.formats.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from engine.formats.tables import (
     ANY,
     HALF_TURN,
@@ -24,7 +25,6 @@ from engine.formats.tables import (
     SIGMA,
     CsvRow,
     cell_text,
-    check_increasing,
     known_columns,
     read_table,
     write_table,
@@ -32,7 +32,14 @@ from engine.formats.tables import (
 from engine.geo import wrap_heading_deg
 from engine.values import Prior
 
-__all__ = ["DEFAULT_PRIOR_SIGMA_M", "TelemetryRow", "ground_amsl_m", "read_telemetry", "write_telemetry"]
+__all__ = [
+    "DEFAULT_PRIOR_SIGMA_M",
+    "TelemetryRow",
+    "ground_amsl_m",
+    "open_telemetry",
+    "read_telemetry",
+    "write_telemetry",
+]
 
 DEFAULT_PRIOR_SIGMA_M = 15.0
 """Standard deviation, per axis, of a prior whose ``sigma_m`` is blank: a poor single-frequency GPS position."""
@@ -116,9 +123,29 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
 _REQUIRED = ("timestamp_ns", "frame")
 
 
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What a telemetry.csv holds.
+
+    Attributes:
+        rows: one a frame.
+        remarks: what was recognised and not stated by the file, a sentence each.
+    """
+
+    rows: list[TelemetryRow]
+    remarks: list[str]
+
+
 def read_telemetry(
     path: str | Path, frames: Container[str] | None = None, description: str = "a frame that is there"
 ) -> list[TelemetryRow]:
+    """The rows of :func:`open_telemetry`."""
+    return open_telemetry(path, frames, description).rows
+
+
+def open_telemetry(
+    path: str | Path, frames: Container[str] | None = None, description: str = "a frame that is there"
+) -> Telemetry:
     """Read telemetry.csv; headings are normalised to [0, 360).
 
     Args:
@@ -129,11 +156,13 @@ def read_telemetry(
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
+    optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
+    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS))
+    stamps = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
     line_of_frame: dict[str, int] = {}
-    for csv_row in read_table(path, _REQUIRED, tuple(_BOUNDS)):
-        row = _telemetry_row(csv_row)
-        check_increasing(csv_row, rows[-1].timestamp_ns if rows else None, row.timestamp_ns)
+    for csv_row, stamp_ns in zip(csv_rows, stamps.ns, strict=True):
+        row = _telemetry_row(csv_row, stamp_ns)
         if frames is not None and row.frame not in frames:
             raise csv_row.error("frame", description)
         if row.frame in line_of_frame:
@@ -142,17 +171,17 @@ def read_telemetry(
         rows.append(row)
     if not rows:
         raise TelemetryError(f"{path}: expected one row a frame, got a header and no rows")
-    return rows
+    return Telemetry(rows, [] if stamps.remark is None else [stamps.remark])
 
 
-def _telemetry_row(csv_row: CsvRow) -> TelemetryRow:
+def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
     values = {name: csv_row.number(name, bounds) for name, bounds in _BOUNDS.items()}
     for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
         if values[name] is None and values[other] is not None:
             raise csv_row.error(name, f"a value, as {other} has one")
     if values["heading_deg"] is not None:
         values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
-    return TelemetryRow(timestamp_ns=csv_row.stamp(), frame=csv_row.text("frame"), **values)
+    return TelemetryRow(timestamp_ns=stamp_ns, frame=csv_row.text("frame"), **values)
 
 
 def write_telemetry(path: str | Path, rows: Sequence[TelemetryRow]) -> None:
