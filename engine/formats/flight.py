@@ -114,6 +114,7 @@ def open_flight(
     camera: Camera | None = None,
     clock: LogClock = AS_LOGGED,
     image_topic: str | None = None,
+    columns: Mapping[str, str] = {},
 ) -> Flight:
     """Open a flight and check up front that its parts belong together.
 
@@ -125,6 +126,7 @@ def open_flight(
         camera: checked against the size of the first image.
         clock: capture times of the frames, where the telemetry is a log.
         image_topic: topic of a bag's images; None where there is only one.
+        columns: what a telemetry.csv calls a column, by its name in :data:`engine.formats.telemetry.COLUMNS`.
 
     Returns:
         The flight; no image but the first has been read.
@@ -145,7 +147,7 @@ def open_flight(
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
-        table = open_telemetry(telemetry, source, source.description)
+        table = open_telemetry(telemetry, source, source.description, columns)
         rows, remarks = table.rows, table.remarks
     elif isinstance(source, VideoFile):
         rows = []

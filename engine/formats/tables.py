@@ -167,6 +167,14 @@ def read_table(
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
+def read_header(path: str | Path) -> list[str]:
+    """The columns of a table that :func:`read_table` has read."""
+    with Path(path).open(encoding="utf-8-sig", newline="") as file:
+        delimiter = _delimiter(file.readline())
+        file.seek(0)
+        return [name.strip() for name in next(csv.reader(file, delimiter=delimiter), [])]
+
+
 def _delimiter(line: str) -> str:
     """What separates the names of a header: the most frequent of comma, semicolon and tab."""
     return max((",", ";", "\t"), key=line.count)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import TelemetryError
+from engine.formats.column_names import advice, question
 from engine.formats.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from engine.formats.tables import (
     ANY,
@@ -26,6 +27,7 @@ from engine.formats.tables import (
     CsvRow,
     cell_text,
     known_columns,
+    read_header,
     read_table,
     write_table,
 )
@@ -33,6 +35,7 @@ from engine.geo import wrap_heading_deg
 from engine.values import Prior
 
 __all__ = [
+    "COLUMNS",
     "DEFAULT_PRIOR_SIGMA_M",
     "TelemetryRow",
     "ground_amsl_m",
@@ -121,6 +124,8 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
     ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3
 )
 _REQUIRED = ("timestamp_ns", "frame")
+COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
+"""All columns that telemetry.csv may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +149,10 @@ def read_telemetry(
 
 
 def open_telemetry(
-    path: str | Path, frames: Container[str] | None = None, description: str = "a frame that is there"
+    path: str | Path,
+    frames: Container[str] | None = None,
+    description: str = "a frame that is there",
+    names: Mapping[str, str] = {},
 ) -> Telemetry:
     """Read telemetry.csv; headings are normalised to [0, 360).
 
@@ -152,12 +160,13 @@ def open_telemetry(
         path: the file.
         frames: the frame names that are allowed, or None for any.
         description: those names in words, for messages.
+        names: what the file calls a column, by its name in :data:`COLUMNS`; others have their own names.
 
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
     optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
-    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS))
+    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, advice=advice))
     stamps = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
     line_of_frame: dict[str, int] = {}
@@ -171,7 +180,9 @@ def open_telemetry(
         rows.append(row)
     if not rows:
         raise TelemetryError(f"{path}: expected one row a frame, got a header and no rows")
-    return Telemetry(rows, [] if stamps.remark is None else [stamps.remark])
+    asked = question(read_header(path), names, tuple(_BOUNDS))
+    remarks = [stamps.remark, None if asked is None else f"{Path(path).name}: {asked}"]
+    return Telemetry(rows, [remark for remark in remarks if remark is not None])
 
 
 def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:

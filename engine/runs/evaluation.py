@@ -59,7 +59,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         values = {"method": record.method, "profile": record.profile} | dict(record.changed)
         settings = options_from_mapping(TrackSettings, nested(values))
         files = _recorded_files(record)
-        flight = files.open_flight()
+        flight = files.open_flight(settings.telemetry_columns)
         stamps = [row.timestamp_ns for row in flight.rows]
         recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
         if (stamps, flight.names) != (recorded, [row.frame for row in rows]):

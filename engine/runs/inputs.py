@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -170,9 +170,20 @@ class FlightFiles:
             self.map, self.surface, self.map_sigma_m, bounds=self.map_bounds, crs=self.map_crs, progress=progress
         )
 
-    def open_flight(self) -> Flight:
-        """The frames with what is known of each, corrected."""
-        flight = open_flight(self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic)
+    def open_flight(self, columns: Mapping[str, str] = {}) -> Flight:
+        """The frames with what is known of each, corrected.
+
+        Args:
+            columns: what the telemetry.csv calls a column, by our name for it.
+
+        Raises:
+            OptionError: columns are named, and the telemetry is no table.
+        """
+        if columns and (self.telemetry is None or is_log(self.telemetry)):
+            raise OptionError(f"telemetry_columns: expected a table as telemetry, got {self.telemetry}")
+        flight = open_flight(
+            self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic, columns=columns
+        )
         if self.corrections.changes_nothing:
             return flight
         return replace(flight, rows=self.corrections.applied(flight.rows))
@@ -204,7 +215,9 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
             together, or is of no use to one of the runs.
     """
     site = files.open_map(progress)
-    flight = files.open_flight()
+    flight = files.open_flight(_columns(runs))
+    for remark in flight.remarks:
+        progress.message(remark)
     camera = files.load_camera(flight, progress)
     truth_path = files.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
@@ -224,12 +237,18 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     check_pictures(flight, camera, progress)
     if flight.unused:
         progress.message(f"frames without a row in the telemetry, left out: {flight.unused}")
-    for remark in flight.remarks:
-        progress.message(remark)
     if flight.heights:
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
         progress.message(f"height above ground, by source, of {len(flight)} frames: {counts}")
     return FlightInputs(site, camera, flight, truth_path, truth)
+
+
+def _columns(runs: Sequence[TrackSettings]) -> Mapping[str, str]:
+    """What the telemetry calls its columns, as all runs of a flight say."""
+    for settings in runs:
+        if settings.telemetry_columns != runs[0].telemetry_columns:
+            raise OptionError("telemetry_columns: expected the same of all runs of a flight, got others")
+    return runs[0].telemetry_columns if runs else {}
 
 
 def open_map(

@@ -27,6 +27,7 @@ from engine.cli.options import (
     MapSigmaOption,
     MountOption,
     OptionalCameraOption,
+    SettingsOption,
     StartOption,
     SurfaceOption,
     TelemetryOffsetOption,
@@ -59,6 +60,7 @@ def check(
     truth: Annotated[
         Path | None, typer.Option("--truth", metavar="FILE", help="Positions that the map is held against.")
     ] = None,
+    settings_path: SettingsOption = None,
     start: StartOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
@@ -70,6 +72,7 @@ def check(
     """
     from engine.runs.checking import as_rows, diagnose_flight
     from engine.runs.inputs import FlightFiles
+    from engine.runs.settings import load_settings
 
     use_threads(threads)
     files = FlightFiles(
@@ -78,7 +81,8 @@ def check(
         map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
         corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip
-    found = diagnose_flight(files, start, progress=console.PROGRESS)
+    names = load_settings(settings_path).telemetry_columns
+    found = diagnose_flight(files, start, columns=names, progress=console.PROGRESS)
     if as_json:
         console.print_json(asdict(found))
     else:
