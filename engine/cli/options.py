@@ -50,6 +50,10 @@ CameraPitchOption = Annotated[
     float | None,
     typer.Option("--camera-pitch-deg", metavar="DEG", help="Of the camera: -90 looks straight down."),
 ]
+ScaleCalibrationOption = Annotated[
+    bool,
+    typer.Option("--scale-calibration", help="Scale --camera to pictures of another size and the same shape."),
+]
 MethodOption = Annotated[
     str, typer.Option("--method", metavar="ncc|sift|auto|learned", help="auto is ncc, and sift where ncc refuses.")
 ]

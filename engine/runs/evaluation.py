@@ -90,5 +90,6 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         hfov_deg=record.hfov_deg,
         mount=record.mount,
         camera_pitch_deg=record.camera_pitch_deg,
+        scale_calibration=record.scale_calibration,
         corrections=Corrections.from_facts(record.corrections),
     )

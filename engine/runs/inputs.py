@@ -58,6 +58,7 @@ class FlightFiles:
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: how the camera is mounted, a key of :data:`engine.camera.MOUNTS`; None is the calibration's.
         camera_pitch_deg: of the camera against the vehicle's horizontal, -90 looks straight down.
+        scale_calibration: whether the calibration is scaled to pictures of another size and the same shape.
         corrections: of telemetry that is wrong in a known way.
 
     Raises:
@@ -79,6 +80,7 @@ class FlightFiles:
     hfov_deg: float | None
     mount: str | None
     camera_pitch_deg: float | None
+    scale_calibration: bool
     corrections: Corrections
 
     def __init__(
@@ -99,6 +101,7 @@ class FlightFiles:
         hfov_deg: float | None = None,
         mount: str | None = None,
         camera_pitch_deg: float | None = None,
+        scale_calibration: bool = False,
         corrections: Corrections | None = None,
     ) -> None:
         with renamed_in_errors(offset_s="log_offset_s"):
@@ -124,7 +127,8 @@ class FlightFiles:
         object.__setattr__(self, "image_topic", image_topic)
         values = {
             "map_sigma_m": map_sigma_m, "map_bounds": map_bounds, "map_crs": map_crs, "hfov_deg": hfov_deg,
-            "mount": mount, "camera_pitch_deg": camera_pitch_deg, "corrections": corrections or Corrections(),
+            "mount": mount, "camera_pitch_deg": camera_pitch_deg, "scale_calibration": scale_calibration,
+            "corrections": corrections or Corrections(),
         }  # fmt: skip
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -156,6 +160,7 @@ class FlightFiles:
             hfov_deg=self.hfov_deg,
             mount=self.mount,
             camera_pitch_deg=self.camera_pitch_deg,
+            scale_calibration=self.scale_calibration,
         )
 
     def load_camera(self, flight: Flight, progress: Progress = SILENT) -> Camera:
