@@ -137,7 +137,10 @@ def _check_increasing(rows: Sequence[CsvRow], column: str, values: Sequence[Deci
 
 def _unit(first: CsvRow, column: str, values: Sequence[Decimal], spacing: Decimal) -> str:
     """The column whose unit the values have."""
-    found = [unit for unit in _UNIT_NS if _USUAL_NS[0] <= spacing * _UNIT_NS[unit] <= _USUAL_NS[1]]
+    found = [
+        unit for unit, unit_ns in _UNIT_NS.items()
+        if _USUAL_NS[0] <= spacing * unit_ns <= _USUAL_NS[1] and values[-1] * unit_ns < 2**63
+    ]  # fmt: skip
     utc = [
         unit for unit in found if all(_UTC_NS[0] <= value * _UNIT_NS[unit] < _UTC_NS[1] for value in values)
     ]  # fmt: skip

@@ -104,6 +104,7 @@ REFUSED = {
         "rows 10 apart, which may be milliseconds or seconds: name the column timestamp_ms or",
     ),
     "too dense": ([0, 0.001, 0.002], "rows 0.001 apart, which no unit makes"),
+    "seconds that would not fit": ([10**15, 10**15 + 1], "rows 1 apart, which no unit makes the interval"),
     "a date that is none": (["2026-02-30T00:00:00Z"], "expected a date in UTC such as"),
     "day first": (["01.05.2026 12:00"], "expected a number or a date in UTC, got '01.05.2026 12:00'"),
     "mixed": (["2026-02-03T00:00:00Z", 5], "line 3, timestamp_ns: expected a date in UTC"),
