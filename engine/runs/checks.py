@@ -77,8 +77,8 @@ def check_needs(flight: Flight, method: str, profile: str) -> None:
     needs += ["heading_deg"] if method == "ncc" else []
     if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
         other = "" if profile == "paper" else "; sift and auto do without"
-        asked = " and ".join(needs)
-        raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}")
+        asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)
+        raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}{doubts}")
 
 
 def check_start(start: Prior | None, site: OrthoMap) -> None:

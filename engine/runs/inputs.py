@@ -221,8 +221,6 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     """
     site = files.open_map(progress)
     flight = files.open_flight(_columns(runs))
-    for remark in flight.remarks:
-        progress.message(remark)
     camera = files.load_camera(flight, progress)
     truth_path = files.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
@@ -242,6 +240,8 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     check_pictures(flight, camera, progress)
     if flight.unused:
         progress.message(f"frames without a row in the telemetry, left out: {flight.unused}")
+    for remark in flight.remarks:
+        progress.message(remark)
     if flight.heights:
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
         progress.message(f"height above ground, by source, of {len(flight)} frames: {counts}")

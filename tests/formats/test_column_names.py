@@ -1,5 +1,6 @@
 """Telemetry with the columns of other programs: named in the settings, or guessed and asked."""
 
+import json
 import sqlite3
 
 import numpy as np
@@ -9,6 +10,7 @@ from PIL import Image
 from engine.errors import OptionError, TelemetryError
 from engine.formats.column_names import likely
 from engine.formats.telemetry import open_telemetry
+from engine.formats.settings import changed, nested, options_from_mapping
 from engine.runs.inputs import FlightFiles, open_inputs
 from engine.runs.settings import TrackSettings, load_settings
 
@@ -84,7 +86,10 @@ def test_the_settings_name_them(tmp_path):
     path = tmp_path / "settings.toml"
     lines = "".join(f'{ours} = "{theirs}"\n' for ours, theirs in NAMES.items())
     path.write_text(f'method = "sift"\n[telemetry_columns]\n{lines}', encoding="utf-8")
-    assert load_settings(path).telemetry_columns == NAMES
+    settings = load_settings(path)
+    assert settings.telemetry_columns == NAMES
+    recorded = json.loads(json.dumps(changed(settings)))  # as the record of a run keeps them
+    assert options_from_mapping(TrackSettings, nested(recorded)) == settings
 
 
 @pytest.mark.parametrize(
