@@ -9,8 +9,8 @@ from PIL import Image
 
 from engine.errors import OptionError, TelemetryError
 from engine.formats.column_names import likely
-from engine.formats.telemetry import open_telemetry
 from engine.formats.settings import changed, nested, options_from_mapping
+from engine.formats.telemetry import open_telemetry
 from engine.runs.inputs import FlightFiles, open_inputs
 from engine.runs.settings import TrackSettings, load_settings
 
