@@ -9,7 +9,7 @@ Convention:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -138,24 +138,19 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
-        """Read a ROS camera_info YAML file, with an optional ``mount``.
+        """Read a calibration: ROS camera_info, a file of OpenCV's or Kalibr's, with an optional ``mount``.
 
         That is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
 
-        Raises:
-            CalibrationError: the file is missing or not YAML, or a field is missing or invalid.
-        """
-        import yaml
+        Args:
+            path: see :func:`engine.calibration_files.read_calibration`.
 
-        try:
-            content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise CalibrationError(f"camera: no such file: {path}") from None
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            reason = str(error).splitlines()[0]
-            raise CalibrationError(f"camera: {path} is not a readable YAML file: {reason}") from None
-        if not isinstance(content, dict):
-            raise CalibrationError(f"camera: {path} holds no camera_info mapping")
+        Raises:
+            CalibrationError: the file is missing or in no such format, or a field is missing or invalid.
+        """
+        from engine.calibration_files import read_calibration
+
+        content = read_calibration(path)
         try:
             return cls._from_camera_info(content)
         except KeyError as error:
@@ -204,6 +199,28 @@ class Camera:
             distortion,
             mount.reshape(3, 3),
         )
+
+    def scaled_to(self, width_px: int, height_px: int) -> Camera:
+        """The same camera with its pictures made smaller or larger as a whole, without a part cut off.
+
+        The edges of the frame stay where they are, which are half a pixel outside the outer pixels' centres.
+
+        Args:
+            width_px: columns of the pictures.
+            height_px: rows.
+
+        Raises:
+            CalibrationError: the pictures are of another shape than the calibrated ones.
+        """
+        across, down = width_px / self.width_px, height_px / self.height_px
+        if min(abs(height_px - across * self.height_px), abs(width_px - down * self.width_px)) > 1.0:
+            raise CalibrationError(
+                f"camera: calibrated for {self.width_px} x {self.height_px}, expected pictures of that shape to "
+                f"scale it to, got {width_px} x {height_px}: a part may have been cut off"
+            )
+        matrix = np.diag([across, down, 1.0]) @ self.matrix
+        matrix[:2, 2] += [(across - 1.0) / 2.0, (down - 1.0) / 2.0]
+        return replace(self, width_px=width_px, height_px=height_px, matrix=matrix)
 
     @property
     def focal_px(self) -> float:

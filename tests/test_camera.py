@@ -250,3 +250,34 @@ def test_a_calibration_may_name_its_mount(save):
     ):
         with pytest.raises(CalibrationError, match=words):
             Camera.load(save(INFO + text))
+
+
+# ------------------------------------------------------------------------------------------- another frame size
+
+
+@pytest.mark.parametrize("size", [(320, 240), (1280, 960), (213, 160)])
+def test_a_scaled_camera_sees_the_same_through_the_same_place_of_its_frame(size):
+    lens = camera()
+    scaled = lens.scaled_to(*size)
+    assert (scaled.width_px, scaled.height_px) == size
+    np.testing.assert_array_equal(scaled.distortion, lens.distortion)
+    np.testing.assert_array_equal(scaled.mount, lens.mount)
+    assert np.allclose(scaled.frame_rays, lens.frame_rays, atol=1e-12)
+    assert np.allclose(lens.scaled_to(*size).scaled_to(640, 480).matrix, lens.matrix)
+
+
+@pytest.mark.parametrize(("model", "distortion"), [("plumb_bob", PLUMB_BOB), ("fisheye", FISHEYE)])
+def test_undistortion_of_a_smaller_picture_is_the_smaller_undistorted_picture(model, distortion):
+    lens = camera(model, distortion)
+    image = cv2.GaussianBlur(texture((480, 640)), (0, 0), 4.0)
+    smaller = lens.scaled_to(320, 240).undistort(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA))
+    wanted = cv2.resize(lens.undistort(image), (320, 240), interpolation=cv2.INTER_AREA)
+    assert np.abs(smaller[40:-40, 40:-40].astype(int) - wanted[40:-40, 40:-40]).mean() < 1.0
+    unscaled = camera(model, distortion, matrix=np.array(K) * [0.5, 1, 0.5, 1, 0.5, 0.5, 1, 1, 1])
+    assert not np.allclose(unscaled.matrix, lens.scaled_to(320, 240).matrix)  # the half pixel of the centres
+
+
+@pytest.mark.parametrize("size", [(640, 360), (320, 320), (480, 640)])
+def test_a_frame_of_another_shape_is_not_scaled_to(size):
+    with pytest.raises(CalibrationError, match="calibrated for 640 x 480, expected pictures of that shape"):
+        camera().scaled_to(*size)

@@ -29,11 +29,11 @@ MapCrsOption = Annotated[
     str | None, typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.")
 ]
 CameraOption = Annotated[
-    Path, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
+    Path, typer.Option("--camera", metavar="FILE", help="Calibration: ROS camera_info, OpenCV's or Kalibr's.")
 ]
 OptionalCameraOption = Annotated[
     Path | None,
-    typer.Option("--camera", metavar="FILE", help="Calibration, a YAML file; without it a bag's own, or EXIF."),
+    typer.Option("--camera", metavar="FILE", help="Calibration file; without it a bag's own, or EXIF."),
 ]
 HfovOption = Annotated[
     float | None, typer.Option("--hfov-deg", metavar="DEG", help="Horizontal field of view, without --camera.")
@@ -49,6 +49,10 @@ MountOption = Annotated[
 CameraPitchOption = Annotated[
     float | None,
     typer.Option("--camera-pitch-deg", metavar="DEG", help="Of the camera: -90 looks straight down."),
+]
+ScaleCalibrationOption = Annotated[
+    bool,
+    typer.Option("--scale-calibration", help="Scale --camera to pictures of another size and the same shape."),
 ]
 MethodOption = Annotated[
     str, typer.Option("--method", metavar="ncc|sift|auto|learned", help="auto is ncc, and sift where ncc refuses.")

@@ -18,7 +18,7 @@ from engine.formats.logs.readers import AS_LOGGED, LogClock, is_log, open_log, s
 from engine.formats.photos import photo_telemetry
 from engine.formats.resampling import telemetry_at
 from engine.formats.ros.bags import BagFrames, is_bag
-from engine.formats.telemetry import TelemetryRow, read_telemetry, write_telemetry
+from engine.formats.telemetry import TelemetryRow, open_telemetry, write_telemetry
 from engine.formats.truth import write_truth
 from engine.geo import wrap_heading_deg
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
@@ -114,6 +114,7 @@ def open_flight(
     camera: Camera | None = None,
     clock: LogClock = AS_LOGGED,
     image_topic: str | None = None,
+    columns: Mapping[str, str] = {},
 ) -> Flight:
     """Open a flight and check up front that its parts belong together.
 
@@ -125,6 +126,7 @@ def open_flight(
         camera: checked against the size of the first image.
         clock: capture times of the frames, where the telemetry is a log.
         image_topic: topic of a bag's images; None where there is only one.
+        columns: what a telemetry.csv calls a column, by its name in :data:`engine.formats.telemetry.COLUMNS`.
 
     Returns:
         The flight; no image but the first has been read.
@@ -145,7 +147,8 @@ def open_flight(
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
-        rows = read_telemetry(telemetry, source, source.description)
+        table = open_telemetry(telemetry, source, source.description, columns)
+        rows, remarks = table.rows, table.remarks
     elif isinstance(source, VideoFile):
         rows = []
     else:

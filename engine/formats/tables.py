@@ -2,8 +2,8 @@
 
 Convention:
     A blank cell is unknown; columns that were not requested are ignored. A byte order mark and either line ending
-    are accepted. A message names the file, the line in the file (the header is line 1), the column, what was
-    expected and what came.
+    are accepted, and semicolons or tabs in place of the commas, with a comma as the decimal mark. A message names
+    the file, the line in the file (the header is line 1), the column, what was expected and what came.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from engine.values import MAX_SIGMA_M
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_DECIMAL = re.compile(r"[+-]?[0-9]*([.,])[0-9]+([eE][+-]?[0-9]+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +117,24 @@ def quoted(text: str) -> str:
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
 
 
-def read_table(path: str | Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[CsvRow]:
+def read_table(
+    path: str | Path,
+    required: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    instead: Mapping[str, Sequence[str]] = {},
+    names: Mapping[str, str] = {},
+    advice: Callable[[str, Sequence[str]], str] | None = None,
+) -> Iterator[CsvRow]:
     """Read the rows of a CSV file with a header.
 
     Args:
         path: the file.
         required: columns that the header must contain.
         optional: columns that it may contain.
+        instead: for a required column, the optional ones of which any will do in its place.
+        names: what the file calls a column, where that is not its name here.
+        advice: what a message adds about a required column that is missing, given the file's columns.
 
     Yields:
         One :class:`CsvRow` per row that is not blank, with all of ``required`` and ``optional`` as keys.
@@ -134,11 +146,15 @@ def read_table(path: str | Path, required: Sequence[str], optional: Sequence[str
     path = Path(path)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            columns = _header(path, reader, required, optional)
+            delimiter = _delimiter(file.readline())
+            file.seek(0)
+            reader = csv.reader(file, delimiter=delimiter)
+            header = _Header(path, [name.strip() for name in next(reader, [])], names)
+            columns = header.columns(required, optional, instead, advice)
+            marks = None if delimiter == "," else _Marks(path)
             for row in reader:
                 if any(cell.strip() for cell in row):
-                    yield _cells(path, reader.line_num, row, columns)
+                    yield _cells(path, reader.line_num, row, columns, marks)
     except FileNotFoundError:
         raise TelemetryError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
@@ -151,47 +167,97 @@ def read_table(path: str | Path, required: Sequence[str], optional: Sequence[str
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
+def read_header(path: str | Path) -> list[str]:
+    """The columns of a table that :func:`read_table` has read."""
+    with Path(path).open(encoding="utf-8-sig", newline="") as file:
+        delimiter = _delimiter(file.readline())
+        file.seek(0)
+        return [name.strip() for name in next(csv.reader(file, delimiter=delimiter), [])]
+
+
+def _delimiter(line: str) -> str:
+    """What separates the names of a header: the most frequent of comma, semicolon and tab."""
+    return max((",", ";", "\t"), key=line.count)
+
+
 @dataclass(frozen=True, slots=True)
 class _Columns:
     count: int
     index: Mapping[str, int | None]
 
 
-def _header(path: Path, reader: Iterator[list[str]], required: Sequence[str], optional: Sequence[str]) -> _Columns:
-    names = [name.strip() for name in next(reader, [])]
-    if not any(names):
-        raise TelemetryError(f"{path}: expected a header with {', '.join(required)}, got an empty first line")
-    for column in (*required, *optional):
-        if names.count(column) > 1:
+@dataclass(frozen=True, slots=True)
+class _Header:
+    path: Path
+    found: Sequence[str]
+    names: Mapping[str, str]
+
+    def columns(
+        self,
+        required: Sequence[str],
+        optional: Sequence[str],
+        instead: Mapping[str, Sequence[str]],
+        advice: Callable[[str, Sequence[str]], str] | None,
+    ) -> _Columns:
+        """Where the columns stand in a row."""
+        if not any(self.found):
             raise TelemetryError(
-                f"{path}: line 1, {column}: expected the column once, got it {names.count(column)} times"
+                f"{self.path}: expected a header with {', '.join(required)}, got an empty first line"
             )
-    for column in required:
-        if column not in names:
+        index = {column: self._place(column) for column in (*required, *optional)}
+        for column in required:
+            if all(index[name] is None for name in (column, *instead.get(column, ()))):
+                more = advice(column, self.found) if advice is not None else ""
+                raise TelemetryError(
+                    f"{self.path}: line 1: lacks the column {column}{more}; "
+                    f"its columns are {quoted(','.join(self.found))}"
+                )
+        return _Columns(len(self.found), index)
+
+    def _place(self, column: str) -> int | None:
+        name = self.names.get(column, column)
+        count = self.found.count(name)
+        if count > 1:
+            raise TelemetryError(f"{self.path}: line 1, {name}: expected the column once, got it {count} times")
+        if not count and column in self.names:
             raise TelemetryError(
-                f"{path}: line 1: lacks the column {column}; its columns are {quoted(','.join(names))}"
+                f"{self.path}: line 1: lacks the column {name}, which is to be {column}; "
+                f"its columns are {quoted(','.join(self.found))}"
             )
-    index = {column: names.index(column) if column in names else None for column in (*required, *optional)}
-    return _Columns(len(names), index)
+        return self.found.index(name) if count else None
 
 
-def _cells(path: Path, line: int, row: list[str], columns: _Columns) -> CsvRow:
+@dataclass(slots=True)
+class _Marks:
+    """The decimal mark of a table without commas between its cells: one for all its numbers."""
+
+    path: Path
+    first: dict[str, str] = field(default_factory=dict)
+
+    def pointed(self, line: int, cell: str) -> str:
+        """A cell, with a decimal point if it is a number with a comma."""
+        found = _DECIMAL.fullmatch(cell)
+        if found is None:
+            return cell
+        self.first.setdefault(found[1], cell)
+        if len(self.first) > 1:
+            raise TelemetryError(
+                f"{self.path}: line {line}: expected one decimal mark, got {quoted(self.first[','])} and "
+                f"{quoted(self.first['.'])}"
+            )
+        return cell.replace(",", ".")
+
+
+def _cells(path: Path, line: int, row: list[str], columns: _Columns, marks: _Marks | None) -> CsvRow:
     # Spreadsheets append commas to lines; a cell with content must have a column.
     if len(row) < columns.count or any(cell.strip() for cell in row[columns.count :]):
         raise TelemetryError(
             f"{path}: line {line}: expected {columns.count} cells as in the header, got {len(row)}"
         )
-    return CsvRow(path, line, {name: "" if i is None else row[i].strip() for name, i in columns.index.items()})
-
-
-def check_increasing(csv_row: CsvRow, previous_ns: int | None, stamp_ns: int) -> None:
-    """Check that a row's stamp is later than that of the row before.
-
-    Raises:
-        TelemetryError: the stamp repeats or goes back.
-    """
-    if previous_ns is not None and stamp_ns <= previous_ns:
-        raise csv_row.error("timestamp_ns", f"a stamp later than the row before ({previous_ns})")
+    values = {name: "" if i is None else row[i].strip() for name, i in columns.index.items()}
+    if marks is not None:
+        values = {name: marks.pointed(line, cell) for name, cell in values.items()}
+    return CsvRow(path, line, values)
 
 
 def known_columns(rows: Sequence[Any], required: Sequence[str], optional: Sequence[str]) -> list[str]:

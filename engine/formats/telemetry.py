@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import TelemetryError
+from engine.formats.column_names import advice, question
+from engine.formats.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from engine.formats.tables import (
     ANY,
     HALF_TURN,
@@ -24,15 +26,23 @@ from engine.formats.tables import (
     SIGMA,
     CsvRow,
     cell_text,
-    check_increasing,
     known_columns,
+    read_header,
     read_table,
     write_table,
 )
 from engine.geo import wrap_heading_deg
 from engine.values import Prior
 
-__all__ = ["DEFAULT_PRIOR_SIGMA_M", "TelemetryRow", "ground_amsl_m", "read_telemetry", "write_telemetry"]
+__all__ = [
+    "COLUMNS",
+    "DEFAULT_PRIOR_SIGMA_M",
+    "TelemetryRow",
+    "ground_amsl_m",
+    "open_telemetry",
+    "read_telemetry",
+    "write_telemetry",
+]
 
 DEFAULT_PRIOR_SIGMA_M = 15.0
 """Standard deviation, per axis, of a prior whose ``sigma_m`` is blank: a poor single-frequency GPS position."""
@@ -114,26 +124,54 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
     ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3
 )
 _REQUIRED = ("timestamp_ns", "frame")
+COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
+"""All columns that telemetry.csv may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What a telemetry.csv holds.
+
+    Attributes:
+        rows: one a frame.
+        remarks: what was recognised and not stated by the file, a sentence each.
+    """
+
+    rows: list[TelemetryRow]
+    remarks: list[str]
 
 
 def read_telemetry(
     path: str | Path, frames: Container[str] | None = None, description: str = "a frame that is there"
 ) -> list[TelemetryRow]:
+    """The rows of :func:`open_telemetry`."""
+    return open_telemetry(path, frames, description).rows
+
+
+def open_telemetry(
+    path: str | Path,
+    frames: Container[str] | None = None,
+    description: str = "a frame that is there",
+    names: Mapping[str, str] = {},
+) -> Telemetry:
     """Read telemetry.csv; headings are normalised to [0, 360).
 
     Args:
         path: the file.
         frames: the frame names that are allowed, or None for any.
         description: those names in words, for messages.
+        names: what the file calls a column, by its name in :data:`COLUMNS`; others have their own names.
 
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
+    optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
+    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, advice=advice))
+    stamps = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
     line_of_frame: dict[str, int] = {}
-    for csv_row in read_table(path, _REQUIRED, tuple(_BOUNDS)):
-        row = _telemetry_row(csv_row)
-        check_increasing(csv_row, rows[-1].timestamp_ns if rows else None, row.timestamp_ns)
+    for csv_row, stamp_ns in zip(csv_rows, stamps.ns, strict=True):
+        row = _telemetry_row(csv_row, stamp_ns)
         if frames is not None and row.frame not in frames:
             raise csv_row.error("frame", description)
         if row.frame in line_of_frame:
@@ -142,17 +180,19 @@ def read_telemetry(
         rows.append(row)
     if not rows:
         raise TelemetryError(f"{path}: expected one row a frame, got a header and no rows")
-    return rows
+    asked = question(read_header(path), names, tuple(_BOUNDS))
+    remarks = [stamps.remark, None if asked is None else f"{Path(path).name}: {asked}"]
+    return Telemetry(rows, [remark for remark in remarks if remark is not None])
 
 
-def _telemetry_row(csv_row: CsvRow) -> TelemetryRow:
+def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
     values = {name: csv_row.number(name, bounds) for name, bounds in _BOUNDS.items()}
     for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
         if values[name] is None and values[other] is not None:
             raise csv_row.error(name, f"a value, as {other} has one")
     if values["heading_deg"] is not None:
         values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
-    return TelemetryRow(timestamp_ns=csv_row.stamp(), frame=csv_row.text("frame"), **values)
+    return TelemetryRow(timestamp_ns=stamp_ns, frame=csv_row.text("frame"), **values)
 
 
 def write_telemetry(path: str | Path, rows: Sequence[TelemetryRow]) -> None:

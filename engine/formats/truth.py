@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from engine.errors import TelemetryError
+from engine.formats.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from engine.formats.tables import (
     ANY,
     HALF_TURN,
@@ -14,7 +15,6 @@ from engine.formats.tables import (
     LONGITUDE,
     QUARTER_TURN,
     cell_text,
-    check_increasing,
     known_columns,
     read_table,
     write_table,
@@ -46,9 +46,8 @@ def read_truth(path: str | Path) -> list[Truth]:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
     rows: list[Truth] = []
-    for csv_row in read_table(path, _REQUIRED, tuple(_OPTIONAL)):
-        stamp_ns = csv_row.stamp()
-        check_increasing(csv_row, rows[-1].timestamp_ns if rows else None, stamp_ns)
+    csv_rows = list(read_table(path, _REQUIRED, (*STAMP_COLUMNS[1:], *_OPTIONAL), instead=OTHER_STAMPS))
+    for csv_row, stamp_ns in zip(csv_rows, read_stamps(csv_rows).ns, strict=True):
         values = {name: csv_row.number(name, bounds) for name, bounds in _OPTIONAL.items()}
         if values["heading_deg"] is not None:
             values["heading_deg"] = wrap_heading_deg(values["heading_deg"])

@@ -27,6 +27,8 @@ SIGNATURES = (
     ("MBTiles", (b"SQLite format 3\0",)),
 )
 """GDAL drivers and the signatures of their files; the ending of a file's name does not count."""
+_GEOPACKAGE = slice(68, 72), (b"GPKG", b"GP10", b"GP11")
+"""Where an SQLite file says that it is a GeoPackage, and how."""
 NO_TILES = (".ovr", ".msk", ".aux", ".part")
 """Endings of side files and partial files, which are not tiles of a folder."""
 OWN_TAGS = "SCENEMATCH_"
@@ -85,10 +87,10 @@ def driver_of(file: Path, argument: str) -> str:
         head = stream.read(1024)
     for driver, starts in SIGNATURES:
         if head.startswith(starts):
-            return driver
+            return "GPKG" if driver == "MBTiles" and head[_GEOPACKAGE[0]] in _GEOPACKAGE[1] else driver
     if _VRT_HEAD in head:
         return "VRT"
-    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "VRT"])
+    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG", "VRT"])
     raise MapError(f"{argument}: expected a raster file of {formats}; {file} is neither")
 
 
@@ -101,7 +103,25 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
     driver = driver_of(path, argument)
+    if driver == "GPKG":
+        _check_geopackage(path, argument)
     return (_vrt_of_file(path, argument), driver) if driver == "VRT" else (path, driver)
+
+
+def _check_geopackage(file: Path, argument: str) -> None:
+    """Refuse a GeoPackage without a raster, or with several, of which GDAL would open none."""
+    import sqlite3
+    from contextlib import closing
+
+    kinds = "'tiles', '2d-gridded-coverage'"
+    try:
+        with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
+            found = base.execute(f"SELECT table_name FROM gpkg_contents WHERE data_type IN ({kinds})").fetchall()
+    except sqlite3.Error as error:
+        raise MapError(f"{argument}: cannot read {file}: {error}") from None
+    if len(found) != 1:
+        names = ", ".join(str(name) for (name,) in found) or "none"
+        raise MapError(f"{argument}: expected a GeoPackage with one raster, got {names} in {file}")
 
 
 # ------------------------------------------------------------------------------------------ a folder of tiles
@@ -147,7 +167,7 @@ def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
                 found.append((file, driver_of(file, "")))
             except MapError:
                 continue  # a licence, a world file, an index: not every file is a tile
-    return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles")]
+    return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles", "GPKG")]
 
 
 def _read_tile(file: Path, driver: str, argument: str) -> _Tile:

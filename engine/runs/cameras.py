@@ -20,14 +20,16 @@ class CameraFiles:
     """What is said of a camera; None where it is not.
 
     Attributes:
-        calibration: a ROS camera_info YAML file, or a bag that has the calibration.
+        calibration: a file of ROS, OpenCV or Kalibr, or a bag that has the calibration.
         image_topic: of the pictures, where it is a bag with several.
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: a key of :data:`engine.camera.MOUNTS`; None is the calibration's, else nadir.
         camera_pitch_deg: of the optical axis, -90 looks straight down.
+        scale_calibration: whether the calibration is scaled to pictures of another size and the same shape.
 
     Raises:
-        OptionError: there is a field of view besides a calibration, or a value is out of range.
+        OptionError: there is a field of view besides a calibration, or a value is out of range, or there is no
+            calibration to scale.
     """
 
     calibration: Path | None = None
@@ -35,8 +37,11 @@ class CameraFiles:
     hfov_deg: float | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
+    scale_calibration: bool = False
 
     def __post_init__(self) -> None:
+        if self.scale_calibration and self.calibration is None:
+            raise OptionError("scale_calibration: expected with `camera`, a calibration to scale")
         if self.hfov_deg is not None and self.calibration is not None and not is_bag(self.calibration):
             raise OptionError("hfov_deg: expected without `camera`, which has its own field of view")
         if self.hfov_deg is not None and not 0.0 < self.hfov_deg < 180.0:
@@ -77,10 +82,11 @@ class CameraFiles:
         if self.hfov_deg is not None and frames is not None:
             height_px, width_px = frames.read(frames.names[0]).shape[:2]
             return self.mounted(Camera.from_fov(width_px, height_px, self.hfov_deg))
-        if self.calibration is not None and is_bag(self.calibration):
-            return self.mounted(read_bag_camera(self.calibration, self.image_topic))
         if self.calibration is not None:
-            return self.mounted(Camera.load(self.calibration))
+            camera = self._calibrated(self.calibration)
+            if self.scale_calibration and frames is not None:
+                camera = _scaled(camera, frames.read((names or frames.names)[0]).shape, progress)
+            return self.mounted(camera)
         if not isinstance(frames, PictureFolder):
             raise CalibrationError("camera: expected a calibration, or `hfov_deg`: only photographs say theirs")
         try:
@@ -90,3 +96,31 @@ class CameraFiles:
         wide_deg = math.degrees(2.0 * math.atan(found.camera.width_px / (2.0 * found.camera.matrix[0, 0])))
         progress.message(f"camera, by {found.source} of the photographs: {wide_deg:.1f} degrees wide")
         return self.mounted(found.camera)
+
+    def _calibrated(self, path: Path) -> Camera:
+        return read_bag_camera(path, self.image_topic) if is_bag(path) else Camera.load(path)
+
+
+def _scaled(camera: Camera, shape: tuple[int, ...], progress: Progress) -> Camera:
+    height_px, width_px = shape[:2]
+    if (width_px, height_px) == (camera.width_px, camera.height_px):
+        return camera
+    progress.message(
+        f"the calibration for {camera.width_px} x {camera.height_px} is scaled to pictures of "
+        f"{width_px} x {height_px}"
+    )
+    return camera.scaled_to(width_px, height_px)
+
+
+def check_size(camera: Camera, shape: tuple[int, ...]) -> None:
+    """Refuse a picture of another size than the calibration's, with the argument that scales it.
+
+    Raises:
+        CalibrationError: the sizes differ.
+    """
+    try:
+        camera.check_size(shape)
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{error}; if the pictures were made smaller or larger as a whole, `scale_calibration`"
+        ) from None

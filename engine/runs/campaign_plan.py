@@ -53,6 +53,7 @@ class RecordedFlight:
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: how the camera is mounted, by name.
         camera_pitch_deg: of the camera, -90 looks straight down.
+        scale_calibration: whether the calibration is scaled to pictures of another size and the same shape.
         group: flights of one group are pooled in the table; without it those of a published data set are, and any
             other flight is a group of its own.
     """
@@ -73,6 +74,7 @@ class RecordedFlight:
     hfov_deg: float | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
+    scale_calibration: bool = False
     group: str | None = None
 
     def __post_init__(self) -> None:
@@ -117,6 +119,7 @@ class RecordedFlight:
                 hfov_deg=self.hfov_deg,
                 mount=self.mount,
                 camera_pitch_deg=self.camera_pitch_deg,
+                scale_calibration=self.scale_calibration,
             )
         except OptionError as error:
             raise OptionError(f"flights.{name}: {error}") from None
@@ -283,7 +286,10 @@ def _input_hashes(files: FlightFiles) -> dict[str, str]:
     paths = {name: getattr(files, name) for name in (*FOLDER_LAYOUT, "frame_stamps")}
     hashes = {name: _content_hash(path) for name, path in paths.items() if path is not None}
     values = {name: getattr(files, name) for name in _VALUES}
-    values["log_offset_s"] = files.log_offset_s or None
+    values["log_offset_s"], values["scale_calibration"] = (
+        files.log_offset_s or None,
+        files.scale_calibration or None,
+    )
     return hashes | {name: repr(value) for name, value in values.items() if value is not None}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from engine.diagnosis import Diagnosis, diagnose
 from engine.errors import OptionError
 from engine.formats.truth import interpolate_truth
@@ -19,6 +21,7 @@ def diagnose_flight(
     files: FlightFiles,
     start: str | None = None,
     *,
+    columns: Mapping[str, str] = {},
     inputs: FlightInputs | None = None,
     progress: Progress = SILENT,
 ) -> Diagnosis:
@@ -27,6 +30,7 @@ def diagnose_flight(
     Args:
         files: of the flight.
         start: where it begins, "LAT,LON" or "LAT,LON,SIGMA_M"; None takes the telemetry's positions.
+        columns: what the telemetry.csv calls a column, by our name for it.
         inputs: what :func:`engine.runs.inputs.open_inputs` read of the files.
         progress: is shown what is read.
 
@@ -36,7 +40,8 @@ def diagnose_flight(
     Raises:
         OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is not as expected.
     """
-    inputs = inputs or open_inputs(files, [TrackSettings(method="sift", start=start)], progress=progress)
+    settings = TrackSettings(method="sift", start=start, telemetry_columns=dict(columns))
+    inputs = inputs or open_inputs(files, [settings], progress=progress)
     begin = parse_position("start", start)
     flight = inputs.flight
     if not len(flight):

@@ -11,6 +11,7 @@ from engine.errors import CalibrationError, OptionError, TelemetryError
 from engine.formats.flight import Flight
 from engine.formats.frames import PictureFolder
 from engine.orthomap import OrthoMap
+from engine.runs.cameras import check_size
 from engine.runs.progress import SILENT, Progress
 from engine.values import Prior
 
@@ -24,13 +25,13 @@ def check_pictures(flight: Flight, camera: Camera, progress: Progress = SILENT) 
     """
     source = flight.source
     if not isinstance(source, PictureFolder):
-        camera.check_size(source.read(flight.names[0]).shape)
+        check_size(camera, source.read(flight.names[0]).shape)
         return
     for name in progress.track(flight.names, len(flight), "checking pictures"):
         path = source.path / name
         size = _decoded_size(str(path))
         try:
-            camera.check_size((size[1], size[0]))
+            check_size(camera, (size[1], size[0]))
         except CalibrationError as error:
             raise CalibrationError(f"{path}: {error}") from None
 
@@ -76,8 +77,8 @@ def check_needs(flight: Flight, method: str, profile: str) -> None:
     needs += ["heading_deg"] if method == "ncc" else []
     if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
         other = "" if profile == "paper" else "; sift and auto do without"
-        asked = " and ".join(needs)
-        raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}")
+        asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)
+        raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}{doubts}")
 
 
 def check_start(start: Prior | None, site: OrthoMap) -> None:

@@ -59,7 +59,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         values = {"method": record.method, "profile": record.profile} | dict(record.changed)
         settings = options_from_mapping(TrackSettings, nested(values))
         files = _recorded_files(record)
-        flight = files.open_flight()
+        flight = files.open_flight(settings.telemetry_columns)
         stamps = [row.timestamp_ns for row in flight.rows]
         recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
         if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
@@ -90,5 +90,6 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         hfov_deg=record.hfov_deg,
         mount=record.mount,
         camera_pitch_deg=record.camera_pitch_deg,
+        scale_calibration=record.scale_calibration,
         corrections=Corrections.from_facts(record.corrections),
     )

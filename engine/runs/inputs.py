@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,7 @@ class FlightFiles:
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: how the camera is mounted, a key of :data:`engine.camera.MOUNTS`; None is the calibration's.
         camera_pitch_deg: of the camera against the vehicle's horizontal, -90 looks straight down.
+        scale_calibration: whether the calibration is scaled to pictures of another size and the same shape.
         corrections: of telemetry that is wrong in a known way.
 
     Raises:
@@ -79,6 +80,7 @@ class FlightFiles:
     hfov_deg: float | None
     mount: str | None
     camera_pitch_deg: float | None
+    scale_calibration: bool
     corrections: Corrections
 
     def __init__(
@@ -99,6 +101,7 @@ class FlightFiles:
         hfov_deg: float | None = None,
         mount: str | None = None,
         camera_pitch_deg: float | None = None,
+        scale_calibration: bool = False,
         corrections: Corrections | None = None,
     ) -> None:
         with renamed_in_errors(offset_s="log_offset_s"):
@@ -124,7 +127,8 @@ class FlightFiles:
         object.__setattr__(self, "image_topic", image_topic)
         values = {
             "map_sigma_m": map_sigma_m, "map_bounds": map_bounds, "map_crs": map_crs, "hfov_deg": hfov_deg,
-            "mount": mount, "camera_pitch_deg": camera_pitch_deg, "corrections": corrections or Corrections(),
+            "mount": mount, "camera_pitch_deg": camera_pitch_deg, "scale_calibration": scale_calibration,
+            "corrections": corrections or Corrections(),
         }  # fmt: skip
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -156,6 +160,7 @@ class FlightFiles:
             hfov_deg=self.hfov_deg,
             mount=self.mount,
             camera_pitch_deg=self.camera_pitch_deg,
+            scale_calibration=self.scale_calibration,
         )
 
     def load_camera(self, flight: Flight, progress: Progress = SILENT) -> Camera:
@@ -170,9 +175,20 @@ class FlightFiles:
             self.map, self.surface, self.map_sigma_m, bounds=self.map_bounds, crs=self.map_crs, progress=progress
         )
 
-    def open_flight(self) -> Flight:
-        """The frames with what is known of each, corrected."""
-        flight = open_flight(self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic)
+    def open_flight(self, columns: Mapping[str, str] = {}) -> Flight:
+        """The frames with what is known of each, corrected.
+
+        Args:
+            columns: what the telemetry.csv calls a column, by our name for it.
+
+        Raises:
+            OptionError: columns are named, and the telemetry is no table.
+        """
+        if columns and (self.telemetry is None or is_log(self.telemetry)):
+            raise OptionError(f"telemetry_columns: expected a table as telemetry, got {self.telemetry}")
+        flight = open_flight(
+            self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic, columns=columns
+        )
         if self.corrections.changes_nothing:
             return flight
         return replace(flight, rows=self.corrections.applied(flight.rows))
@@ -204,7 +220,7 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
             together, or is of no use to one of the runs.
     """
     site = files.open_map(progress)
-    flight = files.open_flight()
+    flight = files.open_flight(_columns(runs))
     camera = files.load_camera(flight, progress)
     truth_path = files.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
@@ -230,6 +246,14 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
         progress.message(f"height above ground, by source, of {len(flight)} frames: {counts}")
     return FlightInputs(site, camera, flight, truth_path, truth)
+
+
+def _columns(runs: Sequence[TrackSettings]) -> Mapping[str, str]:
+    """What the telemetry calls its columns, as all runs of a flight say."""
+    for settings in runs:
+        if settings.telemetry_columns != runs[0].telemetry_columns:
+            raise OptionError("telemetry_columns: expected the same of all runs of a flight, got others")
+    return runs[0].telemetry_columns if runs else {}
 
 
 def open_map(

@@ -40,6 +40,7 @@ class RunRecord:
         hfov_deg: horizontal field of view.
         mount: of the camera, by name.
         camera_pitch_deg: of the camera.
+        scale_calibration: whether the calibration was scaled to the pictures.
         corrections: of the telemetry, by name; None without any.
         heights: frames by the source of their height, where the telemetry is a log or the photographs' own.
         method: "ncc", "sift", "auto" or "learned".
@@ -75,6 +76,7 @@ class RunRecord:
     hfov_deg: float | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
+    scale_calibration: bool = False
     corrections: Mapping[str, Any] | None = None
     heights: Mapping[str, int] = field(default_factory=dict)
     method: str
@@ -102,6 +104,7 @@ class RunRecord:
         self._check(("attitude",), "a table or null", lambda value: value is None or _is_table(value, object))
         self._check(("diagnosis",), "sentences or null", lambda value: value is None or _is_table(value, str))
 
+        self._check(("scale_calibration",), "true or false", lambda value: isinstance(value, bool))
         self._check(("corrections",), "corrections of the telemetry or null", _are_corrections)
 
     def _check(self, names: tuple[str, ...], expected: str, holds: Callable[[object], bool]) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from engine.errors import OptionError
 from engine.formats.settings import read_settings
+from engine.formats.telemetry import COLUMNS
 from engine.methods import METHODS
 from engine.methods.options import PROFILES, LearnedOptions, MatcherOptions, NccOptions, SiftOptions
 from engine.navigator_options import NavigatorOptions
@@ -27,6 +28,8 @@ class TrackSettings:
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none takes the first
             position of the telemetry, and where that has none the whole map is searched.
         budget_ms: time that one frame may take, later answers are refused; none does not hurry.
+        telemetry_columns: what a telemetry.csv calls its columns, by our name: timestamp_us = "time",
+            height_agl_m = "alt". A table, [telemetry_columns]; columns that are not in it have our names.
         ncc: settings of the NCC method.
         sift: settings of the SIFT method, and of what learned matches become.
         learned: settings of the learned method, its weights among them.
@@ -42,6 +45,7 @@ class TrackSettings:
     device: str = "auto"
     start: str | None = None
     budget_ms: float | None = None
+    telemetry_columns: dict[str, str] = field(default_factory=dict)
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
     learned: LearnedOptions = field(default_factory=LearnedOptions)
@@ -52,9 +56,16 @@ class TrackSettings:
         check_choice("profile", self.profile, PROFILES)
         if self.profile == "paper" and self.method not in ("ncc", "sift"):
             raise OptionError(f"method: expected ncc or sift with `profile` paper, got {self.method!r}")
+        self._check_columns()
         parse_position("start", self.start)
         parse_budget("budget_ms", self.budget_ms)
         check_device(self.device)
+
+    def _check_columns(self) -> None:
+        for name, theirs in self.telemetry_columns.items():
+            check_choice("telemetry_columns", name, COLUMNS)
+            if not theirs.strip():
+                raise OptionError(f"telemetry_columns.{name}: expected the name of a column, got a blank one")
 
     def matcher_options(self) -> MatcherOptions:
         """What of it is the matcher's."""

@@ -12,7 +12,7 @@ from engine.matcher import SceneMatcher
 from engine.methods import METHODS
 from engine.methods.options import MatcherOptions
 from engine.runs.arguments import check_choice, check_device, parse_position
-from engine.runs.cameras import CameraFiles
+from engine.runs.cameras import CameraFiles, check_size
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
@@ -33,6 +33,7 @@ def locate_image(
     hfov_deg: float | None = None,
     mount: str | None = None,
     camera_pitch_deg: float | None = None,
+    scale_calibration: bool = False,
     height_agl_m: float | None = None,
     heading_deg: float | None = None,
     roll_deg: float | None = None,
@@ -48,7 +49,7 @@ def locate_image(
     Args:
         image: the file.
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration, a ROS camera_info YAML file; None takes ``hfov_deg`` or the photograph's EXIF.
+        camera: calibration file of ROS, OpenCV or Kalibr; None takes ``hfov_deg`` or the photograph's EXIF.
         surface: surface model, a GeoTIFF of heights.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
@@ -56,6 +57,7 @@ def locate_image(
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: how the camera is mounted, by name; None is the calibration's, else nadir.
         camera_pitch_deg: of the camera, -90 looks straight down.
+        scale_calibration: to a picture of another size and the same shape.
         height_agl_m: above the ground; None is unknown, as of the next three.
         heading_deg: clockwise from true north.
         roll_deg: right side down.
@@ -83,12 +85,13 @@ def locate_image(
         hfov_deg=hfov_deg,
         mount=mount,
         camera_pitch_deg=camera_pitch_deg,
+        scale_calibration=scale_calibration,
     )
     site = open_map(map, surface, map_sigma_m, bounds=map_bounds, crs=map_crs, progress=progress)
     calibration = described.load(open_frames(image), progress=progress)
     check_position("near", prior, site, OptionError)
     pixels = read_image(image)
-    calibration.check_size(pixels.shape)
+    check_size(calibration, pixels.shape)
     frame = Frame(
         pixels, height_agl_m=height_agl_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg
     )

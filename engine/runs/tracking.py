@@ -141,6 +141,7 @@ def _record(
         hfov_deg=files.hfov_deg,
         mount=files.mount,
         camera_pitch_deg=files.camera_pitch_deg,
+        scale_calibration=files.scale_calibration,
         corrections=None if files.corrections.changes_nothing else files.corrections.facts(),
         heights=dict(inputs.flight.heights),
         method=settings.method,

@@ -171,7 +171,7 @@ def test_evaluate_takes_another_truth_and_drops_figures_that_no_longer_hold(done
     late = tmp_path / "late.csv"
     late.write_text((flight / "truth.csv").read_text(encoding="utf-8"), encoding="utf-8")
     for row in range(FRAMES):
-        set_cell(late, row, "timestamp_ns", str(10**15 + row))
+        set_cell(late, row, "timestamp_ns", str(10**15 + row * 10**8))
     assert run(["evaluate", str(folder), f"--truth={late}", "--json"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["scored_fixes"] == 0

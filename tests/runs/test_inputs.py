@@ -1,5 +1,7 @@
 """Inputs of a run that no file was written for: pictures with corners, lenses by their field of view, mounts."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from engine.errors import CalibrationError, MapError, OptionError
 from engine.formats.flight import camera_info
 from engine.formats.geotiff import write_geotiff
 from engine.runs import BridgeFiles, FlightFiles
+from engine.runs.checks import check_pictures
 from engine.runs.evaluation import _recorded_files
 from engine.runs.inputs import open_map
 from engine.runs.record import RunRecord
@@ -187,5 +190,68 @@ def test_a_record_gives_the_same_files(photos):
         map="/m.tif", surface=None, frames=str(photos), truth=None, hfov_deg=70.0, mount="nadir-left",
         camera_pitch_deg=-80.0, method="ncc", profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0},
         ground_m=0.0, ground_amsl_m=None,
+    )  # fmt: skip
+    assert _recorded_files(record) == files
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    """As OpenCV writes it, for pictures of twice the photographs' size."""
+    path = tmp_path / "opencv.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in (
+        ("image_width", 640),
+        ("image_height", 480),
+        ("camera_matrix", np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])),
+        ("distortion_coefficients", np.array([[-0.28, 0.09, 0.0007, -0.0004, -0.01]])),
+    ):
+        storage.write(name, value)
+    storage.release()
+    return path
+
+
+def test_a_calibration_is_scaled_on_request_and_said(photos, calibration):
+    files = FlightFiles(map="m.tif", frames=photos, camera=calibration, scale_calibration=True, mount="nadir-tail")
+    messages = []
+    progress = SimpleNamespace(message=messages.append)
+    camera = files.load_camera(files.open_flight(), progress)
+    assert (camera.width_px, camera.height_px, camera.matrix[0, 0], camera.matrix[0, 2]) == (
+        320,
+        240,
+        250.0,
+        159.5,
+    )
+    assert np.allclose(camera.mount, mount_rotation("nadir-tail"))
+    assert messages == ["the calibration for 640 x 480 is scaled to pictures of 320 x 240"]
+    check_pictures(files.open_flight(), camera)
+
+
+def test_without_the_request_another_size_is_refused_and_the_request_named(photos, calibration, tmp_path, capsys):
+    files = FlightFiles(map="m.tif", frames=photos, camera=calibration)
+    flight = files.open_flight()
+    with pytest.raises(CalibrationError, match=r"0\.jpg: camera: calibrated for 640 x 480, .*`scale_calibration`"):
+        check_pictures(flight, files.load_camera(flight))
+    path = tmp_path / "map.tif"
+    write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
+    arguments = ["locate", str(photos / "0.jpg"), "--map", str(path), "--camera", str(calibration)]
+    assert run(arguments) == 1
+    assert "made smaller or larger as a whole, --scale-calibration" in capsys.readouterr().err
+
+
+def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
+    with pytest.raises(OptionError, match="scale_calibration: expected with `camera`"):
+        FlightFiles(map="m.tif", frames=photos, scale_calibration=True)
+    calibration.write_text(calibration.read_text().replace("480", "360"), encoding="utf-8")
+    files = FlightFiles(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
+    with pytest.raises(CalibrationError, match="a part may have been cut off"):
+        load(files)
+
+
+def test_a_record_gives_the_scaled_calibration_too(photos, calibration):
+    files = FlightFiles(map="/m.tif", frames=photos, camera=calibration, scale_calibration=True)
+    record = RunRecord(
+        map="/m.tif", surface=None, camera=str(calibration), frames=str(photos), truth=None, method="ncc",
+        scale_calibration=True, profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0}, ground_m=0.0,
+        ground_amsl_m=None,
     )  # fmt: skip
     assert _recorded_files(record) == files

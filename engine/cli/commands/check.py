@@ -27,6 +27,8 @@ from engine.cli.options import (
     MapSigmaOption,
     MountOption,
     OptionalCameraOption,
+    ScaleCalibrationOption,
+    SettingsOption,
     StartOption,
     SurfaceOption,
     TelemetryOffsetOption,
@@ -43,6 +45,7 @@ def check(
     hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
+    scale_calibration: ScaleCalibrationOption = False,
     telemetry: Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help="As of track.")] = None,
     image_topic: ImageTopicOption = None,
     frame_stamps: FrameStampsOption = None,
@@ -59,6 +62,7 @@ def check(
     truth: Annotated[
         Path | None, typer.Option("--truth", metavar="FILE", help="Positions that the map is held against.")
     ] = None,
+    settings_path: SettingsOption = None,
     start: StartOption = None,
     threads: ThreadsOption = 1,
     as_json: JsonOption = False,
@@ -70,15 +74,18 @@ def check(
     """
     from engine.runs.checking import as_rows, diagnose_flight
     from engine.runs.inputs import FlightFiles
+    from engine.runs.settings import load_settings
 
     use_threads(threads)
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
         map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        scale_calibration=scale_calibration,
         corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip
-    found = diagnose_flight(files, start, progress=console.PROGRESS)
+    names = load_settings(settings_path).telemetry_columns
+    found = diagnose_flight(files, start, columns=names, progress=console.PROGRESS)
     if as_json:
         console.print_json(asdict(found))
     else:

@@ -26,6 +26,7 @@ from engine.cli.options import (
     OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
+    ScaleCalibrationOption,
     StartOption,
     SurfaceOption,
     ThreadsOption,
@@ -42,6 +43,7 @@ def compare(
     hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
+    scale_calibration: ScaleCalibrationOption = False,
     telemetry: Annotated[
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
     ] = None,
@@ -82,6 +84,7 @@ def compare(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
         map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        scale_calibration=scale_calibration,
     )  # fmt: skip
     results = compare_runs(files, out, settings, force=force, progress=console.PROGRESS)
     if as_json:

@@ -25,7 +25,8 @@ def import_dataset(
         typer.Option("--part", metavar="NAME", help="Sequence, split or scene of a data set that has several."),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option("--camera", metavar="FILE", help="Calibration, a ROS camera_info YAML file.")
+        Path | None,
+        typer.Option("--camera", metavar="FILE", help="Calibration: ROS camera_info, OpenCV's or Kalibr's."),
     ] = None,
     hfov_deg: Annotated[
         float | None,

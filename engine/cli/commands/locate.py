@@ -21,6 +21,7 @@ from engine.cli.options import (
     MethodOption,
     MountOption,
     OptionalCameraOption,
+    ScaleCalibrationOption,
     SurfaceOption,
     ThreadsOption,
     WeightsOption,
@@ -38,6 +39,7 @@ def locate(
     hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
+    scale_calibration: ScaleCalibrationOption = False,
     surface: SurfaceOption = None,
     map_sigma_m: MapSigmaOption = None,
     map_bounds: MapBoundsOption = None,
@@ -72,7 +74,8 @@ def locate(
     use_threads(threads)
     result = locate_image(
         image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
-        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg, height_agl_m=height_agl_m,
+        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        scale_calibration=scale_calibration, height_agl_m=height_agl_m,
         heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
         weights=weights or (), device=device, progress=console.PROGRESS,
     )  # fmt: skip

@@ -32,6 +32,7 @@ from engine.cli.options import (
     OutOption,
     RerunConnectOption,
     RerunOption,
+    ScaleCalibrationOption,
     SettingsOption,
     StartOption,
     SurfaceOption,
@@ -51,6 +52,7 @@ def track(
     hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
+    scale_calibration: ScaleCalibrationOption = False,
     telemetry: Annotated[
         Path | None,
         typer.Option(
@@ -113,6 +115,7 @@ def track(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
         map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        scale_calibration=scale_calibration,
         corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip
     settings = load_settings(

@@ -1,0 +1,145 @@
+"""Calibrations as other programs write them: OpenCV's FileStorage, Kalibr's camchain, ROS's printed messages."""
+
+import cv2
+import numpy as np
+import pytest
+
+from engine.camera import Camera, mount_rotation
+from engine.errors import CalibrationError
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])
+PLUMB_BOB = np.array([-0.28, 0.09, 0.0007, -4e-20, -0.01])
+FISHEYE = np.array([0.03, -0.012, 0.004, -0.001])
+SAMPLES = {"image_width": 640, "image_height": 480, "camera_matrix": K, "distortion_coefficients": PLUMB_BOB}
+
+# As kalibr_calibrate_cameras wrote it of one fisheye lens, and the head of one of a stereo pair.
+KALIBR = """\
+cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [-0.037616380662515145, -0.01017328830844074, 0.0021156274599045564, -0.00041016163581791436]
+  distortion_model: equidistant
+  intrinsics: [348.9572868848721, 351.98561676978676, 356.0925444657544, 238.4353424788532]
+  resolution: [720, 540]
+  rostopic: /cam_1
+"""
+RADTAN = KALIBR.replace("equidistant", "radtan")
+
+
+def opencvs(path, **content):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in content.items():
+        storage.write(name, value)
+    storage.release()
+    return path
+
+
+def saved(tmp_path, text):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def texture():
+    noise = np.random.default_rng(5).integers(0, 256, (540, 720), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 3.0)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+@pytest.mark.parametrize("shape", [(1, 5), (5, 1)])
+def test_what_opencv_writes_is_read_to_the_last_digit(tmp_path, suffix, shape):
+    written = SAMPLES | {
+        "distortion_coefficients": PLUMB_BOB.reshape(shape),
+        "calibration_time": "Mon Nov 23 2026",
+    }
+    read = Camera.load(opencvs(tmp_path / f"camera.{suffix}", **written))
+    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "plumb_bob")
+    np.testing.assert_array_equal(read.matrix, K)
+    np.testing.assert_array_equal(read.distortion, PLUMB_BOB)
+    np.testing.assert_array_equal(read.mount, mount_rotation())
+
+
+def test_the_first_line_of_older_opencv_is_no_hindrance(tmp_path):
+    path = opencvs(tmp_path / "camera.yml", **SAMPLES)
+    text = path.read_text(encoding="utf-8")
+    older = "%YAML:1.0\n---\n" + text.split("---\n", 1)[1]
+    path.write_text(older, encoding="utf-8")
+    np.testing.assert_array_equal(Camera.load(path).matrix, K)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_names_of_the_tutorials_and_a_mount(tmp_path, suffix):
+    path = opencvs(
+        tmp_path / f"camera.{suffix}", K=K, D=FISHEYE, image_size=np.array([640, 480]), fisheye_model=1,
+        mount="nadir-tail",
+    )  # fmt: skip
+    read = Camera.load(path)
+    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "fisheye")
+    np.testing.assert_array_equal(read.mount, mount_rotation("nadir-tail"))
+
+
+def test_fourteen_coefficients_are_eight_where_the_others_are_zero(tmp_path):
+    eight = np.array([0.1, 0.02, 1e-3, 2e-3, 0.03, 0.2, 0.05, 0.01])
+    written = SAMPLES | {"distortion_coefficients": np.r_[eight, np.zeros(6)]}
+    read = Camera.load(opencvs(tmp_path / "camera.yml", **written))
+    assert read.distortion_model == "rational_polynomial"
+    np.testing.assert_array_equal(read.distortion, eight)
+    written["distortion_coefficients"][9] = 1e-5
+    with pytest.raises(
+        CalibrationError, match=r"camera\.yml: distortion_coefficients: expected 4, 5 or 8 numbers"
+    ):
+        Camera.load(opencvs(tmp_path / "camera.yml", **written))
+
+
+@pytest.mark.parametrize(("text", "model"), [(KALIBR, "equidistant"), (RADTAN, "plumb_bob")])
+def test_kalibrs_camchain_undistorts_as_opencv_with_its_numbers(tmp_path, text, model):
+    read = Camera.load(saved(tmp_path, text))
+    assert (read.width_px, read.height_px, read.distortion_model) == (720, 540, model)
+    lens = np.array([-0.037616380662515145, -0.01017328830844074, 0.0021156274599045564, -0.00041016163581791436])
+    matrix = np.array(
+        [[348.9572868848721, 0, 356.0925444657544], [0, 351.98561676978676, 238.4353424788532], [0, 0, 1]]
+    )
+    image = texture()
+    if model == "equidistant":
+        wanted = cv2.fisheye.undistortImage(image, matrix, lens, Knew=matrix)
+    else:
+        wanted = cv2.undistort(image, matrix, lens)
+    assert np.abs(read.undistort(image).astype(int) - wanted).mean() < 0.5
+
+
+def test_openvins_first_line_and_a_mount_in_a_camchain(tmp_path):
+    read = Camera.load(saved(tmp_path, "%YAML:1.0 # as OpenVINS wants it\n\n" + KALIBR + "mount: nadir-left\n"))
+    np.testing.assert_array_equal(read.mount, mount_rotation("nadir-left"))
+
+
+def test_camera_info_as_ros_prints_it(tmp_path):
+    text = (
+        "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nD: [-0.28, 0.09, 0.0007, -0.0004, -0.01]\n"
+        "K: [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]\n"
+    )
+    np.testing.assert_array_equal(Camera.load(saved(tmp_path, text)).matrix, K)
+
+
+BAD = {
+    "stereo": (KALIBR + KALIBR.replace("cam0", "cam1"), "expected one camera, got cam0, cam1: keep the block"),
+    "omni": (KALIBR.replace("pinhole", "omni"), "cam0: camera_model: expected pinhole, got 'omni'"),
+    "fov": (KALIBR.replace("equidistant", "fov"), "distortion_model: expected one of radtan, equidistant, none"),
+    "intrinsics": (KALIBR.replace("[348.9572868848721, ", "["), "cam0: intrinsics: expected 4 numbers"),
+    "no resolution": (KALIBR.replace("resolution", "size"), "cam0: resolution: expected 2 numbers, got None"),
+    "words": (KALIBR.replace("348.9572868848721", "wide"), "camera_matrix: expected numbers"),
+    "xml": ("<opencv_storage><K>", "not a readable XML file"),
+    "other xml": ("<a><b>1</b></a>", "lacks the field camera_matrix"),
+    "xml of a word": ("<a>1</a>", "no camera_info mapping"),
+    "no size": ("K: [500, 0, 319, 0, 500, 239, 0, 0, 1]\n", "lacks the field image_width"),
+    "no matrix": ("camera_matrix: !!opencv-matrix 3\n", "not a readable YAML file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD, ids=list(BAD))
+def test_what_cannot_be_one_camera_is_refused_in_one_line(tmp_path, case):
+    text, expected = BAD[case]
+    with pytest.raises(CalibrationError) as caught:
+        Camera.load(saved(tmp_path, text))
+    assert expected in str(caught.value)
+    assert "camchain.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
