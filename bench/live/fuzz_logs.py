@@ -20,7 +20,7 @@ import numpy as np
 
 from bench.inputs.log_files import S, dataflash_flight, ulog_flight
 from engine.errors import EngineError
-from engine.formats.export import WRITERS
+from engine.formats.export import WRITERS, pose_rows
 from engine.formats.flight import _frame
 from engine.formats.logs.readers import open_log
 from engine.formats.resampling import UTC_FROM_NS, telemetry_at, truth_from_log
@@ -78,7 +78,7 @@ def use_truth(path: Path) -> None:
 
 
 def use_track(path: Path) -> None:
-    rows = read_track(path)
+    rows = pose_rows(read_track(path))
     for write in WRITERS.values():
         with suppress(EngineError):
             write(rows)
