@@ -7,13 +7,13 @@ DISK does, still describes a tile a little differently than the level in one pie
 from __future__ import annotations
 
 import math
-import threading
-from collections import OrderedDict
+from functools import partial
 
 import numpy as np
 import torch
 
 from engine.indexes.landmarks import as_picture
+from engine.indexes.recently_used import RecentlyUsed
 from engine.learned import KeypointMatcher, Keypoints
 from engine.orthomap import OrthoMap
 from engine.values import Window
@@ -41,10 +41,12 @@ class KeypointMap:
 
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
         self._site, self._matcher = site, matcher
-        self._tiles: OrderedDict[_Key, Keypoints] = OrderedDict()  # the most recently used is last
-        self._lock = threading.Lock()  # guards the tiles, not their description, as in PreparedMap
-        self.created = 0
+        self._tiles: RecentlyUsed[_Key, Keypoints] = RecentlyUsed()
+
+    @property
+    def created(self) -> int:
         """Tiles described so far."""
+        return self._tiles.created
 
     def find(self, window: Window, level: int, count: int) -> Keypoints:
         """The strongest keypoints of a window.
@@ -61,34 +63,14 @@ class KeypointMap:
         size = np.array([window.width_px, window.height_px], np.float32)
         keys = _keys(window, level)
         parts = []
-        for tile in [self._tile(key) for key in keys]:
+        for tile in [self._tiles.get(key, partial(self._describe, *key)) for key in keys]:
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
             parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
-        self._evict(keep=len(keys))
+        self._tiles.evict(len, MAX_KEYPOINTS, keep=len(keys))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
         return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
-
-    def _tile(self, key: _Key) -> Keypoints:
-        with self._lock:
-            found = self._tiles.get(key)
-            if found is not None:
-                self._tiles.move_to_end(key)
-                return found
-        tile = self._describe(*key)
-        with self._lock:
-            self.created += 1
-            self._tiles[key] = tile
-            self._tiles.move_to_end(key)
-        return tile
-
-    def _evict(self, keep: int) -> None:
-        """Evict the least recently used tiles down to the limit, but not the last ``keep``."""
-        with self._lock:
-            used = sum(map(len, self._tiles.values()))
-            while used > MAX_KEYPOINTS and len(self._tiles) > keep:
-                used -= len(self._tiles.popitem(last=False)[1])
 
     def _describe(self, level: int, row: int, column: int) -> Keypoints:
         """The keypoints of a tile, in pixels of the level."""

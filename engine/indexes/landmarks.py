@@ -8,7 +8,6 @@ edges, so that the tiles together equal the level described in one piece.
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from engine.device import download, upload
 from engine.features import Features, sift
 from engine.indexes.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
+from engine.indexes.recently_used import RecentlyUsed
 from engine.orthomap import OrthoMap
 from engine.values import Window
 
@@ -80,11 +80,13 @@ class LandmarkMap:
 
     def __init__(self, site: OrthoMap, device: torch.device) -> None:
         self._site, self._device = site, device
-        self._tiles: dict[_Key, NamedArrays] = {}  # the most recently used is last
+        self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
         self._max_landmarks = MAX_LANDMARKS
-        self._lock = threading.Lock()  # guards the tiles, not their description, as in PreparedMap
-        self.created = 0
+
+    @property
+    def created(self) -> int:
         """Tiles described so far."""
+        return self._tiles.created
 
     def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
         """The landmarks of a window.
@@ -100,7 +102,7 @@ class LandmarkMap:
         """
         keys = _keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
-        self._evict(keep=len(keys))
+        self._tiles.evict(_count, self._max_landmarks, keep=len(keys))
         low = np.array([window.x0, window.y0]) - 0.5
         high = low + np.array([window.width_px, window.height_px])
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
@@ -125,7 +127,7 @@ class LandmarkMap:
             for upright in (True, False):
                 self._prepare(level, upright)
         # No more than what is prepared now: a large map, of which little is prepared, keeps the usual limit.
-        self._max_landmarks = max(self._max_landmarks, sum(len(tile["rank"]) for tile in self._tiles.values()))
+        self._max_landmarks = max(self._max_landmarks, sum(map(_count, self._tiles.values())))
 
     def _prepare(self, level: int, upright: bool) -> None:
         rows, columns = self._site.level_shape(level)
@@ -151,28 +153,8 @@ class LandmarkMap:
 
     def _tile(self, key: _Key) -> NamedArrays:
         """A tile, which becomes the most recently used."""
-        with self._lock:
-            found = self._tiles.pop(key, None)
-            if found is not None:
-                self._tiles[key] = found
-                return found
-        level, upright, row, column = key
-        tile = self._with_points(self._detect(level, upright, row, column), level)
-        with self._lock:
-            self.created += 1
-            self._tiles[key] = tile
-        return tile
-
-    def _evict(self, keep: int) -> None:
-        """Evict the least recently used tiles down to the limit, but not the last ``keep``."""
-        with self._lock:
-            tiles = list(self._tiles.items())
-            used = sum(len(tile["rank"]) for _, tile in tiles)
-            for key, tile in tiles[: len(tiles) - keep]:
-                if used <= self._max_landmarks:
-                    break
-                used -= len(tile["rank"])
-                del self._tiles[key]
+        level = key[0]
+        return self._tiles.get(key, lambda: self._with_points(self._detect(*key), level))
 
     def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
         """Every keypoint on a tile, as it would be detected in the whole level."""
@@ -215,6 +197,10 @@ class LandmarkMap:
         xy, scale, angle, descriptors = (column[None] for column in upload(columns, self._device))
         valid = torch.ones(1, len(found["rank"]), dtype=torch.bool, device=self._device)
         return Landmarks(Features(xy, scale, angle, descriptors.float(), valid), found["xy_px"], found["points_m"])
+
+
+def _count(tile: NamedArrays) -> int:
+    return len(tile["rank"])
 
 
 def as_picture(gray: NDArray[np.uint8], device: torch.device) -> torch.Tensor:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections import OrderedDict
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from engine.dense import Samples
 from engine.indexes.prepared import WHOLE_LEVEL_PX, PreparedMap
+from engine.indexes.recently_used import RecentlyUsed
 from engine.orthomap import OrthoMap
 from engine.values import Window
 
@@ -34,10 +34,12 @@ class SampleMap:
 
     def __init__(self, site: OrthoMap, prepared: PreparedMap) -> None:
         self._site, self._prepared = site, prepared
-        self._cells: OrderedDict[tuple[int, Window], tuple[Samples, tuple[int, int]]] = OrderedDict()
-        self._lock = threading.Lock()  # guards the cells, not their sampling, as in PreparedMap
-        self.created = 0
+        self._cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
+
+    @property
+    def created(self) -> int:
         """Cells sampled so far."""
+        return self._cells.created
 
     def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
         """Samples of a window.
@@ -81,17 +83,8 @@ class SampleMap:
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and the number of their rows and columns."""
-        with self._lock:
-            found = self._cells.pop((level, cell), None)
-            if found is not None:
-                self._cells[level, cell] = found
-                return found
-        found = self._sampled(cell, level)
-        with self._lock:
-            self.created += 1
-            self._cells[level, cell] = found
-            if len(self._cells) > MAX_CELLS:
-                self._cells.popitem(last=False)
+        found = self._cells.get((level, cell), partial(self._sampled, cell, level))
+        self._cells.evict(lambda _: 1, MAX_CELLS, keep=0)
         return found
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:

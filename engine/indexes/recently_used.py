@@ -1,0 +1,61 @@
+"""What an index made of parts of a map; the least recently used is given up. For any number of threads."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class RecentlyUsed(Generic[K, V]):
+    """Entries by key, the most recently used last. The lock guards them, not how they are made."""
+
+    def __init__(self) -> None:
+        self._entries: OrderedDict[K, V] = OrderedDict()
+        self._lock = threading.Lock()
+        self.created = 0
+        """Entries made so far."""
+
+    def __contains__(self, key: K) -> bool:
+        return key in self._entries
+
+    def __iter__(self) -> Iterator[K]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __setitem__(self, key: K, entry: V) -> None:
+        """Add an entry that was made before, or replace one."""
+        with self._lock:
+            self._entries[key] = entry
+            self._entries.move_to_end(key)
+
+    def values(self) -> list[V]:
+        """The entries, the least recently used first."""
+        return list(self._entries.values())
+
+    def get(self, key: K, make: Callable[[], V]) -> V:
+        """An entry, which becomes the most recently used; made where there is none."""
+        with self._lock:
+            found = self._entries.get(key)
+            if found is not None:
+                self._entries.move_to_end(key)
+                return found
+        made = make()
+        with self._lock:
+            self.created += 1
+            self._entries[key] = made
+            self._entries.move_to_end(key)
+        return made
+
+    def evict(self, size: Callable[[V], int], limit: int, keep: int) -> None:
+        """Give up the least recently used entries until their sizes fit a limit, but not the last ``keep``."""
+        with self._lock:
+            used = sum(map(size, self._entries.values()))
+            while used > limit and len(self._entries) > keep:
+                used -= size(self._entries.popitem(last=False)[1])
