@@ -30,7 +30,6 @@ MAX_RAY_DEG = 75.0
 _MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
 # A frame that is finer than the map by more than this factor is averaged down first, to prevent aliasing.
 _MAX_SHRINK = 0.75
-_LAST_SHRINK = 0.75  # of a picture that was halved as often as that leaves more to do
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
 # Least size of a patch as a share of the requested fraction.
 MIN_SHRINK = 0.25
@@ -177,10 +176,10 @@ def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Ar
     height, width = (max(8, round(n * scale)) for n in gray.shape)
     sx, sy = width / gray.shape[1], height / gray.shape[0]
     homography = np.array([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1.0]])
-    picture = gray
-    for _ in range(math.floor(math.log2(_LAST_SHRINK / scale)) if scale < _LAST_SHRINK else 0):
-        half = (max(8, picture.shape[1] // 2), max(8, picture.shape[0] // 2))  # fast by OpenCV, edges on edges
-        picture = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8)
+    picture, left = gray, scale
+    while left <= _MAX_SHRINK / 2.0:  # as much as halves do, which are fast by OpenCV, edges on edges
+        half = (max(8, picture.shape[1] // 2), max(8, picture.shape[0] // 2))
+        picture, left = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8), 2.0 * left
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8), homography
 
 

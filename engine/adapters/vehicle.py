@@ -16,9 +16,9 @@ __all__ = ["NedOrigin", "VehicleState", "north_east_m"]
 ANGLES = (True, True, True)
 """Roll, pitch and heading are all angles, see :class:`RecentValues`."""
 ANGLE_VARIANCE = math.radians(10.0) ** 2
+"""Variance in rad^2 of the vehicle's own attitude where that is sent: large, since it is sent back."""
 MOUNT_VARIANCE = math.radians(1.0) ** 2
 """Of each angle between camera and autopilot, which a fix does not measure: adds to that of its attitude."""
-"""Variance in rad^2 of the attitude that is sent: large, since it is the vehicle's own estimate."""
 
 _STALE_NS = 500_000_000  # largest distance of a sample in time from a capture that it describes
 _MAX_SAMPLES = 128  # of each quantity

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from engine.errors import TelemetryError
 from engine.values import MAX_SIGMA_M
@@ -146,11 +146,9 @@ def read_table(
     path = Path(path)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            delimiter = _delimiter(file.readline())
-            file.seek(0)
+            delimiter = _delimiter(file)
             reader = csv.reader(file, delimiter=delimiter)
-            header = _Header(path, [name.strip() for name in next(reader, [])], names)
-            columns = header.columns(required, optional, instead, advice)
+            columns = _Header(path, _names(reader), names).columns(required, optional, instead, advice)
             marks = None if delimiter == "," else _Marks(path)
             for row in reader:
                 if any(cell.strip() for cell in row):
@@ -170,14 +168,19 @@ def read_table(
 def read_header(path: str | Path) -> list[str]:
     """The columns of a table that :func:`read_table` has read."""
     with Path(path).open(encoding="utf-8-sig", newline="") as file:
-        delimiter = _delimiter(file.readline())
-        file.seek(0)
-        return [name.strip() for name in next(csv.reader(file, delimiter=delimiter), [])]
+        return _names(csv.reader(file, delimiter=_delimiter(file)))
 
 
-def _delimiter(line: str) -> str:
-    """What separates the names of a header: the most frequent of comma, semicolon and tab."""
+def _delimiter(file: TextIO) -> str:
+    """What separates the names of the header, which is read again: the most frequent of comma, semicolon and tab."""
+    line = file.readline()
+    file.seek(0)
     return max((",", ";", "\t"), key=line.count)
+
+
+def _names(reader: Iterator[list[str]]) -> list[str]:
+    """The columns of the header, none of an empty file."""
+    return [name.strip() for name in next(reader, [])]
 
 
 @dataclass(frozen=True, slots=True)

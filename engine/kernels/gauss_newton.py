@@ -104,10 +104,16 @@ def normal_equations(shown, expected, points, offset_m, rotation, weights, diffe
             score[i] -= weighted * differences[n]
             for j in range(i + 1):
                 normal[i, j] += weighted * row[j]
-    for i in range(_PARAMETERS):
-        for j in range(i):
-            normal[j, i] = normal[i, j]
+    mirror(normal)
     return normal, score
+
+
+@compiled
+def mirror(matrix):
+    """Complete a symmetric matrix (N, N) of which the lower triangle is known, in place."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
 
 
 @compiled
@@ -156,9 +162,7 @@ def information(shown, expected, points, offset_m, rotation, weights, difference
                 common[i, j] += 0.5 * (first * two[j] + second * one[j])
                 of_map[i, j] += second * two[j]
     for sums in (own, common, of_map):
-        for i in range(_PARAMETERS):
-            for j in range(i):
-                sums[j, i] = sums[i, j]
+        mirror(sums)
     return own, common, of_map, by_cell
 
 

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.gauss_newton import rotation_of, rotation_vector, small_product, solve
+from engine.kernels.gauss_newton import mirror, rotation_of, rotation_vector, small_product, solve
 from engine.kernels.jit import compiled
 
 _SIX = 6
@@ -146,9 +146,7 @@ def normal_equations(tangents, projected, squared, pixels, matrix, weights, reac
                 weighted = weight * row[axis, i]
                 for j in range(i + 1):
                     normal[i, j] += weighted * row[axis, j]
-    for i in range(_SIX):
-        for j in range(i):
-            normal[j, i] = normal[i, j]
+    mirror(normal)
     return normal, gradient
 
 

@@ -94,9 +94,7 @@ class Ncc(Method):
             return None
         if not query.scheduler.can_afford_all({step: works[coarser], _AT_ONCE: work_px}):
             return None
-        with query.scheduler.costed(step, works[coarser]):
-            found = self.find(query, coarser=coarser)
-            result = found if isinstance(found, NoFix) else self.judge(query, found)
+        _, result = self._find_and_judge(query, step, works, coarser)
         if isinstance(result, NoFix):
             return None
         refined = None
@@ -126,9 +124,7 @@ class Ncc(Method):
             return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, step)
-        with query.scheduler.costed(step, works[coarser]):
-            found = self.find(query, coarser=coarser)
-            result = found if isinstance(found, NoFix) else self.judge(query, found)
+        found, result = self._find_and_judge(query, step, works, coarser)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             with suppress(OutOfTime):  # the refusal that there is stands
                 result = self._look_again(query, found, result)
@@ -139,6 +135,14 @@ class Ncc(Method):
         if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
             return self.refine(query.with_height(found.aligned.pose), result)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
+
+    def _find_and_judge(
+        self, query: Query, step: str, works: dict[int, float], coarser: int
+    ) -> tuple[PeakCandidate | NoFix, Result]:
+        """The highest peak on a level, and what becomes of it; a variant of a step, whose cost is learned."""
+        with query.scheduler.costed(step, works[coarser]):
+            found = self.find(query, coarser=coarser)
+            return found, found if isinstance(found, NoFix) else self.judge(query, found)
 
     def _step(self, query: Query) -> tuple[str, dict[int, float]]:
         """The name of the step that correlates, and the work of its variants."""
@@ -160,7 +164,7 @@ class Ncc(Method):
             query = replace(query, frame=frame)
         work_px = float(query.gray.size)
         if not query.scheduler.can_afford("refinement", work_px):
-            query.scheduler.note_refusal("refinement", has_fix=True)
+            query.scheduler.note_refusal("refinement", keeps_cost=True)
             return result
         try:
             with query.scheduler.with_fix(), query.scheduler.costed("refinement", work_px):

@@ -152,12 +152,6 @@ class Refinement:
     def _through_levels(
         self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None
     ) -> DenseFit | None:
-        with self.query.scheduler.stage("dense"):  # one a pass, before each of which it may be abandoned
-            return self._timed_through_levels(prior, coarser, min_correlation)
-
-    def _timed_through_levels(
-        self, prior: GaussianPrior, coarser: int, min_correlation: float | None
-    ) -> DenseFit | None:
         """Refine on levels coarser than the frame's, where a few pixels reach farther; then on its own.
 
         The pose must fit better than the one to begin with.
@@ -167,18 +161,19 @@ class Refinement:
         own, has_tilt = query.level_of(height_m), self._knows_tilt
         least = _MIN_CORRELATION if has_tilt else _MIN_CORRELATION_WITHOUT_TILT
         pose, fit = prior.pose, None
-        for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
-            window = self._footprint(prior.pose, height_m, level)
-            if window is None:
-                fit = None
-                continue
-            picture = self._enhanced_frame(height_m, level)
-            ground = self.samples.find(window, level, MAX_SAMPLES if level == own else _COARSE_SAMPLES)
-            if not has_tilt and fit is None:
-                pose = max(_tilted(pose, height_m), key=lambda start: correlation_at(picture, ground, start))
-            last_step, start = _LAST_STEP if level == own else _LAST_STEP_COARSE, pose
-            fit = refine(picture, ground, start, prior, last_step_sigmas=last_step)
-            pose = start if fit is None else fit.pose
+        with query.scheduler.stage("dense"):  # one a pass, before each of which it may be abandoned
+            for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
+                window = self._footprint(prior.pose, height_m, level)
+                if window is None:
+                    fit = None
+                    continue
+                picture = self._enhanced_frame(height_m, level)
+                ground = self.samples.find(window, level, MAX_SAMPLES if level == own else _COARSE_SAMPLES)
+                if not has_tilt and fit is None:
+                    pose = max(_tilted(pose, height_m), key=lambda start: correlation_at(picture, ground, start))
+                last_step, start = _LAST_STEP if level == own else _LAST_STEP_COARSE, pose
+                fit = refine(picture, ground, start, prior, last_step_sigmas=last_step)
+                pose = start if fit is None else fit.pose
         if fit is None or not fit.converged:
             return None
         at_prior = fit.first_correlation if start is prior.pose else correlation_at(picture, ground, prior.pose)

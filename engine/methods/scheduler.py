@@ -54,9 +54,9 @@ class Scheduler:
         """The first variant of a step, by its work, that there is time for; None where there is none."""
         return next((variant for variant, work in works.items() if self.can_afford(step, work)), None)
 
-    def note_refusal(self, step: str, *, has_fix: bool = False) -> None:
+    def note_refusal(self, step: str, *, keeps_cost: bool = False) -> None:
         """Note that a step could not be afforded, see :meth:`engine.methods.costs.Costs.note_refusal`."""
-        self._costs.note_refusal(step, keeps_cost=has_fix)
+        self._costs.note_refusal(step, keeps_cost=keeps_cost)
 
     @contextmanager
     def costed(self, step: str, work: float) -> Iterator[None]:
