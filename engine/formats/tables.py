@@ -172,7 +172,7 @@ def read_header(path: str | Path) -> list[str]:
 
 
 def _delimiter(file: TextIO) -> str:
-    """What separates the names of the header, which is read again: the most frequent of comma, semicolon and tab."""
+    """What separates the names of the header, which is read again: the commonest of comma, semicolon, tab."""
     line = file.readline()
     file.seek(0)
     return max((",", ";", "\t"), key=line.count)
