@@ -29,10 +29,13 @@ Array = NDArray[np.float64]
 _MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
 _MAX_COARSE_PX = 4_000_000  # of the map, likewise
 _MIN_TEMPLATE_PX = 20
+_MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept where it is beyond doubt only
+_MIN_QUICK_SCORE, _MAX_QUICK_RIVAL = 0.5, 0.7  # at full resolution; the rival as a share of the score
 _CANDIDATES = 8
 _SEMIFINALISTS = 4
 _FINALISTS = 2
-_GROUP = 2  # templates in one batch, which bounds the memory of their surfaces
+_HOPEFUL = 0.5  # of the best score: a place below does not win by a better heading and height
+_MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces: memory's bound
 _SLACK_PX = 3  # by which a place that was found on a level may be wrong, in pixels of that level
 _EDGE_PX = 1.5  # by which the nearest hypothesis may be off at the corner of the patch
 _MIDDLE_ROUNDS = 2
@@ -44,6 +47,31 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
     level, poses = _coarse_level(correlator, first, window)
     if level == first.level and len(poses) == 1:
         return correlator.search(first, window), first
+    quick = _quick_level(correlator, first, level)
+    if quick is not None:
+        best = _from_level(correlator, first, window, *quick)
+        if best is not None and _is_beyond_doubt(best[0]):
+            return best
+    return _from_level(correlator, first, window, level, poses) or (None, first)
+
+
+def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
+    """One level above, with its fewer hypotheses, which costs a sixteenth; None where too little is left there."""
+    above = level + 1
+    h, w = (n >> (above - first.level) for n in first.template.shape)
+    if above == correlator.query.site.levels or min(h, w) < _MIN_QUICK_TEMPLATE_PX:
+        return None
+    return above, _hypotheses(correlator.query.telemetry, *_grid(correlator.options, math.hypot(h, w) / 2.0))
+
+
+def _is_beyond_doubt(peak: Peak) -> bool:
+    return peak.score >= _MIN_QUICK_SCORE and peak.second_score <= _MAX_QUICK_RIVAL * peak.score
+
+
+def _from_level(
+    correlator: Correlator, first: Aligned, window: Window, level: int, poses: list[GridPose]
+) -> tuple[Peak, Aligned] | None:
+    """The best peak over some hypotheses, all of which are scored on one level."""
     found: list[tuple[Peak, Aligned]] = []
     middle = max(first.level, level - 1)
     for pose, nadir in _coarse(correlator, poses, window, level):
@@ -54,9 +82,10 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
     found.sort(key=lambda pair: -pair[0].score)
     several = len(poses) > 1
     if several:
-        found = [_refined(correlator, *pair, _MIDDLE_ROUNDS) for pair in found[:_SEMIFINALISTS]]
+        hopeful = [pair for pair in found[:_SEMIFINALISTS] if pair[0].score >= _HOPEFUL * found[0][0].score]
+        found = [_refined(correlator, *pair, _MIDDLE_ROUNDS) for pair in hopeful]
         found.sort(key=lambda pair: -pair[0].score)
-    return _best_at_full_resolution(correlator, found, first.level, refine=several) or (None, first)
+    return _best_at_full_resolution(correlator, found, first.level, refine=several)
 
 
 def coarse_px(correlator: Correlator, first: Aligned, window: Window) -> int:
@@ -137,8 +166,9 @@ def _coarse(
 
 def _surfaces(correlator: Correlator, region: Region, templates: torch.Tensor) -> Iterator[torch.Tensor]:
     """One surface (H', W') after the other, of which only a few are in memory."""
+    area_px = region.window.width_px * region.window.height_px
     if region.valid is None:
-        for group in surfaces(region.search, templates, group=_GROUP):
+        for group in surfaces(region.search, templates, group=max(_MIN_GROUP, _MAX_GROUP_PX // area_px)):
             yield from group
     else:
         for template in templates:

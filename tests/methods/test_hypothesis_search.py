@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
-from engine.methods import ncc
+from engine.methods import hypothesis_search, ncc
 from engine.methods.options import NccOptions
 from engine.sim import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_town, site_of
@@ -142,3 +142,38 @@ def test_a_frame_of_another_town_scores_far_below_one_of_this(matcher, other_sit
         frame = replace(flight.frames[k], heading_deg=None)
         assert here.locate(frame).score > 0.7
         assert there.locate(frame).score < 0.3
+
+
+@pytest.fixture
+def looked_on(monkeypatch):
+    """The levels on which all hypotheses were scored, in turn."""
+    levels, real = [], hypothesis_search._from_level
+
+    def noting(correlator, first, window, level, poses):
+        levels.append(level)
+        return real(correlator, first, window, level, poses)
+
+    monkeypatch.setattr(hypothesis_search, "_from_level", noting)
+    return levels
+
+
+def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
+    matcher, site, flight, looked_on, monkeypatch
+):
+    unknown = replace(flight.frames[5], heading_deg=None)
+    quick = matcher(heading_search_deg=180.0).locate(unknown)
+    levels = list(looked_on)
+    monkeypatch.setattr(hypothesis_search, "_MIN_QUICK_SCORE", 2.0)  # nothing is beyond doubt
+    thorough = matcher(heading_search_deg=180.0).locate(unknown)
+    assert len(levels) == 1
+    assert looked_on == [*levels, *levels, levels[0] - 1]
+    assert abs(quick.east_m - thorough.east_m) < 0.1
+    assert abs(quick.north_m - thorough.north_m) < 0.1
+    assert turn_between(quick.attitude.heading_deg, thorough.attitude.heading_deg) < 0.1
+
+
+def test_a_place_in_doubt_at_a_quick_look_is_looked_for_thoroughly(matcher, other_site, flight, looked_on):
+    result = matcher(other_site, heading_search_deg=20.0).locate(flight.frames[5])
+    assert isinstance(result, NoFix)
+    assert len(looked_on) == 2
+    assert looked_on[0] == looked_on[1] + 1
