@@ -18,7 +18,7 @@ from engine.maps.fetching.heights import (
     read_part,
     write_heights,
 )
-from engine.maps.fetching.mosaic import Bounds, Mosaic, Place, Wanted
+from engine.maps.fetching.mosaic import FINE_ENOUGH, Bounds, Mosaic, Place, Wanted
 from engine.maps.fetching.pictures import fetch_pieces, piece_file, remove_pieces, write_map
 from engine.maps.fetching.services import capabilities, query_value, with_query
 from engine.maps.fetching.wms import plan_wms
@@ -109,12 +109,12 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     progress.message(f"note: {NOTE}")
     client = Client(settings.pause_ms, settings.timeout_s, progress.message)
     mosaic = _planned(settings, place, client)
-    for name, text in mosaic.states.items():
-        progress.message(f"the server states as {name}: {text}")
+    _say_what_comes(mosaic, settings, progress)
     folder = out.with_name(f"{out.name}.tiles")
     facts = _plan_facts(settings, mosaic, folder)
     if settings.dry_run:
-        return facts | {"surface_files": _surface_files(settings, mosaic), "dry_run": True}
+        surface_files = [shown(file) for file in _surface_files(settings, mosaic)]
+        return facts | {"surface_files": surface_files, "dry_run": True}
     folder.mkdir(parents=True, exist_ok=True)
     fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
     surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
@@ -125,6 +125,17 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     remove_pieces(folder)
     received = {"fetched": asked, "fetched_mb": client.bytes_received / 1e6}
     return {"file": str(out)} | facts | received | written | _surface_facts(surface, surface_out)
+
+
+def _say_what_comes(mosaic: Mosaic, settings: FetchSettings, progress: Progress) -> None:
+    """What a person should know before the pictures come."""
+    for name, text in mosaic.states.items():
+        progress.message(f"the server states as {name}: {text}")
+    got, asked = mosaic.gsd_m_per_px, settings.gsd_m_per_px
+    coarser = ", coarser than asked: the server has no finer level" if got > asked * FINE_ENOUGH else ""
+    progress.message(f"{mosaic.kind} level {mosaic.level}: {got:.3g} m/px{coarser}")
+    if settings.map_sigma_m is None:
+        progress.message("the map's accuracy is not stated (`map_sigma_m`): matching will assume 3 m per axis")
 
 
 def _write(mosaic: Mosaic, folder: Path, out: Path, tags: dict[str, object]) -> dict[str, Any]:
@@ -205,7 +216,7 @@ def _plan_facts(settings: FetchSettings, mosaic: Mosaic, folder: Path) -> dict[s
         "georeference_sigma_m": settings.map_sigma_m,
         "attribution": settings.attribution,
         "licence": settings.licence,
-        "server_states": dict(mosaic.states),
+        "server_states": [f"{name}: {text}" for name, text in mosaic.states.items()],
         "note": NOTE,
     }
 

@@ -140,9 +140,10 @@ def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
     if asked is not None or not codes:
         return chosen_name("crs", None if asked is None else code_of(asked), codes, "one that the server offers")
     zone = int(((place.lon_deg + 180.0) % 360.0) // 6.0) + 1
-    utm = f"EPSG:{(32600 if place.lat_deg >= 0.0 else 32700) + zone}"
+    bases = (32600, 25800, 26900) if place.lat_deg >= 0.0 else (32700,)  # WGS84, ETRS89, NAD83
+    utm = tuple(f"EPSG:{base + zone}" for base in bases)
     others = [code for code in codes if code not in _DEGREES]
-    return next(code for code in (utm, *_MERCATOR, *others, *_DEGREES) if code in codes)
+    return next(code for code in (*utm, *_MERCATOR, *others, *_DEGREES) if code in codes)
 
 
 def chosen_format(asked: str | None, offered: Sequence[str]) -> str:
