@@ -86,8 +86,7 @@ class FetchSettings:
 def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT) -> dict[str, Any]:
     """Fetch a map into one GeoTIFF, and a surface model beside it.
 
-    What has been fetched is kept in a folder beside the file until that is complete: the same call goes on after
-    an interruption.
+    What has been fetched is kept beside the file until that is complete: the same call goes on later.
 
     Args:
         settings: what, and how.
@@ -113,8 +112,7 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     folder = out.with_name(f"{out.name}.tiles")
     facts = _plan_facts(settings, mosaic, folder)
     if settings.dry_run:
-        surface_files = [shown(file) for file in _surface_files(settings, mosaic)]
-        return facts | {"surface_files": surface_files, "dry_run": True}
+        return facts | {"surface_files": list(map(shown, _surface_files(settings, mosaic))), "dry_run": True}
     folder.mkdir(parents=True, exist_ok=True)
     fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
     surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)

@@ -232,6 +232,7 @@ def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.tif", "own.tif"]
 
 
+@pytest.mark.slow
 def test_a_frame_is_located_over_a_fetched_map_as_over_the_map_itself(tmp_path, server, raster):
     """A town's own map, and what WMS and tiles make of it: the fixes agree to a quarter of a pixel of 0.53 m."""
     write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
@@ -480,6 +481,8 @@ def test_files_of_degrees_by_their_names():
 def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
     source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
     height_tile(files / "far.tif", 10, 10)
+    (files / "tiles/0/0").mkdir(parents=True)
+    (files / "tiles/0/0/0.png").write_bytes(tile_answer())
     (files / "page.tif").write_bytes(b"<html>not here</html>")
     for surface, datum, error, text in (
         (f"{server.url}/files/none.tif", None, MapError, "there is no http://127.0.0.1"),
@@ -487,6 +490,7 @@ def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
         (str(files / "none.tif"), None, MapError, "surface: expected a file of heights, but there is no /"),
         (str(files / "{lat}{lon}.tif"), None, MapError, "surface: expected a file of heights, but there is no "),
         (str(files / "far.tif"), None, MapError, "surface: "),
+        (str(files / "tiles"), None, MapError, "surface: expected heights, got a folder of pictures"),
         (str(files / "far.tif"), "EPSG:4326", OptionError, "surface_datum: expected a vertical datum in metres"),
     ):
         with pytest.raises(error, match=re.escape(text)):

@@ -23,6 +23,7 @@ from engine.errors import MapError, OptionError
 from engine.maps.fetching.client import Client, check_url, shown, user_agent
 from engine.maps.fetching.mosaic import Bounds
 from engine.maps.rasters import open_source, vertical_datum
+from engine.maps.xyz_tiles import TileCache
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -124,7 +125,12 @@ def _opened(file: str, client: Client) -> Any:
     from rasterio.errors import RasterioError
 
     if "://" not in file:
-        return open_source(file, "surface").dataset if Path(file).exists() else None
+        if not Path(file).exists():
+            return None
+        dataset = open_source(file, "surface").dataset
+        if isinstance(dataset, TileCache):
+            raise MapError(f"surface: expected heights, got a folder of pictures, {file}")
+        return dataset
     if client.get(file, first_bytes=4) is None:
         return None
     try:
