@@ -1,4 +1,8 @@
-"""What each step costs on this machine, learned every time that it runs."""
+"""What each step costs on this machine, learned every time that it runs.
+
+What a step costs by itself, and how long it waits while other processes have the processor, are learned apart. The
+second is a share of the first and common to all steps: a short step that was preempted is no dearer than before.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ _SIGMAS = 3.0
 _MIN_MS = 0.05
 _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for its cost
 _COST_DECAY = 0.99  # of the cost itself, until the step is tried
+_MAX_WAIT_MS = 20.0  # a longer wait counts as this long: a scheduler's turns are shorter
 _ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
 
 
@@ -60,40 +65,53 @@ class Costs:
 
     def __init__(self) -> None:
         self._models: dict[str, _CostModel] = {}
+        self._ran_ms = self._waited_ms = 0.0  # running sums over all steps
         self._lock = threading.Lock()  # a model's sums belong together
 
-    def learn(self, step: str, work: float, ms: float) -> None:
-        """Note that a step with this much work took so many milliseconds."""
+    def learn(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
+        """Note that a step with this much work took so long, ``waited_ms`` of it waiting for a processor."""
         with self._lock:
-            self._models.setdefault(step, _CostModel()).learn(work, ms)
+            ran_ms = self._note_wait(ms, waited_ms)
+            self._models.setdefault(step, _CostModel()).learn(work, ran_ms)
 
-    def note_abandoned(self, step: str, work: float, ms: float) -> None:
+    def note_abandoned(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
         """Note that a step was abandoned after so many milliseconds: it costs more than these."""
         with self._lock:
+            ran_ms = self._note_wait(ms, waited_ms)
             known = self._models.setdefault(step, _CostModel())
             known.trust = 1.0
             expected_ms = known.expected_ms(work) if known.weight > 0.0 else 0.0
-            known.learn(work, max(_ABANDONED * ms, expected_ms))
+            known.learn(work, max(_ABANDONED * ran_ms, expected_ms))
 
-    def note_refusal(self, step: str, *, keeps_cost: bool = False) -> None:
+    def note_refusal(self, step: str, *, keeps_cost: bool = False, has_fix: bool = False) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
 
         Args:
             step: its name.
             keeps_cost: only the deviation of its cost decays, since to try it may lose a fix that is there. Else
                 the cost decays as well until it is tried once; if it was not cheaper, that is undone.
+            has_fix: other steps ran, and have shown how long they waited; else the waiting decays too.
         """
         with self._lock:
             known = self._models.get(step)
             if known is None:
                 return
+            self._waited_ms *= 1.0 if has_fix else _DEVIATION_DECAY
             known.square *= _DEVIATION_DECAY**2
             known.trust *= 1.0 if keeps_cost else _COST_DECAY
 
     def upper_bound_ms(self, step: str, work: float) -> float:
-        """The step's expected time and three deviations; 0 where it never ran."""
+        """Expected time and three deviations of a step, with the waiting that goes with it; 0 if it never ran."""
         with self._lock:
             model = self._models.get(step)
             if model is None:
                 return 0.0
-            return model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
+            ran_ms = model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
+            return ran_ms * (1.0 + self._waited_ms / self._ran_ms) if self._ran_ms > 0.0 else ran_ms
+
+    def _note_wait(self, ms: float, waited_ms: float) -> float:
+        """Learn the share of waiting, and return what the step took without."""
+        ran_ms = ms - waited_ms
+        self._ran_ms = _MEMORY * self._ran_ms + ran_ms
+        self._waited_ms = _MEMORY * self._waited_ms + min(waited_ms, _MAX_WAIT_MS)
+        return ran_ms

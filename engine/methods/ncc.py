@@ -99,8 +99,11 @@ class Ncc(Method):
             return None
         refined = None
         if (result.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE:
-            with query.scheduler.costed(_AT_ONCE, work_px):
-                refined = Refinement(query, self.samples, self.options).refine_at_once(result)
+            try:
+                with query.scheduler.with_fix(), query.scheduler.costed(_AT_ONCE, work_px):
+                    refined = Refinement(query, self.samples, self.options).refine_at_once(result)
+            except OutOfTime:
+                return replace(result, stage="coarse")
         if refined is None and query.scheduler.first_affordable(step, works) is None:
             return replace(result, stage="coarse")
         return refined

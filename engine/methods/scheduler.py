@@ -6,7 +6,7 @@ step that would end too late is not begun. Without a budget every step is afford
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -15,6 +15,7 @@ import torch
 from engine.budget import Deadline
 from engine.device import synchronise
 from engine.methods.costs import Costs
+from engine.methods.preemption import thread_usage, waited_ms
 from engine.values import Timings
 
 _T = TypeVar("_T")
@@ -56,21 +57,21 @@ class Scheduler:
 
     def note_refusal(self, step: str, *, keeps_cost: bool = False) -> None:
         """Note that a step could not be afforded, see :meth:`engine.methods.costs.Costs.note_refusal`."""
-        self._costs.note_refusal(step, keeps_cost=keeps_cost)
+        self._costs.note_refusal(step, keeps_cost=keeps_cost, has_fix=keeps_cost or self._has_fix)
 
     @contextmanager
     def costed(self, step: str, work: float) -> Iterator[None]:
         """Learn what a step of this much work costs."""
-        start_ms, outer, self._step = self.deadline.elapsed_ms, self._step, (step, work)
+        taken, outer, self._step = self._stopwatch(), self._step, (step, work)
         self._is_under_way = False
         try:
             yield
         except OutOfTime:
-            self._costs.note_abandoned(step, work, self.deadline.elapsed_ms - start_ms)
+            self._costs.note_abandoned(step, work, *taken())
             raise
         finally:
             self._step = outer
-        self._costs.learn(step, work, self.deadline.elapsed_ms - start_ms)
+        self._costs.learn(step, work, *taken())
 
     @contextmanager
     def with_fix(self) -> Iterator[None]:
@@ -89,7 +90,6 @@ class Scheduler:
             OutOfTime: it is part of a step, and the deadline has passed before it; or it would pass within it, and
                 there is a fix.
         """
-        start_ms = self.deadline.elapsed_ms
         step, work = self._step or ("", 0.0)
         stage = f"{step}: {name}"
         if self._step is not None:
@@ -100,14 +100,25 @@ class Scheduler:
                 self.note_refusal(stage)
                 raise OutOfTime
             self._is_under_way = True
+        taken = self._stopwatch()
         try:
             yield
         finally:
             synchronise(self._device)
-            took_ms = self.deadline.elapsed_ms - start_ms
+            took_ms, waiting_ms = taken()
             self._stages_ms[name] = self._stages_ms.get(name, 0.0) + took_ms
         if self._step is not None:
-            self._costs.learn(stage, work, took_ms)
+            self._costs.learn(stage, work, took_ms, waiting_ms)
+
+    def _stopwatch(self) -> Callable[[], tuple[float, float]]:
+        """Says how many milliseconds have passed since it was made, and how many of them this thread waited."""
+        start_ms, before = self.deadline.elapsed_ms, thread_usage()
+
+        def taken() -> tuple[float, float]:
+            took_ms = self.deadline.elapsed_ms - start_ms
+            return took_ms, waited_ms(before, thread_usage(), took_ms)
+
+        return taken
 
     @property
     def timings(self) -> Timings:

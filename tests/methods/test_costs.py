@@ -110,3 +110,45 @@ def test_a_step_that_was_tried_and_is_cheap_again_stays_so():
     refused(costs, 100)  # it was dear, because it was preempted
     costs.learn("step", 1.0, 1.0)
     assert costs.upper_bound_ms("step", 1.0) < 3.0
+
+
+def beside_another_process(costs, times):
+    """A short step, of 1 ms, which is preempted for 4 ms every fourth time."""
+    for n in range(times):
+        costs.learn("step", 1.0, *((5.0, 4.0) if n % 4 == 0 else (1.0, 0.0)))
+
+
+def test_a_preempted_step_is_as_dear_as_its_own_work_and_the_share_of_waiting():
+    costs = learned([1.0] * 50, lambda work: 1.0)
+    beside_another_process(costs, 100)
+    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(2.0, rel=0.15)  # half of the time it waited
+
+
+def test_the_share_of_waiting_is_common_to_all_steps():
+    costs = learned([1.0] * 50, lambda work: 10.0, "long")
+    alone = costs.upper_bound_ms("long", 1.0)
+    beside_another_process(costs, 100)
+    assert costs.upper_bound_ms("long", 1.0) == pytest.approx(2.0 * alone, rel=0.15)
+    for _ in range(60):
+        costs.learn("step", 1.0, 1.0)
+    assert costs.upper_bound_ms("long", 1.0) == pytest.approx(alone, rel=0.05)  # the other process has ended
+
+
+def test_one_very_long_wait_counts_as_a_turn_of_the_scheduler():
+    costs = learned([1.0] * 50, lambda work: 2.0)
+    costs.learn("step", 1.0, 502.0, 500.0)
+    assert costs.upper_bound_ms("step", 1.0) < 4.0
+
+
+def test_waiting_that_lets_no_step_run_decays():
+    costs = learned([1.0] * 50, lambda work: 10.0)
+    for _ in range(50):
+        costs.learn("step", 1.0, 30.0, 20.0)
+    dear = costs.upper_bound_ms("step", 1.0)
+    assert dear == pytest.approx(30.0, rel=0.15)
+    for _ in range(20):
+        costs.note_refusal("step", keeps_cost=True, has_fix=True)  # another step has shown how long it waits
+    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(dear, rel=0.05)
+    for _ in range(20):
+        costs.note_refusal("step", keeps_cost=True)
+    assert costs.upper_bound_ms("step", 1.0) < 0.5 * dear

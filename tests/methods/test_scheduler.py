@@ -10,6 +10,8 @@ import pytest
 
 from engine import Budget, Fix, MatcherOptions, Navigator, NccOptions, NoFix, OrthoMap, Prior, Reason, SceneMatcher
 from engine.methods.ncc import Ncc
+from engine.methods.refinement import Refinement
+from engine.methods.scheduler import OutOfTime
 from engine.methods.sift import Sift
 
 NADIR = np.array([315.0, 296.0])
@@ -25,13 +27,13 @@ class FixedCosts:
     def upper_bound_ms(self, step, work):
         return self.per_unit.get(step.removesuffix(" at once"), 0.0) * work  # refinement, in both of its ways
 
-    def learn(self, step, work, ms):
+    def learn(self, step, work, ms, waited_ms=0.0):
         pass
 
-    def note_refusal(self, step, *, keeps_cost=False):
+    def note_refusal(self, step, *, keeps_cost=False, has_fix=False):
         pass
 
-    def note_abandoned(self, step, work, ms):
+    def note_abandoned(self, step, work, ms, waited_ms=0.0):
         pass
 
 
@@ -116,6 +118,16 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
         assert fix.stage == "refined"
     apart_m = math.hypot(by_coarse.east_m - by_fine.east_m, by_coarse.north_m - by_fine.north_m)
     assert apart_m < by_fine.relative_sigma_m
+
+
+def test_a_refinement_that_is_abandoned_leaves_the_coarse_fix(ground, make, frame, prior, monkeypatch):
+    def out_of_time(self, fix):
+        raise OutOfTime
+
+    monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
+    fix = make("ncc").locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert fix.stage == "coarse"
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
