@@ -120,7 +120,7 @@ class OrthoMap(Georeference):
         site._set_accuracy(georeference_sigma_m, slope_sigma_deg, original, heights_file)
         if heights_file is not None:
             site._attach(*open_surface(heights_file, site._grid))
-            site.surface_datum = vertical_datum(heights_file)
+            site.surface_datum = vertical_datum(heights_file.dataset)
         return site
 
     def _set_accuracy(

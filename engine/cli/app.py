@@ -43,7 +43,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},  # commands inherit it
 )
-map_app = typer.Typer(help="Facts about a map.")
+map_app = typer.Typer(help="A map: facts, audit, fetching.")
 dataset_app = typer.Typer(help="Published data sets.")
 bridge_app = typer.Typer(help="Live, beside an autopilot.")
 
@@ -62,6 +62,7 @@ app.command(cls=Command)(bag.bag)
 app.command(cls=Command)(doctor.doctor)
 map_app.command("info", cls=Command)(map_commands.info)
 map_app.command("audit", cls=Command)(map_commands.audit)
+map_app.command("fetch", cls=Command)(map_commands.fetch)
 dataset_app.command("import", cls=Command)(dataset.import_dataset)
 dataset_app.command("check", cls=Command)(dataset.check)
 bridge_app.command("mavlink", cls=Command)(bridge.mavlink)

@@ -156,15 +156,14 @@ def open_source(
     return Source(file, dataset, _checked(grid, argument, file))
 
 
-def vertical_datum(source: Source) -> str | None:
-    """Name of the system in which the heights in a file are metres above the sea; None where it names no such one.
+def vertical_datum(dataset: Any) -> str | None:
+    """Name of the system in which a dataset's heights are metres above the sea; None where it names no such one.
 
     Only a compound CRS does, such as EPSG:32636+5773; heights above the ellipsoid are the third axis of another.
     """
     from pyproj import CRS
 
-    own = source.dataset.crs
-    crs = CRS.from_wkt(own.to_wkt()) if own else None
+    crs = CRS.from_wkt(dataset.crs.to_wkt()) if dataset.crs else None
     vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None) if crs is not None else None
     if vertical is None or "ellips" in vertical.name.lower():  # which older files name a datum of the sea
         return None

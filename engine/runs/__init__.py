@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from engine.runs.inputs import FlightFiles
     from engine.runs.live_viewing import LiveViewTarget
     from engine.runs.map_audit import AuditFiles, MapAudit, audit_map
+    from engine.runs.map_fetch import FetchSettings, fetch_map
     from engine.runs.mavlink_bridge import (
         BridgeFiles,
         BridgeSettings,
@@ -50,6 +51,7 @@ __all__ = [
     "BridgeSettings",
     "ClosedLoopSettings",
     "Corrections",
+    "FetchSettings",
     "FlightFiles",
     "ImportOptions",
     "LiveViewTarget",
@@ -67,6 +69,7 @@ __all__ = [
     "diagnose_flight",
     "evaluate",
     "export_track",
+    "fetch_map",
     "fly_closed_loop",
     "import_dataset",
     "import_photographs",
@@ -96,6 +99,7 @@ _NAMES = {
     "engine.runs.inputs": "FlightFiles",
     "engine.runs.live_viewing": "LiveViewTarget",
     "engine.runs.map_audit": "AuditFiles MapAudit audit_map",
+    "engine.runs.map_fetch": "FetchSettings fetch_map",
     "engine.runs.mavlink_bridge": "BridgeFiles BridgeSettings MavlinkSettings run_mavlink_bridge",
     "engine.runs.mavlink_parameters": "write_parameter_file",
     "engine.runs.progress": "Progress",

@@ -33,6 +33,18 @@ def parse_position(name: str, text: str | None) -> Prior | None:
         raise OptionError(f"{name}: {error}") from None
 
 
+def parse_place(name: str, text: str) -> tuple[float, float]:
+    """Read LAT,LON.
+
+    Raises:
+        OptionError: the text is of another form, or a number is out of range.
+    """
+    lat_deg, lon_deg = _numbers(name, text, "LAT,LON", (2,), "in degrees")
+    if not (abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0):
+        raise OptionError(f"{name}: expected a place on the Earth, got {text!r}")
+    return lat_deg, lon_deg
+
+
 def parse_circle(name: str, text: str | None) -> tuple[float, float, float] | None:
     """Read LAT,LON,RADIUS_M; None where nothing was given.
 
@@ -90,6 +102,16 @@ def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
     if not (math.isfinite(budget_ms) and budget_ms > 0):
         raise OptionError(f"{name}: expected milliseconds above 0, got {budget_ms:g}")
     return Budget(total_ms=budget_ms, search_ms=math.inf)
+
+
+def check_above(name: str, value: float | None, low: float, most: float) -> None:
+    """Refuse a number that is not above one limit and at most another; None is not given.
+
+    Raises:
+        OptionError: it is not.
+    """
+    if value is not None and not low < value <= most:  # NaN fails too
+        raise OptionError(f"{name}: expected a number above {low:g} and at most {most:g}, got {value:g}")
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:

@@ -13,6 +13,7 @@ from engine.cli.options import (
     JsonOption,
     MapBoundsOption,
     MapCrsOption,
+    MapSigmaOption,
     OutOption,
     SurfaceOption,
     ThreadsOption,
@@ -89,3 +90,76 @@ def audit(
     else:
         tables.print_audit(result, str(map_path))
         console.say(f"written to {out}")
+
+
+def fetch(
+    around: Annotated[str, typer.Option("--around", metavar="LAT,LON", help="The middle of the map.")],
+    radius_m: Annotated[float, typer.Option("--radius-m", metavar="M", help="From there to each edge, at least.")],
+    source: Annotated[
+        str,
+        typer.Option(
+            "--source", metavar="URL", help="Tiles as https://host/{z}/{x}/{y}.png, or a WMS or WMTS: your choice."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.")],
+    gsd_m_per_px: Annotated[
+        float,
+        typer.Option("--gsd-m-per-px", metavar="M", help="Of the map; tiles are so fine or finer."),
+    ] = 0.5,
+    layer: Annotated[
+        str | None, typer.Option("--layer", metavar="NAME", help="Of a WMS or WMTS that has several.")
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option("--crs", metavar="EPSG:N", help="Of a WMS or WMTS; else UTM or Web Mercator.")
+    ] = None,
+    image_format: Annotated[
+        str | None,
+        typer.Option("--image-format", metavar="TYPE", help="Of a WMS or WMTS; else image/png if offered."),
+    ] = None,
+    tile_px: Annotated[int, typer.Option("--tile-px", metavar="N", help="Side of a template's tiles.")] = 256,
+    map_sigma_m: MapSigmaOption = None,
+    attribution: Annotated[
+        str | None, typer.Option("--attribution", metavar="TEXT", help="Whom to credit; kept in the file.")
+    ] = None,
+    licence: Annotated[
+        str | None, typer.Option("--licence", metavar="TEXT", help="What you may do with it; kept in the file.")
+    ] = None,
+    surface: Annotated[
+        str | None,
+        typer.Option(
+            "--surface", metavar="FILE|URL", help="Heights to cut out as well; {lat} and {lon} as N48 and E016."
+        ),
+    ] = None,
+    surface_datum: Annotated[
+        str | None,
+        typer.Option("--surface-datum", metavar="EPSG:N", help="Of its heights, where the file does not say."),
+    ] = None,
+    surface_slope_sigma_deg: Annotated[
+        float | None,
+        typer.Option("--surface-slope-sigma-deg", metavar="DEG", help="Accuracy of its slope over one frame."),
+    ] = None,
+    max_tiles: Annotated[
+        int, typer.Option("--max-tiles", min=1, metavar="N", help="More are refused before any is asked for.")
+    ] = 2000,
+    pause_ms: Annotated[float, typer.Option("--pause-ms", metavar="MS", help="Between two requests.")] = 100.0,
+    timeout_s: Annotated[float, typer.Option("--timeout-s", metavar="S", help="Without a byte.")] = 30.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be fetched.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fetch a map from a server that you name.
+
+    One request at a time. What was fetched stays beside the file until it is complete: the same command goes on
+    after an interruption. The server's terms decide what you may fetch, keep and use.
+    """
+    from engine.runs.map_fetch import FetchSettings, fetch_map
+
+    settings = FetchSettings(
+        around=around, radius_m=radius_m, source=source, gsd_m_per_px=gsd_m_per_px, layer=layer, crs=crs,
+        image_format=image_format, tile_px=tile_px, map_sigma_m=map_sigma_m, attribution=attribution,
+        licence=licence, surface=surface, surface_datum=surface_datum,
+        surface_slope_sigma_deg=surface_slope_sigma_deg, max_tiles=max_tiles, pause_ms=pause_ms,
+        timeout_s=timeout_s, dry_run=dry_run, force=force,
+    )  # fmt: skip
+    facts = fetch_map(settings, out, console.PROGRESS)
+    console.facts(facts, as_json, title=f"map around {around}")

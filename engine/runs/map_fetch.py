@@ -1,0 +1,279 @@
+"""Fetching a map, and a surface model with it, from servers that the user names."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from engine.errors import OptionError
+from engine.maps.fetching.client import Client, check_url, shown
+from engine.maps.fetching.heights import (
+    GLO30,
+    GLO30_SLOPE_SIGMA_DEG,
+    Heights,
+    files_for,
+    read_part,
+    write_heights,
+)
+from engine.maps.fetching.mosaic import FINE_ENOUGH, Bounds, Mosaic, Place, Wanted
+from engine.maps.fetching.pictures import fetch_pieces, piece_file, remove_pieces, write_map
+from engine.maps.fetching.services import capabilities, query_value, with_query
+from engine.maps.fetching.wms import plan_wms
+from engine.maps.fetching.wmts import plan_wmts
+from engine.maps.fetching.xyz import is_template, plan_xyz
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.runs.arguments import check_above, parse_place
+from engine.runs.folders import StrPath, check_file
+from engine.runs.progress import SILENT, Progress
+from engine.values import MAX_SIGMA_M
+
+MAX_TILES = 2000
+SURFACE = "surface.tif"
+"""Name of the surface model among the pieces, until the map is complete."""
+NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"
+_MAX_RADIUS_M = 100_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchSettings:
+    """What is fetched, and how; None where not given.
+
+    Attributes:
+        around: "LAT,LON", the middle of the map.
+        radius_m: half the side of the square that the map covers at least.
+        source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
+        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels.
+        layer: of a service that has several.
+        crs: of a service that offers several, EPSG:N.
+        image_format: of a service that offers several, such as image/jpeg.
+        tile_px: side of the tiles of a template.
+        map_sigma_m: georeferencing accuracy per axis, which the file states then.
+        attribution, licence: texts that the file states.
+        surface: file or URL of heights, or a template with {lat} and {lon}.
+        surface_datum: vertical datum of its heights, EPSG:N.
+        surface_slope_sigma_deg: slope accuracy over one frame, which the file states then.
+        max_tiles: as many as may be asked for.
+        pause_ms: between requests.
+        timeout_s: without a byte.
+        dry_run: only plan.
+        force: whether the files may be there already.
+    """
+
+    around: str
+    radius_m: float
+    source: str
+    gsd_m_per_px: float = 0.5
+    layer: str | None = None
+    crs: str | None = None
+    image_format: str | None = None
+    tile_px: int = 256
+    map_sigma_m: float | None = None
+    attribution: str | None = None
+    licence: str | None = None
+    surface: str | None = None
+    surface_datum: str | None = None
+    surface_slope_sigma_deg: float | None = None
+    max_tiles: int = MAX_TILES
+    pause_ms: float = 100.0
+    timeout_s: float = 30.0
+    dry_run: bool = False
+    force: bool = False
+
+
+def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT) -> dict[str, Any]:
+    """Fetch a map into one GeoTIFF, and a surface model beside it.
+
+    What has been fetched is kept beside the file until that is complete: the same call goes on later.
+
+    Args:
+        settings: what, and how.
+        out: the map; the surface model is ``NAME-surface.tif`` beside it.
+        progress: is shown how far it is, and what is waited for.
+
+    Returns:
+        What was planned, asked for and written.
+
+    Raises:
+        OptionError: a setting cannot be, more tiles are needed than allowed, or a file is there already.
+        MapError: a server refuses, cannot be reached, or sends something else.
+    """
+    out = Path(out)
+    surface_out = out.with_name(f"{out.stem}-surface.tif")
+    place = _checked(settings)
+    for file in (out, surface_out) if settings.surface else (out,):
+        check_file(file, settings.force)
+    progress.message(f"note: {NOTE}")
+    client = Client(settings.pause_ms, settings.timeout_s, progress.message)
+    mosaic = _planned(settings, place, client)
+    _say_what_comes(mosaic, settings, progress)
+    folder = out.with_name(f"{out.name}.tiles")
+    facts = _plan_facts(settings, mosaic, folder)
+    if settings.dry_run:
+        return facts | {"surface_files": list(map(shown, _surface_files(settings, mosaic))), "dry_run": True}
+    folder.mkdir(parents=True, exist_ok=True)
+    fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
+    asked = sum(progress.track(fetch_pieces(mosaic, client, folder), len(mosaic.pieces), "fetching"))
+    written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc))
+    if surface is not None:
+        os.replace(folder / SURFACE, surface_out)
+    remove_pieces(folder)
+    received = {"fetched": asked, "fetched_mb": client.bytes_received / 1e6}
+    return {"file": str(out)} | facts | received | written | _surface_facts(surface, surface_out)
+
+
+def _say_what_comes(mosaic: Mosaic, settings: FetchSettings, progress: Progress) -> None:
+    """What a person should know before the pictures come."""
+    for name, text in mosaic.states.items():
+        progress.message(f"the server states as {name}: {text}")
+    got, asked = mosaic.gsd_m_per_px, settings.gsd_m_per_px
+    coarser = ", coarser than asked: the server has no finer level" if got > asked * FINE_ENOUGH else ""
+    progress.message(f"{mosaic.kind} level {mosaic.level}: {got:.3g} m/px{coarser}")
+    if settings.map_sigma_m is None:
+        progress.message("the map's accuracy is not stated (`map_sigma_m`): matching will assume 3 m per axis")
+
+
+def _write(mosaic: Mosaic, folder: Path, out: Path, tags: dict[str, object]) -> dict[str, Any]:
+    """Write the map of fetched pieces."""
+    gaps = sum(piece_file(folder, piece).stat().st_size == 0 for piece in mosaic.pieces)
+    nodata_share = write_map(mosaic, folder, out, tags)
+    return {"gaps": gaps, "nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
+
+
+def _checked(settings: FetchSettings) -> Place:
+    """The place, where the settings can be.
+
+    Raises:
+        OptionError: one cannot.
+    """
+    lat_deg, lon_deg = parse_place("around", settings.around)
+    for name, most in (
+        ("radius_m", _MAX_RADIUS_M),
+        ("gsd_m_per_px", 1e3),
+        ("timeout_s", 3600.0),
+        ("map_sigma_m", MAX_SIGMA_M),
+        ("surface_slope_sigma_deg", 45.0),
+    ):
+        check_above(name, getattr(settings, name), 0.0, most)
+    if not 0.0 <= settings.pause_ms <= 60_000.0:
+        raise OptionError(f"pause_ms: expected milliseconds from 0 to 60000, got {settings.pause_ms:g}")
+    if not 16 <= settings.tile_px <= 4096:
+        raise OptionError(f"tile_px: expected 16 to 4096, got {settings.tile_px}")
+    if settings.surface is None and settings.surface_datum is not None:
+        raise OptionError("surface_datum: expected with `surface` only")
+    if settings.surface is None and settings.surface_slope_sigma_deg is not None:
+        raise OptionError("surface_slope_sigma_deg: expected with `surface` only")
+    if is_template(settings.source):
+        for name in ("layer", "crs", "image_format"):
+            if getattr(settings, name) is not None:
+                raise OptionError(f"{name}: expected with a WMS or WMTS only, not with a template of tiles")
+    check_url("source", settings.source)
+    return Place(lat_deg, lon_deg, settings.radius_m)
+
+
+def _planned(settings: FetchSettings, place: Place, client: Client) -> Mosaic:
+    """What is to be asked for; a service is asked for its capabilities first."""
+    url = settings.source
+    wanted = Wanted(
+        place=place,
+        gsd_m_per_px=settings.gsd_m_per_px,
+        max_tiles=settings.max_tiles,
+        layer=settings.layer,
+        crs=settings.crs,
+        image_format=settings.image_format,
+    )
+    if is_template(url):
+        return plan_xyz(url, wanted, settings.tile_px)
+    is_document = url.partition("?")[0].lower().endswith(".xml")
+    service = query_value(url, "service") or ("WMTS" if "wmts" in url.lower() else "WMS")
+    query = {"SERVICE": service.upper(), "REQUEST": "GetCapabilities"}
+    root = capabilities(client, url if is_document else with_query(url, query))
+    return plan_wmts(root, url, wanted) if root.tag.endswith("}Capabilities") else plan_wms(root, url, wanted)
+
+
+def _plan_facts(settings: FetchSettings, mosaic: Mosaic, folder: Path) -> dict[str, Any]:
+    """What is known before the first picture is asked for."""
+    width, height = mosaic.size_px
+    left = [piece for piece in mosaic.pieces if not piece_file(folder, piece).is_file()]
+    piece_mb = mosaic.piece_px[0] * mosaic.piece_px[1] * mosaic.bytes_per_px / 1e6
+    return {
+        "source": shown(settings.source),
+        "kind": mosaic.kind,
+        "level": mosaic.level,
+        "crs": mosaic.crs.to_string(),
+        "gsd_m_per_px": mosaic.gsd_m_per_px,
+        "width_px": width,
+        "height_px": height,
+        "bounds_deg": list(_bounds_deg(mosaic)),
+        "tiles": len(mosaic.pieces),
+        "tiles_to_fetch": len(left),
+        "expected_mb": len(left) * piece_mb,
+        "georeference_sigma_m": settings.map_sigma_m,
+        "attribution": settings.attribution,
+        "licence": settings.licence,
+        "server_states": [f"{name}: {text}" for name, text in mosaic.states.items()],
+        "note": NOTE,
+    }
+
+
+def _bounds_deg(mosaic: Mosaic) -> Bounds:
+    """West, south, east, north of the map in degrees."""
+    from pyproj import Transformer
+
+    found: Bounds = Transformer.from_crs(mosaic.crs, 4326, always_xy=True).transform_bounds(*mosaic.bounds)
+    return found
+
+
+def _map_tags(settings: FetchSettings, mosaic: Mosaic, fetched_utc: str) -> dict[str, object]:
+    """Metadata items of the map: its accuracy, and where it is from."""
+    tags = {
+        GEOREFERENCE_TAG: settings.map_sigma_m,
+        "SOURCE": shown(settings.source),
+        "SOURCE_LEVEL": mosaic.level,
+        "FETCHED_UTC": fetched_utc,
+        "ATTRIBUTION": settings.attribution or mosaic.states.get("Attribution"),
+        "LICENCE": settings.licence,
+        "SERVER_ACCESS_CONSTRAINTS": mosaic.states.get("AccessConstraints"),
+    }
+    return {name: value for name, value in tags.items() if value is not None}
+
+
+# ---------------------------------------------------------------------------------------------- surface model
+
+
+def _surface_files(settings: FetchSettings, mosaic: Mosaic) -> list[str]:
+    return [] if settings.surface is None else files_for(settings.surface, _bounds_deg(mosaic))
+
+
+def _fetch_surface(
+    settings: FetchSettings, mosaic: Mosaic, client: Client, out: Path, fetched_utc: str
+) -> tuple[Heights, float | None] | None:
+    """Write the surface under the map; its heights, and its slope accuracy where it is known."""
+    if settings.surface is None:
+        return None
+    files = _surface_files(settings, mosaic)
+    heights = read_part(files, mosaic.bounds, mosaic.crs, settings.surface_datum, client)
+    known = GLO30_SLOPE_SIGMA_DEG if any(GLO30 in file for file in files) else None
+    slope_sigma_deg = settings.surface_slope_sigma_deg or known
+    tags = {SLOPE_TAG: slope_sigma_deg, "SOURCE": ", ".join(map(shown, files)), "FETCHED_UTC": fetched_utc}
+    write_heights(heights, out, {name: value for name, value in tags.items() if value is not None})
+    return heights, slope_sigma_deg
+
+
+def _surface_facts(surface: tuple[Heights, float | None] | None, file: Path) -> dict[str, Any]:
+    """What was written of a surface."""
+    import numpy as np
+
+    if surface is None:
+        return {"surface": None}
+    heights, slope_sigma_deg = surface
+    return {
+        "surface": str(file),
+        "surface_datum": heights.datum,
+        "surface_range_m": [float(np.nanmin(heights.heights_m)), float(np.nanmax(heights.heights_m))],
+        "surface_nodata_share": float(np.isnan(heights.heights_m).mean()),
+        "slope_sigma_deg": slope_sigma_deg,
+    }

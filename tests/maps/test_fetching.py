@@ -1,0 +1,525 @@
+"""Maps fetched from a server on loopback are what it serves, where it lies; what goes wrong is one clear line."""
+
+import io
+import itertools
+import json
+import re
+
+import numpy as np
+import pytest
+import rasterio
+from PIL import Image
+from pyproj import Transformer
+from rasterio.enums import Resampling
+from rasterio.transform import Affine
+
+from engine import Fix, OrthoMap
+from engine.errors import MapError, OptionError
+from engine.maps.fetching import client
+from engine.maps.fetching.client import shown
+from engine.maps.fetching.heights import files_for
+from engine.maps.fetching.xyz import tile_url
+from engine.runs.map_fetch import FetchSettings, fetch_map
+from engine.runs.simulation import write_flight
+from engine.runs.single_image import locate_image
+from engine.sim import plan_flight
+from engine.values import Window
+from tests.support.map_servers import HALF_WORLD_M, serving
+from tests.support.towns import drawn_town
+
+SIZE = 700
+GSD_M = 0.5
+CORNER = (613_000.0, 5_345_000.0)  # UTM 33N, near Vienna: easting and northing
+ZOOM = 18
+
+
+def from_origin(west, north, step):
+    return Affine(step, 0.0, west, 0.0, -step, north)
+
+
+def encoded(size):
+    """(H, W, 3) whose pixels say their own column and row."""
+    row, column = np.mgrid[:size, :size]
+    return np.stack([column % 256, row % 256, column // 256 * 16 + row // 256 + 1], axis=-1).astype(np.uint8)
+
+
+def place_of(pixels):
+    """(..., 2) column and row that pixels (..., 3) say."""
+    r, g, b = np.moveaxis(pixels.astype(int), -1, 0)
+    return np.stack([r + 256 * ((b - 1) // 16), g + 256 * ((b - 1) % 16)], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def raster(tmp_path_factory):
+    path = tmp_path_factory.mktemp("served") / "ortho.tif"
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "width": SIZE, "height": SIZE}
+    with rasterio.open(path, "w", crs="EPSG:32633", transform=from_origin(*CORNER, GSD_M), **profile) as file:
+        file.write(np.moveaxis(encoded(SIZE), 2, 0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return tmp_path_factory.mktemp("files")
+
+
+@pytest.fixture(scope="module")
+def one_server(raster, files):
+    with serving(raster, files) as server:
+        yield server
+
+
+@pytest.fixture
+def server(one_server, monkeypatch):
+    """Asked without a proxy, and nothing of another test left."""
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(client, "FIRST_WAIT_S", 0.01)
+    one_server.asked.clear()
+    one_server.trouble.clear()
+    one_server.wms_version, one_server.most_px, one_server.layers, one_server.kvp = "1.3.0", 200, ("ortho",), False
+    return one_server
+
+
+@pytest.fixture(scope="module")
+def middle():
+    lon, lat = Transformer.from_crs(32633, 4326, always_xy=True).transform(CORNER[0] + 175.0, CORNER[1] - 175.0)
+    return f"{lat},{lon}"
+
+
+@pytest.fixture
+def settings(middle):
+    """Settings of a fetch about the middle of the raster."""
+
+    def make(source, radius_m=60.0, **others):
+        others = {"gsd_m_per_px": 0.5, "pause_ms": 0.0, "timeout_s": 5.0} | others
+        return FetchSettings(around=middle, radius_m=radius_m, source=source, **others)
+
+    return make
+
+
+@pytest.fixture
+def fetched(settings, tmp_path):
+    """Fetch into a new file: the facts, the pixels (H, W, 4) and the open dataset's profile."""
+    numbers = itertools.count()
+
+    def fetch(source, radius_m=60.0, **others):
+        out = tmp_path / f"map-{next(numbers)}.tif"
+        facts = fetch_map(settings(source, radius_m, **others), out)
+        with rasterio.open(out) as file:
+            pixels = np.moveaxis(np.concatenate([file.read(), file.dataset_mask()[None]]), 0, 2)
+            return facts, pixels, file.profile | {"tags": file.tags(), "bounds": file.bounds}
+
+    return fetch
+
+
+def offsets_px(pixels, profile):
+    """Distance of what each valid pixel says from where it lies, in pixels of the served raster."""
+    row, column = np.nonzero(pixels[..., 3])
+    x, y = profile["transform"] @ (column + 0.5, row + 0.5)
+    east, north = Transformer.from_crs(profile["crs"], 32633, always_xy=True).transform(x, y)
+    here = np.stack([(east - CORNER[0]) / GSD_M, (CORNER[1] - north) / GSD_M], axis=-1) - 0.5
+    return np.abs(place_of(pixels[row, column, :3]) - here).max(axis=-1)
+
+
+# ------------------------------------------------------------ what is fetched
+
+
+@pytest.mark.parametrize(
+    ("template", "path"),
+    [("{z}/{x}/{y}.png", None), ("{z}/{x}/{-y}.png", "tms"), ("{q}", "quadkey")],
+    ids=["XYZ", "TMS", "quadkey"],
+)
+def test_tiles_lie_where_they_say(server, fetched, template, path, monkeypatch):
+    if path is not None:  # the server knows XYZ only: what it is asked for is translated by the rule of the scheme
+        monkeypatch.setattr(client.Client, "_once", translated(client.Client._once, path))
+    facts, pixels, profile = fetched(f"{server.url}/tiles/{template}")
+    assert (facts["kind"], facts["level"], facts["crs"]) == ("XYZ", str(ZOOM), "EPSG:3857")
+    assert profile["count"] == 3
+    assert facts["gsd_m_per_px"] == pytest.approx(0.399, abs=0.002)  # of level 18 at 48 degrees
+    assert offsets_px(pixels, profile).max() < 0.51
+    assert facts["tiles"] == facts["fetched"] == facts["width_px"] * facts["height_px"] // 256**2
+
+
+def translated(once, path):
+    def ask(self, url, first_bytes):
+        if path == "tms":
+            zoom, column, row = map(int, re.findall(r"/(\d+)", url)[-3:])
+            url = re.sub(r"\d+\.png$", f"{2**zoom - 1 - row}.png", url)
+        else:
+            key = url.rpartition("/")[2]
+            bits = [(int(digit) & 1, int(digit) >> 1) for digit in key]
+            column, row = (int("".join(str(pair[axis]) for pair in bits), 2) for axis in (0, 1))
+            url = url.replace(key, f"{len(key)}/{column}/{row}.png")
+        return once(self, url, first_bytes)
+
+    return ask
+
+
+def test_a_quadkey_is_that_of_its_inventor():
+    assert tile_url("{q}", 3, 3, 5) == "213"  # the example of Bing Maps' tile system
+
+
+@pytest.mark.parametrize("version", ["1.3.0", "1.1.1"])
+@pytest.mark.parametrize("crs", [None, "EPSG:31256", "EPSG:3857", "EPSG:4326", "CRS:84"])
+def test_a_wms_draws_on_the_grid_that_is_asked_for(server, fetched, version, crs):
+    server.wms_version = version
+    if (version, crs) == ("1.1.1", "CRS:84"):
+        with pytest.raises(OptionError, match="crs: expected one that the server offers"):
+            fetched(f"{server.url}/wms", crs=crs)
+        return
+    server.most_px = 200 if version == "1.3.0" else 1024  # 1.1.1 does not state it
+    facts, pixels, profile = fetched(f"{server.url}/wms?map=/town.map", crs=crs)
+    assert profile["crs"].to_epsg() == {None: 32633, "CRS:84": 4326}.get(crs) or profile["crs"] == crs
+    assert facts["gsd_m_per_px"] == pytest.approx(0.5, rel=1e-6)
+    assert facts["tiles"] == (4 if version == "1.3.0" else 1)  # 240 px a side and a little
+    assert pixels[..., 3].all()
+    assert offsets_px(pixels, profile).max() < 0.51 + (0.1 if crs in ("EPSG:4326", "CRS:84") else 0.0)
+    assert all("map=/town.map" in path for path in server.asked)
+    assert facts["server_states"] == [
+        "Title: The town", "Fees: none", "AccessConstraints: only for tests", "Attribution: the town's surveyor",
+    ]  # fmt: skip
+    assert profile["tags"]["ATTRIBUTION"] == "the town's surveyor"
+
+
+@pytest.mark.parametrize("kvp", [False, True], ids=["template", "query"])
+def test_a_wmts_is_read_in_its_own_grid(server, fetched, kvp):
+    server.kvp = kvp
+    facts, pixels, profile = fetched(f"{server.url}/wmts" + ("" if kvp else "/1.0.0/WMTSCapabilities.xml"))
+    assert (facts["kind"], facts["level"], profile["crs"].to_epsg()) == ("WMTS", "fine", 31256)
+    assert (profile["transform"].a, profile["transform"].e) == pytest.approx((0.5, -0.5), rel=1e-9)
+    assert offsets_px(pixels, profile).max() < 0.51
+    assert facts["server_states"][1] == "AccessConstraints: CC BY"
+
+
+def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path, raster):
+    """Of tiles cut from a picture that is on their grid: equal to the bit, in the same place."""
+    step, corner = 2.0 * HALF_WORLD_M / (256 << ZOOM), (143_000 * 256 + 70, 90_900 * 256 + 40)
+    origin = corner[0] * step - HALF_WORLD_M, HALF_WORLD_M - corner[1] * step
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "width": SIZE, "height": SIZE, "crs": "EPSG:3857"}
+    noise = np.random.default_rng(0).integers(1, 255, (3, SIZE, SIZE), np.uint8)
+    with rasterio.open(tmp_path / "own.tif", "w", transform=from_origin(*origin, step), **profile) as file:
+        file.write(noise)
+    lon, lat = Transformer.from_crs(3857, 4326, always_xy=True).transform(
+        origin[0] + SIZE / 2 * step, origin[1] - SIZE / 2 * step
+    )
+    server.raster = tmp_path / "own.tif"
+    wanted = FetchSettings(
+        around=f"{lat},{lon}", radius_m=260.0, source=f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", pause_ms=0.0,
+        map_sigma_m=1.5, attribution="a surveyor", licence="CC BY 4.0",
+    )  # fmt: skip
+    try:
+        facts = fetch_map(wanted, tmp_path / "map.tif")
+    finally:
+        server.raster = raster
+    own, site = OrthoMap.open(tmp_path / "own.tif"), OrthoMap.open(tmp_path / "map.tif")
+    x, y = np.rint(site.pixel_from_geodetic(*own.geodetic_from_pixel([0.0, 0.0]))).astype(int).tolist()
+    np.testing.assert_allclose(
+        site.geodetic_from_pixel([float(x), float(y)]), own.geodetic_from_pixel([0.0, 0.0]), atol=1e-9
+    )
+    part = Window(x, y, SIZE, SIZE)
+    assert site.valid(part).all()
+    np.testing.assert_array_equal(site.gray(part), own.gray(Window(0, 0, SIZE, SIZE)))
+    everything = site.valid(Window(0, 0, site.width_px, site.height_px))
+    assert everything.sum() == SIZE * SIZE  # what is beside the picture, or in a missing tile, is nodata
+    assert 0 < facts["gaps"] < facts["tiles"]
+    assert facts["nodata_share"] == pytest.approx(1.0 - everything.mean())
+    assert site.georeference_sigma_m == 1.5
+    with rasterio.open(tmp_path / "map.tif") as file:
+        assert (file.tags()["ATTRIBUTION"], file.tags()["LICENCE"]) == ("a surveyor", "CC BY 4.0")
+        assert file.tags()["SOURCE"] == wanted.source
+        assert file.profile["compress"] == "deflate"
+        assert file.profile["tiled"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.tif", "own.tif"]
+
+
+@pytest.mark.slow
+def test_a_frame_is_located_over_a_fetched_map_as_over_the_map_itself(tmp_path, server, raster):
+    """A town's own map, and what WMS and tiles make of it: the fixes agree to a quarter of a pixel of 0.53 m."""
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+    names, values = (line.split(",") for line in (tmp_path / "telemetry.csv").read_text().splitlines())
+    row = dict(zip(names, values, strict=True))
+    names, values = (line.split(",") for line in (tmp_path / "truth.csv").read_text().splitlines()[:2])
+    truth = dict(zip(names, values, strict=True))
+    around = f"{truth['lat_deg']},{truth['lon_deg']}"
+    server.raster, server.draws, server.most_px = tmp_path / "map.tif", Resampling.cubic, 1024
+    try:
+        for name, source in (("wms", "/wms"), ("tiles", "/tiles/{z}/{x}/{y}.png")):
+            wanted = FetchSettings(
+                around=around, radius_m=150.0, source=server.url + source, gsd_m_per_px=0.53, pause_ms=0.0
+            )
+            fetch_map(wanted, tmp_path / f"{name}.tif")
+    finally:
+        server.raster, server.draws = raster, Resampling.nearest
+    site, fixes = OrthoMap.open(tmp_path / "map.tif"), {}
+    for name in ("map", "wms", "tiles"):
+        fix = locate_image(
+            tmp_path / "frames" / row["frame"], tmp_path / f"{name}.tif", tmp_path / "camera.yaml",
+            surface=tmp_path / "dsm.tif", method="ncc", near=f"{around},20",
+            height_agl_m=float(row["height_agl_m"]), heading_deg=float(row["heading_deg"]),
+        )  # fmt: skip
+        assert isinstance(fix, Fix), (name, fix)
+        fixes[name] = np.array(site.frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg))
+    assert np.hypot(*(fixes["wms"] - fixes["map"])[:2]) < 0.13
+    assert np.hypot(*(fixes["tiles"] - fixes["map"])[:2]) < 0.13
+
+
+# ------------------------------------------------------------ manners, interruptions
+
+
+def test_nothing_is_asked_for_where_too_much_is_wanted_or_nothing_is_to_be_fetched(server, settings, tmp_path):
+    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
+    with pytest.raises(OptionError, match=r"max_tiles: expected at most 9 tiles, but the area has \d+") as error:
+        fetch_map(settings(source, 300.0, max_tiles=9), tmp_path / "map.tif")
+    count = int(re.search(r"has (\d+)", str(error.value))[1])
+    facts = fetch_map(settings(source, 300.0, max_tiles=count, dry_run=True), tmp_path / "map.tif")
+    assert (facts["tiles"], facts["tiles_to_fetch"], facts["dry_run"]) == (count, count, True)
+    assert facts["expected_mb"] == pytest.approx(count * 256**2 * 2 / 1e6)
+    assert server.asked == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_fetch_goes_on_where_it_was(server, settings, tmp_path):
+    source, out = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", tmp_path / "map.tif"
+    whole = fetch_map(settings(source, 120.0), tmp_path / "whole.tif")
+    first_asked = list(server.asked)
+    server.asked.clear()
+    server.trouble[:] = [(first_asked[4], (403, {}))]
+    with pytest.raises(MapError, match="answers 403"):
+        fetch_map(settings(source, 120.0), out)
+    assert len(server.asked) == 5
+    assert not out.exists()
+    kept = tmp_path / "map.tif.tiles"
+    assert len(list(kept.glob("*.piece"))) == 4
+    (kept / "half.part").write_bytes(b"what a kill leaves")
+    server.asked.clear()
+    facts = fetch_map(settings(source, 120.0), out)
+    assert server.asked == first_asked[4:]
+    assert (facts["tiles_to_fetch"], facts["fetched"]) == (whole["tiles"] - 4, whole["tiles"] - 4)
+    assert not kept.exists()
+    with rasterio.open(out) as one, rasterio.open(tmp_path / "whole.tif") as other:
+        np.testing.assert_array_equal(one.read(), other.read())
+        assert one.transform == other.transform
+
+
+def test_a_busy_server_and_a_broken_connection_are_waited_for(server, settings, tmp_path, monkeypatch):
+    waits = []
+    monkeypatch.setattr(client.time, "sleep", waits.append)
+    tile = "/tiles/"
+    server.trouble[:] = [
+        (tile, (429, {"Retry-After": "7"})), (tile, (503, {"Retry-After": "Wed, 21 Oct 2015 07:28:00 GMT"})),
+        (tile, "break"), (tile, (502, {})),
+    ]  # fmt: skip
+    facts = fetch_map(settings(f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", pause_ms=250.0), tmp_path / "map.tif")
+    assert len(server.asked) == facts["tiles"] + 4
+    long = [wait for wait in waits if wait not in (0.0,) and not 0.2 < wait <= 0.25]
+    assert long == pytest.approx([7.0, 0.04, 0.08])  # as asked; at once, by a date gone by; then ever longer
+    assert sum(0.2 < wait <= 0.25 for wait in waits) >= facts["tiles"] - 1  # the pause
+    assert len(server.agents) == 1
+    assert server.agents.pop().startswith("scenematch")
+
+
+def test_a_server_that_stays_busy_ends_the_fetch(server, settings, tmp_path):
+    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
+    server.trouble[:] = [("/tiles/", (503, {}))] * 5
+    with pytest.raises(MapError, match=r"the server answers 503 Service Unavailable, at attempt 5$"):
+        fetch_map(settings(source), tmp_path / "map.tif")
+    server.trouble[:] = [("/tiles/", (429, {"Retry-After": "3600"}))]
+    with pytest.raises(MapError, match="at attempt 1, and asks for a wait of 3600 s"):
+        fetch_map(settings(source), tmp_path / "map.tif")
+
+
+def test_what_is_no_picture_is_refused_with_what_it_says(server, settings, tmp_path):
+    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
+    picture = io.BytesIO()
+    Image.new("RGB", (512, 512)).save(picture, "PNG")
+    for answer, text in (
+        (
+            b"<html><body>Please <b>log in</b></body></html>",
+            "expected a picture, got text/html that says 'Please log in'",
+        ),
+        (picture.getvalue(), "expected a picture of 256 x 256 px, got 512 x 512 px; give `tile_px` 512"),
+        (picture.getvalue()[:-30], "expected a picture"),
+        ((401, {}), "the server answers 401 Unauthorized: it does not let you in"),
+    ):
+        server.trouble[:] = [("/tiles/", answer)]
+        with pytest.raises(MapError, match=re.escape(text)):
+            fetch_map(settings(source), tmp_path / "map.tif")
+    assert not (tmp_path / "map.tif").exists()
+    assert list((tmp_path / "map.tif.tiles").glob("*.piece")) == []
+
+
+def test_where_nothing_is(server, settings, tmp_path):
+    with pytest.raises(MapError, match=r"source: the server has no data there on level '18', 0.398 m/px"):
+        fetch_map(settings(f"{server.url}/nowhere/{{z}}/{{x}}/{{y}}.png"), tmp_path / "a.tif")
+    with pytest.raises(MapError, match=r"/nowhere\?SERVICE=WMS&REQUEST=GetCapabilities: the server has nothing"):
+        fetch_map(settings(f"{server.url}/nowhere"), tmp_path / "b.tif")
+    with pytest.raises(MapError, match=r"the host no-such-host.invalid is unknown, or there is no network"):
+        fetch_map(settings("http://no-such-host.invalid/{z}/{x}/{y}.png"), tmp_path / "c.tif")
+    with pytest.raises(MapError, match=r"cannot connect to 127.0.0.1"):
+        fetch_map(settings("http://127.0.0.1:9/{z}/{x}/{y}.png"), tmp_path / "d.tif")
+    server.wms_version = "1.3.0"
+    with pytest.raises(OptionError, match="around: expected a place that the layer covers"):
+        fetch_map(FetchSettings(around="10,10", radius_m=50, source=f"{server.url}/wms"), tmp_path / "e.tif")
+
+
+def test_a_proxy_that_is_not_there_is_named(settings, tmp_path, monkeypatch):
+    monkeypatch.setenv("http_proxy", "http://user:secret@127.0.0.1:9")
+    monkeypatch.delenv("no_proxy", raising=False)
+    with pytest.raises(MapError, match=r"cannot connect to example.org, through the proxy 127.0.0.1 ") as error:
+        fetch_map(settings("http://example.org/{z}/{x}/{y}.png"), tmp_path / "map.tif")
+    assert "secret" not in str(error.value)
+
+
+def test_a_wms_says_which_layers_it_has_and_what_was_wrong(server, settings, tmp_path):
+    server.layers = ("ortho", "cadastre")
+    with pytest.raises(OptionError, match="layer: expected one that the server has, ortho, cadastre, got none"):
+        fetch_map(settings(f"{server.url}/wms"), tmp_path / "map.tif")
+    with pytest.raises(OptionError, match="layer: expected one that the server has, ortho, cadastre, got roofs"):
+        fetch_map(settings(f"{server.url}/wms", layer="roofs"), tmp_path / "map.tif")
+    server.trouble[:] = [("GetMap", b"<ServiceExceptionReport><ServiceException code='X'>Style &lt;no&gt; unknown"
+                          b"</ServiceException></ServiceExceptionReport>")]  # fmt: skip
+    with pytest.raises(MapError, match="that says 'Style <no> unknown'"):
+        fetch_map(settings(f"{server.url}/wms?LAYERS=ortho"), tmp_path / "map.tif")
+    facts = fetch_map(
+        settings(f"{server.url}/wms", layer="cadastre", image_format="image/jpeg"), tmp_path / "map.tif"
+    )
+    assert facts["expected_mb"] < facts["width_px"] * facts["height_px"] * 0.6 / 1e6
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("https://tiles.example.org/{z}/{x}.png", "expected {z}, {x} and {y}, or {q}"),
+        ("https://{s}.example.org/{z}/{x}/{y}.png", "got {s}"),
+        ("ftp://example.org/{z}/{x}/{y}.png", "begins with https:// or http://"),
+        ("map.tif", "begins with https:// or http://"),
+        ("https://me:word@example.org/wms", "without user and password"),
+    ],
+)
+def test_sources_that_cannot_be(settings, tmp_path, source, message):
+    with pytest.raises(OptionError, match=re.escape(message)):
+        fetch_map(settings(source), tmp_path / "map.tif")
+
+
+def test_keys_are_not_repeated():
+    assert (
+        shown("https://a.org/wms?map=/x.map&api_key=abc&layers=o")
+        == "https://a.org/wms?map=/x.map&api_key=...&layers=o"
+    )
+    assert shown("https://a.org/{z}/{x}/{y}.png?access_token=abc").endswith("/{z}/{x}/{y}.png?access_token=...")
+    assert shown("https://a.org/wms?layers=o") == "https://a.org/wms?layers=o"
+
+
+# ------------------------------------------------------------ surface models
+
+
+def height_tile(path, lat, lon, nodata=None):
+    """A file as Copernicus GLO-30 has them, coarser: the first pixel's centre is on the north-western degree."""
+    step = 1.0 / 1200.0
+    transform = Affine(step, 0.0, lon - step / 2, 0.0, -step, lat + 1 + step / 2)
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "width": 1200, "height": 1200, "tiled": True}
+    with rasterio.open(path, "w", crs="EPSG:4326", transform=transform, nodata=nodata, **profile) as file:
+        file.write(plane(*np.meshgrid(*(transform @ (np.arange(1200) + 0.5, np.arange(1200) + 0.5)))), 1)
+
+
+def plane(lon, lat):
+    """Heights that say where they are."""
+    return (200.0 + 1e3 * (lon - 16.0) - 2e3 * (lat - 48.0)).astype(np.float32)
+
+
+@pytest.mark.parametrize("remote", [True, False], ids=["url", "files"])
+def test_a_surface_is_cut_from_the_files_of_degrees(server, files, settings, tmp_path, remote):
+    """Over the corner of three files, the fourth being sea: heights as they are, their datum and slope stated."""
+    names = "Copernicus_DSM_COG_10_{lat}_00_{lon}_00_DEM.tif"
+    for lat, lon in ((48, 16), (48, 17), (47, 16)):
+        height_tile(files / names.format(lat=f"N{lat}", lon=f"E0{lon}"), lat, lon)
+    server.draws = Resampling.nearest
+    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
+    wanted = settings(
+        source, 2000.0, gsd_m_per_px=50.0, surface=f"{server.url}/files/{names}" if remote else f"{files}/{names}"
+    )
+    corner = FetchSettings(**{name: getattr(wanted, name) for name in wanted.__slots__} | {"around": "48.0,17.0"})
+    server.trouble[:] = [("/tiles/", tile_answer()) for _ in range(4)]
+    facts = fetch_map(corner, tmp_path / "map.tif")
+    assert facts["surface"] == str(tmp_path / "map-surface.tif")
+    assert facts["surface_datum"] == "EGM2008 height"
+    assert 0.1 < facts["surface_nodata_share"] < 0.5
+    with rasterio.open(tmp_path / "map-surface.tif") as file, rasterio.open(tmp_path / "map.tif") as ground:
+        heights, known = file.read(1), file.dataset_mask() > 0
+        row, column = np.nonzero(known)
+        lon, lat = file.transform @ (column + 0.5, row + 0.5)
+        np.testing.assert_allclose(heights[known], plane(lon, lat), atol=1e-2)  # float32, and no resampling
+        lon, lat = (
+            v.reshape(known.shape) for v in file.transform @ (np.indices(known.shape)[::-1] + 0.5).reshape(2, -1)
+        )
+        half = file.transform.a / 2
+        np.testing.assert_array_equal(known, ~((lon > 17.0 - half) & (lat < 48.0 + half)))  # the south-east is sea
+        west, south, east, north = rasterio.warp.transform_bounds("EPSG:3857", "EPSG:4326", *ground.bounds)
+        assert file.bounds.left < west
+        assert file.bounds.right > east
+        assert file.bounds.bottom < south
+        assert file.bounds.top > north
+    site = OrthoMap.open(tmp_path / "map.tif", surface=tmp_path / "map-surface.tif")
+    assert (site.surface_datum, site.slope_sigma_deg) == ("EGM2008 height", 0.5)
+
+
+def tile_answer():
+    picture = io.BytesIO()
+    Image.new("RGB", (256, 256), (90, 100, 110)).save(picture, "PNG")
+    return picture.getvalue()
+
+
+def test_files_of_degrees_by_their_names():
+    assert files_for("d/{lat}{lon}.tif", (-0.2, -0.2, 0.2, 0.2)) == [
+        "d/S01W001.tif", "d/S01E000.tif", "d/N00W001.tif", "d/N00E000.tif"
+    ]  # fmt: skip
+    assert files_for("own.tif", (0, 0, 1, 1)) == ["own.tif"]
+    with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon}"):
+        files_for("d/{lat}.tif", (0, 0, 1, 1))
+
+
+def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
+    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
+    height_tile(files / "far.tif", 10, 10)
+    (files / "tiles/0/0").mkdir(parents=True)
+    (files / "tiles/0/0/0.png").write_bytes(tile_answer())
+    (files / "page.tif").write_bytes(b"<html>not here</html>")
+    for surface, datum, error, text in (
+        (f"{server.url}/files/none.tif", None, MapError, "there is no http://127.0.0.1"),
+        (f"{server.url}/files/page.tif", None, MapError, "page.tif: cannot be read as a GeoTIFF"),
+        (str(files / "none.tif"), None, MapError, "surface: expected a file of heights, but there is no /"),
+        (str(files / "{lat}{lon}.tif"), None, MapError, "surface: expected a file of heights, but there is no "),
+        (str(files / "far.tif"), None, MapError, "surface: "),
+        (str(files / "tiles"), None, MapError, "surface: expected heights, got a folder of pictures"),
+        (str(files / "far.tif"), "EPSG:4326", OptionError, "surface_datum: expected a vertical datum in metres"),
+    ):
+        with pytest.raises(error, match=re.escape(text)):
+            fetch_map(settings(source, surface=surface, surface_datum=datum), tmp_path / "map.tif")
+    assert not (tmp_path / "map.tif").exists()
+
+
+# ------------------------------------------------------------ the command
+
+
+def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
+    from engine.cli.app import run
+
+    out = tmp_path / "map.tif"
+    given = [
+        "map", "fetch", f"--around={middle}", "--radius-m=50", f"--source={server.url}/wms", f"--out={out}",
+        "--pause-ms=0", "--json",
+    ]  # fmt: skip
+    assert run([*given, "--dry-run"]) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert planned["dry_run"]
+    assert run(given) == 0
+    printed = capsys.readouterr()
+    facts = json.loads(printed.out)
+    assert (facts["file"], facts["tiles"]) == (str(out), planned["tiles"])
+    assert "its terms decide what may be fetched, kept and used" in printed.err
+    assert "the server states as AccessConstraints: only for tests" in printed.err
+    assert run(given) == 2
+    found = json.loads(capsys.readouterr().out)
+    assert (found["argument"], "exists" in found["error"]) == ("--out", True)
+    assert run([*given, "--force", "--max-tiles=1", "--radius-m=150"]) == 2
+    assert "--max-tiles: expected at most 1 tiles" in capsys.readouterr().err
