@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -261,6 +261,14 @@ def _scratch(name: str, shape: tuple[int, ...]) -> FloatImage:
 
 
 def _transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
-    """In place, of which only so many rows are not zero, or wanted; powers of 2 are faster as a whole."""
-    power_of_2 = values.shape[0] & (values.shape[0] - 1) == 0
-    cv2.dft(values, values, flags, 0 if power_of_2 else rows)
+    """In place, of which only so many rows are not zero, or wanted.
+
+    OpenCV hands whole pictures to IPP where it is built with it, which is three to four times as fast as its own
+    transform of a part of the rows.
+    """
+    cv2.dft(values, values, flags, 0 if _uses_ipp() else rows)
+
+
+@cache
+def _uses_ipp() -> bool:
+    return hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
