@@ -147,6 +147,7 @@ def open_flight(
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
+        _check_is_table(Path(telemetry))
         table = open_telemetry(telemetry, source, source.description, columns)
         rows, remarks = table.rows, table.remarks
     elif isinstance(source, VideoFile):
@@ -159,6 +160,15 @@ def open_flight(
     if camera is not None:
         camera.check_size(source.read(flight.names[0]).shape)
     return flight
+
+
+def _check_is_table(telemetry: Path) -> None:
+    """Metadata in a video is not read: no library for it is kept, light and made for every supported Python."""
+    if telemetry.suffix.lower() in (*VIDEO_SUFFIXES, ".klv", ".360"):
+        raise TelemetryError(
+            f"{telemetry}: expected a table or a flight log, got a video's metadata (MISB KLV, GoPro GPMF), "
+            "which is not read; convert it to a .SRT as docs/map-and-flight-files.md shows"
+        )
 
 
 def subtitles_beside(frames: str | Path) -> Path | None:
