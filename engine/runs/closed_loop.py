@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from engine.camera import Camera
-from engine.errors import OptionError
+from engine.errors import OptionError, require
 from engine.formats.flight import write_flight_folder
 from engine.formats.track import TrackRow, read_track, track_row, write_track
 from engine.formats.truth import read_truth
@@ -103,7 +103,11 @@ def fly_closed_loop(
 
     Returns:
         The figures, as loop.json has them.
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the plots, is not installed.
     """
+    require("matplotlib", "desk")
     out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
     if world.camera_pitch_deg != NADIR_PITCH_DEG:
         raise OptionError(f"camera_pitch_deg: expected none in a closed loop, got {world.camera_pitch_deg:g}")

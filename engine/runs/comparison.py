@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from engine.errors import OptionError
+from engine.errors import OptionError, require
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
 from engine.methods import METHODS
@@ -84,7 +84,11 @@ def compare(
 
     Returns:
         The summaries by name, which ``table.json`` holds too.
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the chart, is not installed.
     """
+    require("matplotlib", "desk")
     out, runs = Path(out), parse_runs() if runs is None else runs
     check_folder(out, force)
     for name in runs:

@@ -31,6 +31,7 @@ from engine.runs.inputs import open_map
 from engine.runs.last_fix import LastFix, last_fix_file
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
+from engine.runs.service import running_service
 from engine.runs.settings import with_weights
 from engine.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
@@ -295,12 +296,12 @@ def run_mavlink_bridge(
         with bridge:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
-            pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
             with (
-                closing(pictures),
+                running_service() as beat,
+                closing(files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))) as pictures,
                 suppress(KeyboardInterrupt),
             ):  # the usual end beside a camera, and no reason to lose the counts
-                _run(bridge, pictures, camera, settings.seconds, progress)
+                _run(bridge, pictures, camera, settings.seconds, progress, beat)
             if files.camera_source is not None:
                 remember_delay(bridge.status.least_age_ms)
             return bridge.status
@@ -335,6 +336,7 @@ def _run(
     camera: Camera,
     seconds: float | None,
     progress: Progress,
+    beat: Callable[[], None],
 ) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
     begin = reported = time.monotonic()
@@ -343,6 +345,7 @@ def _run(
         if picture is not None:
             count += 1
             _submit(bridge, picture, camera, count)
+        beat()
         now = time.monotonic()
         if now - reported >= _MESSAGE_PERIOD_S:
             reported = now
@@ -363,12 +366,13 @@ def _submit(bridge: MavlinkBridge, picture: CapturedImage, camera: Camera, numbe
     bridge.submit(image, captured_ns)
 
 
-def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress) -> None:
+def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress, beat: Callable[[], None]) -> None:
     """A flight that is played begins with the autopilot's: where it was earlier is not known."""
     if not bridge.connected:
         progress.message(f"the pictures wait for the autopilot, {_AUTOPILOT_TIMEOUT_S:g} s at most")
     until = time.monotonic() + _AUTOPILOT_TIMEOUT_S
     while not bridge.connected and time.monotonic() < until:
+        beat()
         time.sleep(0.002)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.errors import EngineError
+from engine.errors import EngineError, MissingExtraError, require
 from engine.formats.flight import Flight
 from engine.formats.notes import read_notes
 from engine.formats.track import TrackRow
@@ -48,7 +48,10 @@ def write_results(
     report: bool = True,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones."""
+    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones.
+
+    The figures are left out where matplotlib is not installed, as on a vehicle: no track is lost for them.
+    """
     summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         progress.message(f"no fix is scored: {record.truth} says nothing of the times of this flight")
@@ -58,7 +61,11 @@ def write_results(
     for name in FIGURES:
         (out / name).unlink(missing_ok=True)
     title = f"{record.method} ({record.profile} profile)"
-    draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
+    try:
+        require("matplotlib", "desk")
+        draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
+    except MissingExtraError as error:
+        progress.message(f"no plots are drawn: {error}")
     notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
     _write_page(out / PAGE, FinishedTrack(rows, truth, site, ground, summary, notes), frames)
     return summary

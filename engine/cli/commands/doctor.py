@@ -63,7 +63,7 @@ def requirements() -> tuple[list[str], dict[str, list[str]]]:
             continue
         if extra is None:
             needed.append(name[0])
-        elif extra[1] not in _DEVELOPERS:
+        elif extra[1] not in _DEVELOPERS and name[0] != _DISTRIBUTION:  # an extra may contain another
             extras.setdefault(extra[1], []).append(name[0])
     return needed, extras
 
