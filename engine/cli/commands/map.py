@@ -32,6 +32,8 @@ def info(
 
     site = open_map(map_path, surface, bounds=map_bounds, crs=map_crs, progress=console.PROGRESS)
     console.facts(site.info(), as_json, title=str(map_path))
+    place = f"{console.quoted(map_path)} --camera CAMERA --height-agl METRES"
+    console.next_step(f"map audit {place} --out audit", as_json=as_json)
 
 
 def audit(
@@ -89,3 +91,5 @@ def audit(
     else:
         tables.print_audit(result, str(map_path))
         console.say(f"written to {out}")
+    files_given = console.options(map=map_path, surface=surface, camera=camera)
+    console.next_step(f"track {files_given} --frames FRAMES --out out", as_json=as_json)
