@@ -151,6 +151,8 @@ def mavlink(
         files, link, settings, supervise=supervise, live_view=live_view, progress=console.PROGRESS
     )
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
+    flown = console.options(map=map_path, surface=surface, camera=camera)
+    console.next_step(f"track {flown} --frames VIDEO --telemetry LOG --out out", as_json=as_json)
 
 
 def camera_delay(
@@ -186,6 +188,11 @@ def camera_delay(
     )  # fmt: skip
     values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
     console.facts(values, as_json, title=f"camera {camera_source}")
+    late = console.options(
+        connect=connect, camera=camera, camera_source=camera_source,
+        exposure_to_grab_ms=values["exposure_to_grab_ms"],
+    )  # fmt: skip
+    console.next_step(f"bridge mavlink --map MAP {late}", as_json=as_json)
 
 
 def mavlink_params(
@@ -228,6 +235,11 @@ def mavlink_params(
         console.print_json({"parameters": str(out)} | asdict(written))
     else:
         console.say(f"written to {out}, for a delay of {written.delay_ms} ms ({written.delay_source})")
+    console.next_step(
+        "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE",
+        as_json=as_json,
+        hint=f"load {out} into the autopilot",
+    )
 
 
 def ros(
@@ -317,3 +329,6 @@ def ros(
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"ROS {version} on {image}")
+    console.next_step(
+        f"track {console.options(map=map_path, surface=surface)} --frames BAG --out out", as_json=as_json
+    )

@@ -15,6 +15,7 @@ from engine.cli.options import JsonOption
 _DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
 """Extras that add nothing to the engine."""
+_INSTALL = f"pip install {_DISTRIBUTION}"
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra == ["']([^"']+)["']""")
 
@@ -23,6 +24,7 @@ def doctor(as_json: JsonOption = False) -> None:
     """Versions, devices, what is missing."""
     facts, healthy = examine()
     console.facts(facts, as_json, title="scenematch doctor")
+    console.next_step("demo" if healthy else "doctor", as_json=as_json, hint="" if healthy else _INSTALL)
     raise typer.Exit(0 if healthy else 1)
 
 

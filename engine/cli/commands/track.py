@@ -126,3 +126,5 @@ def track(
     summary = track_flight(files, out, settings, force=force, live_view=live_view, progress=console.PROGRESS)
     title = f"{settings.method} ({settings.profile} profile) on {frames}"
     tables.print_summary(summary, as_json, title=title, out=out)
+    page = f"open {out / 'report.html'}"
+    console.next_step(f"export {console.quoted(out)} --format geojson", as_json=as_json, hint=page)
