@@ -1,6 +1,6 @@
 """Visual odometry between fixes: velocities are withheld, and every second 5 s of a flight is not matched.
 
-    python -m bench.accuracy.odometry [FLIGHT ...] [--quick]
+    python -m bench.accuracy.odometry [FLIGHT ...] [--only gaps|velocities] [--quick]
 
 Prints the two tables of docs/odometry.md. Without names it flies those that nothing was fitted to, gazebo-a1 and
 nust; gazebo-a2 and "built-in" are what the covariance was fitted to.
@@ -129,11 +129,15 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
     first = flight.truth[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
     navigator = Navigator(gappy, start, options=NavigatorOptions(odometry=velocity == PICTURES))
-    gaps, way_m, before, ended_ns = Gaps(), 0.0, None, None
+    gaps, way_m, before, ended_ns, middle_m = Gaps(), 0.0, None, None, np.zeros(2)
     for index, frame in enumerate(frames):
         result, place, stamp_ns = navigator.update(frame), true_en_m(flight, frame), frame.timestamp_ns or 0
         withheld = gappy.withholds(frame)
-        _count(gaps, flight, navigator, result, place, withheld=withheld)
+        if isinstance(result, Fix) and flight.name in MIDDLE:
+            seen = moved_to_middle(result, flight.site, flight.camera)
+            middle_m = np.array([seen.east_m - result.east_m, seen.north_m - result.north_m])
+        known = _known(navigator, result, middle_m)
+        _count(gaps, result, known, place, withheld=withheld)
         if ended_ns is not None and isinstance(result, Fix):
             gaps.back_s.append((stamp_ns - ended_ns) * 1e-9)
             ended_ns = None
@@ -143,26 +147,30 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
         ends = withheld and index + 1 < len(frames) and not gappy.withholds(frames[index + 1])
         if ends and place is not None and navigator.prediction is not None:
             predicted = navigator.prediction
-            gaps.off_m.append(np.array([predicted.east_m, predicted.north_m]) - place)
+            gaps.off_m.append(np.array([predicted.east_m, predicted.north_m]) + middle_m - place)
             gaps.sigma_m.append(math.sqrt(max(predicted.sigma_m**2 - map_sigma_of(flight.site) ** 2, 0.0)))
             gaps.way_m.append(way_m)
             ended_ns, way_m = frames[index + 1].timestamp_ns, 0.0
     return gaps
 
 
+def _known(navigator: Navigator, result: Fix | NoFix, middle_m: Array) -> tuple[Array, float] | None:
+    """Place (2,) and standard deviation where the position is known; ``middle_m`` leads to the truth's place."""
+    predicted = navigator.prediction
+    if isinstance(result, Fix):
+        return np.array([result.east_m, result.north_m]) + middle_m, result.sigma_m
+    if predicted is None or predicted.sigma_m > USEFUL_M:
+        return None
+    return np.array([predicted.east_m, predicted.north_m]) + middle_m, predicted.sigma_m
+
+
 def _count(
-    gaps: Gaps, flight: Recorded, navigator: Navigator, result: Fix | NoFix, place: Array | None, *, withheld: bool
+    gaps: Gaps, result: Fix | NoFix, known: tuple[Array, float] | None, place: Array | None, *, withheld: bool
 ) -> None:
     """Add one frame."""
     gaps.frames += 1
     gaps.matched += not withheld
     gaps.fixed += isinstance(result, Fix)
-    predicted, known = navigator.prediction, None
-    if isinstance(result, Fix):
-        fix = moved_to_middle(result, flight.site, flight.camera) if flight.name in MIDDLE else result
-        known = np.array([fix.east_m, fix.north_m]), fix.sigma_m
-    elif predicted is not None and predicted.sigma_m <= USEFUL_M:
-        known = np.array([predicted.east_m, predicted.north_m]), predicted.sigma_m
     gaps.known += known is not None
     if known is not None and place is not None:
         gaps.wrong += bool(np.hypot(*(known[0] - place)) > max(3.0 * known[1], 10.0))
@@ -308,6 +316,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("flights", nargs="*", default=REPORTED)
     parser.add_argument("--quick", action="store_true", help="the first 20 s of each flight")
+    parser.add_argument("--only", choices=["gaps", "velocities"], help="one of the two tables")
     options = parser.parse_args()
     set_threads(1)
     there = [name for name in options.flights if name == BUILT_IN or (SHARED / name).is_dir()]
@@ -316,12 +325,12 @@ def main() -> None:
         flights = [replace(flight, frames=flight.frames[:100]) for flight in flights]
     print("| flight | velocity | drift m per 100 m | median m | worst m | states m | NEES | known | fixed | wrong "
           "| first fix after s | worst s |\n|---" + "|---" * 11 + "|")  # fmt: skip
-    for flight in flights:
+    for flight in flights if options.only != "velocities" else ():
         for row in gap_rows(flight):
             print(row, flush=True)
     print("\n| flight | s apart | by | RMS m/s | drift m per 100 m | NEES | refused | p50 ms | p95 ms |\n|---"
           + "|---" * 8 + "|")  # fmt: skip
-    for flight in flights:
+    for flight in flights if options.only != "gaps" else ():
         for row in velocity_rows(flight, (1, 5)):
             print(row, flush=True)
 

@@ -14,7 +14,6 @@ from engine.geo import enu_from_body
 
 Array = NDArray[np.float64]
 
-_BY_CAMERA = (mavlink.MAV_ESTIMATOR_TYPE_VISION, mavlink.MAV_ESTIMATOR_TYPE_VIO)
 _OVER_GROUND = (mavlink.MAV_FRAME_LOCAL_NED,)
 _OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter was its name before
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -34,13 +33,11 @@ def vision_velocity(
         None where the message has no such velocity: of another estimator than a camera's or the bridge's own, in
         another frame, failed, or not finite.
     """
-    if message.get_srcComponent() == BRIDGE_COMPONENT:
-        return None
     if message.get_type() == "VISION_SPEED_ESTIMATE":
         velocity, variances = np.array([message.x, message.y, message.z]), message.covariance[0::4]
         turn: Array | None = _ENU_FROM_NED
     else:
-        if message.estimator_type not in _BY_CAMERA or message.quality == _FAILED:
+        if not _is_by_camera(message) or message.quality == _FAILED:
             return None
         velocity = np.array([message.vx, message.vy, message.vz])
         variances = [message.velocity_covariance[i] for i in (0, 6, 11)]  # of a 6 x 6 upper triangle
@@ -51,6 +48,13 @@ def vision_velocity(
     largest = max(variances)
     known = all(math.isfinite(v) for v in variances) and largest > 0.0
     return east, north, up, math.sqrt(largest) if known else 0.0
+
+
+def _is_by_camera(message: Any) -> bool:
+    """Whether an ODOMETRY is of another camera's odometry: not the autopilot's, nor the bridge's own."""
+    if message.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_VISION:
+        return bool(message.get_srcComponent() != BRIDGE_COMPONENT)
+    return bool(message.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_VIO)
 
 
 def _turn(frame: int, attitude_deg: tuple[float, ...] | None) -> Array | None:

@@ -353,7 +353,7 @@ def test_a_velocity_by_another_camera_counts_more_than_the_autopilots(message, e
 @pytest.mark.parametrize(
     "message",
     [
-        from_camera(speed_estimate(1.0, 2.0, 3.0), BRIDGE_COMPONENT),
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION), BRIDGE_COMPONENT),
         from_camera(speed_estimate(math.nan, 2.0, 3.0)),
         from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT)),
         from_camera(odometry(1.0, 2.0, 3.0, quality=-1)),
