@@ -105,6 +105,7 @@ def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
         height_sigma_m=row.height_sigma_m,
         heading_sigma_deg=row.heading_sigma_deg,
         tilt_sigma_deg=row.tilt_sigma_deg,
+        velocity_sigma_mps=row.velocity_sigma_mps,
     )
 
 
@@ -245,6 +246,7 @@ def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow
         height_sigma_m=frame.height_sigma_m,
         heading_sigma_deg=frame.heading_sigma_deg,
         tilt_sigma_deg=frame.tilt_sigma_deg,
+        velocity_sigma_mps=frame.velocity_sigma_mps,
         lat_deg=prior.lat_deg if prior else None,
         lon_deg=prior.lon_deg if prior else None,
         sigma_m=prior.sigma_m if prior else None,

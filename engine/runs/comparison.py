@@ -55,7 +55,7 @@ def _parse_run(text: str, weights: Sequence[StrPath], overrides: Mapping[str, An
     method, slash, profile = text.partition("/")
     weights = weights if method == "learned" else ()
     if method in METHODS and not Path(text).is_file():
-        chosen = {"method": method, "profile": profile} if slash else {"method": method}
+        chosen: dict[str, Any] = {"method": method, "profile": profile} if slash else {"method": method}
         return text.replace("/", "-"), load_settings(None, weights=weights, **overrides, **chosen)
     if not Path(text).is_file():
         raise OptionError(

@@ -21,6 +21,7 @@ from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
 from engine.methods.options import MatcherOptions
+from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.realtime import Realtime, check_realtime, set_realtime
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
@@ -194,6 +195,7 @@ class BridgeSettings:
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
         seconds: ends after this time; None ends with the pictures.
+        odometry: whether pictures are followed from one to the next where there is no velocity.
         realtime: how the threads that match are scheduled; None is as usual.
 
     Raises:
@@ -208,6 +210,7 @@ class BridgeSettings:
     start: str | None = None
     deadline_ms: float | None = None
     seconds: float | None = None
+    odometry: bool = False
     realtime: Realtime | None = None
 
     def __post_init__(self) -> None:
@@ -221,6 +224,10 @@ class BridgeSettings:
     def matcher_options(self) -> MatcherOptions:
         """What of it is the matcher's."""
         return MatcherOptions(learned=with_weights(self.method, self.weights))
+
+    def navigator_options(self) -> NavigatorOptions:
+        """What of it is the navigator's."""
+        return NavigatorOptions(odometry=self.odometry)
 
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, with the one that counts where none was set."""
@@ -283,7 +290,7 @@ def run_mavlink_bridge(
     start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
 
     end_on_sigterm()
-    with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),

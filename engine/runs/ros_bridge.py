@@ -128,7 +128,7 @@ def run_ros_bridge(
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
-    with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:

@@ -29,6 +29,7 @@ from engine.cli.options import (
     MethodOption,
     MountOption,
     NiceOption,
+    OdometryOption,
     RealtimeOption,
     RerunConnectOption,
     RerunOption,
@@ -107,6 +108,7 @@ def mavlink(
     method: MethodOption = "auto",
     weights: WeightsOption = None,
     start: StartOption = None,
+    odometry: OdometryOption = False,
     device: DeviceOption = "auto",
     deadline_ms: BridgeDeadlineOption = None,
     seconds: SecondsOption = None,
@@ -144,7 +146,7 @@ def mavlink(
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
-        seconds=seconds, realtime=parse_realtime(realtime, nice, cores),
+        seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_mavlink_bridge(
@@ -290,6 +292,7 @@ def ros(
     method: MethodOption = "auto",
     weights: WeightsOption = None,
     start: StartOption = None,
+    odometry: OdometryOption = False,
     device: DeviceOption = "auto",
     deadline_ms: DeadlineOption = 121.0,
     seconds: SecondsOption = None,
@@ -319,7 +322,7 @@ def ros(
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
-        seconds=seconds, realtime=parse_realtime(realtime, nice, cores),
+        seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,

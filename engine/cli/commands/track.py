@@ -27,6 +27,7 @@ from engine.cli.options import (
     MapOption,
     MapSigmaOption,
     MountOption,
+    OdometryOption,
     OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
@@ -86,6 +87,7 @@ def track(
     ] = None,
     weights: WeightsOption = None,
     start: StartOption = None,
+    odometry: OdometryOption = False,
     device: OptionalDeviceOption = None,
     budget_ms: BudgetOption = None,
     profile: Annotated[
@@ -120,7 +122,7 @@ def track(
     )  # fmt: skip
     settings = load_settings(
         settings_path, weights=weights or (), method=method, profile=profile, device=device, start=start,
-        budget_ms=budget_ms,
+        budget_ms=budget_ms, odometry=odometry,
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     summary = track_flight(files, out, settings, force=force, live_view=live_view, progress=console.PROGRESS)
