@@ -102,8 +102,8 @@ def measured() -> Row:
     torch.set_num_threads(1)
     marks.append(time.time())
     from engine import Camera, Fix, OrthoMap, SceneMatcher
-    from engine.device import set_threads
     from engine.formats.flight import open_flight
+    from engine.threads import set_threads
 
     set_threads(1)
     marks.append(time.time())

@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
 from engine.formats.notes import FrameNote
 from engine.formats.track import TrackRow
@@ -328,7 +327,7 @@ def _inputs(settings: Mapping[str, Any]) -> str:
     changed = table(changes) if changes else "<p>Nothing.</p>"
     versions = [
         ("scenematch", metadata.version("scenematch-engine")),
-        ("torch", str(torch.__version__)),
+        ("torch", metadata.version("torch")),
         ("OpenCV", cv2.__version__),
         ("numpy", np.__version__),
         ("Python", platform.python_version()),
