@@ -104,3 +104,38 @@ def placed(array: AnyArray, device: Device | torch.device) -> Picture:
 def on_host(picture: Picture) -> AnyArray:
     """The array of a picture: itself, or what is copied from its device."""
     return picture if isinstance(picture, np.ndarray) else np.asarray(picture.cpu())
+
+
+def element_type(picture: Picture) -> str:
+    """The name of the element type, such as "float32"."""
+    return str(picture.dtype).removeprefix("torch.")
+
+
+def as_float(picture: Picture, name: str) -> Picture:
+    """The picture in float32 or float64."""
+    if isinstance(picture, np.ndarray):
+        return picture.astype(name, copy=False)
+    return picture.double() if name == "float64" else picture.float()
+
+
+def plain(*pictures: Picture) -> list[Picture]:
+    """The arrays of tensors on the CPU, in the same memory; those of a GPU, or with gradients, as they are."""
+    if any(not isinstance(v, np.ndarray) and (v.device.type != "cpu" or v.requires_grad) for v in pictures):
+        return list(pictures)
+    return [v if isinstance(v, np.ndarray) else v.numpy() for v in pictures]
+
+
+def as_tensor(picture: Picture) -> Picture:
+    """A tensor as it is, and an array as one, in the same memory."""
+    if not isinstance(picture, np.ndarray):
+        return picture
+    from engine.tensors import torch
+
+    return torch.from_numpy(np.ascontiguousarray(picture))
+
+
+def like(given: Picture, found: Picture) -> Picture:
+    """What was found as an array or a tensor, as what was given is."""
+    if isinstance(given, np.ndarray):
+        return found if isinstance(found, np.ndarray) else found.numpy()
+    return as_tensor(found)

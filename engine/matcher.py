@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,6 +41,12 @@ def _plans_created() -> int:
     """Layouts of pictures that SIFT made so far; its module is not imported to say that there are none."""
     features = sys.modules.get("engine.features")
     return 0 if features is None else int(features.plans_created())
+
+
+def _give_back_memory() -> None:
+    """Give the system what was allocated for the warm-up alone: glibc keeps it otherwise."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)
 
 
 def _bounded(prior: Prior) -> Prior:
@@ -106,6 +113,8 @@ class SceneMatcher:
                 self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
             if self.site.is_searchable:
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
+        _give_back_memory()
+        self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # takes again what a frame needs of it
 
     def _synthetic_frame(self, share: float) -> tuple[Frame, Prior]:
         """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.device import Picture
+from engine.device import Picture, as_float, as_tensor, element_type, like, plain
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.kernels import ncc as kernels
 from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit, peak_of
@@ -71,57 +71,25 @@ def ncc(
         OptionError: different devices, NaN or infinity, or masks without ``zero_mean``.
     """
     _check(search, templates)
-    types = (_type_of(search), _type_of(templates))
+    types = (element_type(search), element_type(templates))
     if search_valid is not None or templates_valid is not None:
         masks = _mask("search_valid", search, search_valid), _mask("templates_valid", templates, templates_valid)
         if not zero_mean:
             raise OptionError("zero_mean: expected True where masks are given, got False")
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
-        pictures = _plain(search, masks[0], templates, masks[1])
+        pictures = plain(search, masks[0], templates, masks[1])
         scores = kernels.masked_ncc_surface(*pictures, min_overlap=min_overlap)
     elif types[0] in _DOUBLE or types[1] in _DOUBLE:
         scores = kernels.ncc_surface(
-            *(_tensor(_as(v, "float64")) for v in (search, templates)), zero_mean=zero_mean
+            *(as_tensor(as_float(v, "float64")) for v in (search, templates)), zero_mean=zero_mean
         )
     else:
         scores = kernels.ncc_surface(
-            *_plain(_as(search, "float32"), _as(templates, "float32")), zero_mean=zero_mean
+            *plain(as_float(search, "float32"), as_float(templates, "float32")), zero_mean=zero_mean
         )
-    found: Given = _like(search, _as(scores, "float64" if "float64" in types else "float32"))
+    found: Given = like(search, as_float(scores, "float64" if "float64" in types else "float32"))
     return found
-
-
-def _type_of(picture: Picture) -> str:
-    return str(picture.dtype).removeprefix("torch.")
-
-
-def _as(picture: Picture, name: str) -> Picture:
-    """The picture in float32 or float64."""
-    if isinstance(picture, np.ndarray):
-        return picture.astype(name, copy=False)
-    return picture.double() if name == "float64" else picture.float()
-
-
-def _plain(*pictures: Picture) -> list[Picture]:
-    """The arrays of tensors on the CPU, in the same memory; those of a GPU, or with gradients, as they are."""
-    if any(not isinstance(v, np.ndarray) and (v.device.type != "cpu" or v.requires_grad) for v in pictures):
-        return list(pictures)
-    return [v if isinstance(v, np.ndarray) else v.numpy() for v in pictures]
-
-
-def _tensor(picture: Picture) -> Tensor:
-    """A tensor as it is, and an array as one, in the same memory."""
-    from engine.tensors import Tensor, torch
-
-    return picture if isinstance(picture, Tensor) else torch.from_numpy(np.ascontiguousarray(picture))
-
-
-def _like(given: Picture, found: Picture) -> Picture:
-    """What was found as an array or a tensor, as what was given is."""
-    if isinstance(given, np.ndarray):
-        return found if isinstance(found, np.ndarray) else found.numpy()
-    return _tensor(found)
 
 
 def _check(search: Picture, templates: Picture) -> None:
@@ -135,7 +103,7 @@ def _check(search: Picture, templates: Picture) -> None:
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
     for name, picture in (("search", search), ("templates", templates)):
-        if _type_of(picture) not in _TYPES:
+        if element_type(picture) not in _TYPES:
             raise DtypeError(f"{name}: expected uint8, int16, uint16, int32 or a float, got {picture.dtype}")
     places = ["numpy" if isinstance(v, np.ndarray) else str(v.device) for v in (search, templates)]
     if places[0] != places[1]:
@@ -148,9 +116,9 @@ def _mask(name: str, picture: Picture, mask: Picture | None) -> Picture:
         return (
             np.ones(picture.shape, bool)
             if isinstance(picture, np.ndarray)
-            else _tensor(picture).new_ones(picture.shape).bool()
+            else as_tensor(picture).new_ones(picture.shape).bool()
         )
-    if _type_of(mask) != "bool":
+    if element_type(mask) != "bool":
         raise DtypeError(f"{name}: expected bool, got {mask.dtype}")
     if mask.shape != picture.shape:
         raise ShapeError(f"{name}: expected {tuple(picture.shape)}, got {tuple(mask.shape)}")
@@ -200,9 +168,9 @@ def prepare(image: Picture, *, halvings: int = _MAX_HALVINGS) -> Search:
     """
     if image.ndim != 2 or 0 in image.shape:
         raise ShapeError(f"image: expected (H, W) with no empty axis, got {tuple(image.shape)}")
-    if _type_of(image) != "float32":
+    if element_type(image) != "float32":
         raise DtypeError(f"image: expected float32, got {image.dtype}")
-    (image,) = _plain(image)
+    (image,) = plain(image)
     image = np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image.contiguous()
     half = None
     if halvings > 0 and min(image.shape) >= 2 * _COARSE_TEMPLATE_PX:
@@ -250,12 +218,12 @@ def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]
     for first in range(0, len(templates), group):
         part = _of_kind(search, templates[first : first + group])
         found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))
-        yield _like(templates, found)
+        yield like(templates, found)
 
 
 def _of_kind(search: Search, template: Picture) -> Picture:
     """A template as an array where the map is one; else as it is."""
-    return _plain(template)[0] if isinstance(search.image, np.ndarray) else template
+    return plain(template)[0] if isinstance(search.image, np.ndarray) else template
 
 
 def match_template(search: Search, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
@@ -282,7 +250,7 @@ def match_template(search: Search, template: Picture, *, exclusion_px: float, ex
     _check_template(search, template)
     if not isinstance(search.image, np.ndarray):
         return _peaks_on_device([search], [template], exclusion_px)[0]
-    (template,) = _plain(template)
+    (template,) = plain(template)
     if not exhaustive:
         found = _coarse_to_fine(search, template, exclusion_px)
         if found is not None:
