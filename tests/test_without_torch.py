@@ -28,7 +28,6 @@ valid[:150, :180] = False  # within the windows, so that some are masked
 site = OrthoMap.from_arrays(gray, [[0.5, 0, 500_000], [0, -0.5, 5_000_000]], "EPSG:32633", valid=valid)
 camera = Camera.from_fov(120, 120, 60.0)
 matcher = SceneMatcher(site, camera)
-matcher.warmup()
 def taken(image, index):
     return Frame(image.copy(), index * 10**9, 0.5 * camera.focal_px, 0.0, 0.0, 0.0)
 def frame(index):
@@ -83,11 +82,9 @@ def test_one_module_imports_torch():
     assert found == {"tensors.py"}
 
 
-@pytest.mark.parametrize(
-    "name", ["matcher", "navigator", "live", "methods.ncc", "runs.tracking", "runs.mavlink_bridge"]
-)
-def test_modules_of_the_way_load_no_torch(name):
-    assert run(f"import engine.{name}")[-2:] == ["TORCH", "False"]
+def test_modules_of_the_way_load_no_torch():
+    names = ("matcher", "navigator", "live", "methods.ncc", "runs.tracking", "runs.mavlink_bridge", "report.page")
+    assert run("".join(f"import engine.{name}\n" for name in names)) == ["TORCH", "False"]
 
 
 def test_a_flight_by_ncc_on_the_cpu_loads_no_torch():
@@ -95,6 +92,7 @@ def test_a_flight_by_ncc_on_the_cpu_loads_no_torch():
     assert run(FLIGHT) == ["19", "TORCH", "False"]
 
 
+@pytest.mark.slow
 def test_tracking_by_ncc_loads_no_torch(tmp_path):
     folder = tmp_path / "flight"
     write_flight(folder, plan_flight(town=drawn_town(), frames=3))
