@@ -24,14 +24,12 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
-from engine.device import in_parallel
 from engine.errors import DtypeError, OptionError, ShapeError, require
 from engine.sift.descriptors import describe, dominant_angle
 from engine.sift.keypoints import Points, detect, strongest
 from engine.sift.scale_space import make_plan
+from engine.tensors import Tensor, torch
+from engine.threads import in_parallel
 
 
 @dataclass(frozen=True, slots=True)

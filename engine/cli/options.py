@@ -172,7 +172,7 @@ CoresOption = Annotated[
 
 def use_threads(count: int) -> None:
     """Threads of torch and OpenCV."""
-    from engine.device import set_threads
+    from engine.threads import set_threads
 
     set_threads(count)
 

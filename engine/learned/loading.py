@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import nn
-
 from engine import device as devices
 from engine.errors import OptionError, require
 from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
 from engine.learned.matchers import KeypointMatcher, Loftr
 from engine.learned.superpoint import SuperPoint
 from engine.learned.weights import KINDS, Weights, fill, read_weights
+from engine.tensors import nn, torch
 
 _EXTRACTORS = ("DISK", "ALIKED", "SuperPoint")
 _EXPECTED = "LoFTR, or LightGlue with DISK, ALIKED or SuperPoint"
@@ -48,7 +46,7 @@ def load_matcher(
         raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
     if not paths:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got none")
-    target, files = devices.resolve(device), [read_weights(path) for path in paths]
+    target, files = torch.device(devices.resolve(device)), [read_weights(path) for path in paths]
     for weights in files:
         if weights.kind is None:
             some = ", ".join(sorted(weights.tensors)[:2])
@@ -78,7 +76,7 @@ def load_loftr(path: str | Path, *, device: str | torch.device = "auto", min_con
     """
     if not 0.0 <= min_confidence <= 1.0:
         raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
-    return Loftr(_loftr(read_weights(path), devices.resolve(device)), min_confidence)
+    return Loftr(_loftr(read_weights(path), torch.device(devices.resolve(device))), min_confidence)
 
 
 def load_disk_lightglue(
@@ -99,7 +97,7 @@ def load_disk_lightglue(
     """
     if max_keypoints < 2:
         raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
-    target = devices.resolve(device)
+    target = torch.device(devices.resolve(device))
     detector = Disk(_disk(read_weights(disk), target))
     return KeypointMatcher(detector, _lightglue(read_weights(lightglue), 128, target), max_keypoints)
 

@@ -30,7 +30,7 @@ def doctor(as_json: JsonOption = False) -> None:
 
 def examine() -> tuple[dict[str, Any], bool]:
     """Facts by name, and whether nothing is missing."""
-    import torch
+    from engine.tensors import torch
 
     facts: dict[str, Any] = {
         "scenematch": _version(_DISTRIBUTION),
