@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from engine import threads as chosen
 from engine.kernels import by_opencv, eager, reference
 from engine.ncc_fft import ncc, prepare, surface
 
