@@ -88,11 +88,14 @@ def synchronise(device: Device | torch.device) -> None:
 
 
 def placed(array: AnyArray, device: Device | torch.device) -> Picture:
-    """An array where it is worked on: itself on the CPU, elsewhere a tensor.
+    """An array where it is worked on.
 
     Args:
         array: of any shape.
-        device: of the tensor.
+        device: where.
+
+    Returns:
+        The array itself on the CPU, elsewhere a tensor of its shape and type.
     """
     if device.type == "cpu":
         return array
@@ -102,7 +105,14 @@ def placed(array: AnyArray, device: Device | torch.device) -> Picture:
 
 
 def on_host(picture: Picture) -> AnyArray:
-    """The array of a picture: itself, or what is copied from its device."""
+    """A picture as an array.
+
+    Args:
+        picture: of any shape.
+
+    Returns:
+        Itself, or what is copied from its device.
+    """
     return picture if isinstance(picture, np.ndarray) else np.asarray(picture.cpu())
 
 

@@ -137,7 +137,7 @@ def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, fla
     prepared = PreparedMap(flat_site, torch.device("cpu"), radius_px=12)
     window = Window(100, 120, 200, 160)
     found = SampleMap(flat_site, prepared).find(window, 0)
-    picture = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image.numpy()
+    picture = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image
     for axis, step in enumerate(np.eye(2) * flat_site.gsd_m_per_px):
         at = [flat_site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
         ahead, behind = (cv2.remap(picture, *px.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for px in at)
@@ -288,7 +288,7 @@ def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(flat
     assert (xy >= [100 - BLOCK_PX, 60 - BLOCK_PX]).all()
     assert (xy < [300 + BLOCK_PX, 220 + BLOCK_PX]).all()
     x, y = np.round(xy).astype(int).T
-    shown = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image.numpy()
+    shown = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image
     np.testing.assert_allclose(first.values, shown[y, x], atol=1e-6)
 
 

@@ -43,7 +43,15 @@ def summits(products: Tensor, inverse_norms: Tensor, *, exclusion_px: float) -> 
 
 
 def of_surface(scores: Tensor, exclusion_px: float) -> Array:
-    """What the peak of one surface (H', W') is made of, (28,) of :func:`summits`."""
+    """What the peak of one surface is made of.
+
+    Args:
+        scores: (H', W').
+        exclusion_px: radius about the peak within which no rival is counted.
+
+    Returns:
+        (28,) of :func:`summits`.
+    """
     with torch.inference_mode():
         ones = torch.ones((), device=scores.device).expand(scores.shape)
         found = summits(scores.float()[None], ones, exclusion_px=exclusion_px)

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from engine import threads as chosen
 from engine.kernels import by_opencv, eager, reference
 from engine.ncc_fft import ncc, prepare, surface
-from engine.threads import set_threads
 
 
 def scores_of(search, templates, zero_mean=True):
@@ -72,12 +72,12 @@ def test_blocks_are_the_window(seed, size, model, count, threads):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(by_opencv, "_CACHED_SIDE", 32)
         patch.setattr(by_opencv, "_division", by_opencv._division.__wrapped__)
-        before = count()
-        set_threads(threads)
+        before = chosen.count()
+        chosen.set_threads(threads)
         try:
             got = scores_of(search, templates)
         finally:
-            set_threads(before)
+            chosen.set_threads(before)
     np.testing.assert_allclose(got, expected_of(search, templates), rtol=0, atol=1e-5)
 
 
@@ -114,9 +114,9 @@ def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
     part = prepare(torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))).crop(7, 3, 41, 37)
     templates = torch.from_numpy(rng.normal(0.0, 1.0, (2, *model)).astype(np.float32))
     centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    norms = eager.inverse_norm(part.sums, *model)
+    norms = eager.inverse_norm(torch.from_numpy(part.sums), *model)
     for count in (1, 2):
-        expected = eager.prepared_surface(part.image, norms, centred[:count])
+        expected = eager.prepared_surface(torch.from_numpy(part.image), norms, centred[:count])
         torch.testing.assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
 
 
