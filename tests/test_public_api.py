@@ -237,7 +237,7 @@ def test_documents_and_examples_import_public_names_only(path):
 
 
 def test_documents_mention_public_modules_only():
-    """A module that a page tells users to call, as in ``engine.device.set_threads(1)``, is a public one."""
+    """A module that a page tells users to call, as in ``engine.set_threads(1)``, is a public one."""
     public = {*MODULES, *(name for name in engine.__all__ if inspect.ismodule(getattr(engine, name)))}
     for path in TEXTS:
         for module in re.findall(r"\bengine\.((?:\w+\.)*\w+)\.\w+\(", path.read_text(encoding="utf-8")):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import SHARED
-from engine import Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher, device
+from engine import Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher, set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.methods.options import NccOptions
@@ -181,7 +181,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=40, help="of each flight")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of the towns")
     options = parser.parse_args()
-    device.set_threads(1)
+    set_threads(1)
     seeds, starts, names = options.seeds, options.starts, RECORDED
     if options.quick:
         seeds, starts, names = seeds[:1], 6, RECORDED[:1]

@@ -36,12 +36,12 @@ from engine import (
 )
 from engine.align import to_gray
 from engine.covariance import map_sigma_of
-from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.motion import GroundMotion
 from engine.odometry import NoMotion, VisualOdometry
 from engine.report.metrics import Ground
 from engine.sim import plan_flight
+from engine.threads import set_threads
 
 Array = NDArray[np.float64]
 

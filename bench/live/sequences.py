@@ -31,7 +31,6 @@ from engine import (
     OrthoMap,
     Prior,
     SceneMatcher,
-    device,
 )
 from engine.methods.options import SiftOptions
 from engine.pose import PoseOptions
@@ -198,7 +197,7 @@ def is_sound(covariance_m2: Any) -> bool:
 
 def main() -> None:
     """Fly 10,000 sequences, or as many as are asked for, from seed ``FIRST`` on."""
-    device.set_threads(1)
+    set_threads(1)
     warnings.simplefilter("error")
     count = int(sys.argv[1]) if sys.argv[1:] else 10_000
     first = int(sys.argv[2]) if sys.argv[2:] else 0

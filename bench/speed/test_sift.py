@@ -18,7 +18,7 @@ from bench.inputs.scenes import flight
 from bench.inputs.views import Size, warped_pairs
 from bench.speed import peers
 from bench.speed.detectors import detectors
-from engine import Fix, MatcherOptions, SceneMatcher, device
+from engine import Fix, MatcherOptions, SceneMatcher, set_threads
 from engine.methods.options import NccOptions, SiftOptions
 
 SIZES: list[Size] = [(150, 150), (300, 300), (640, 480)]
@@ -66,7 +66,7 @@ def _side_by_side(peer: str, pictures: Pictures, threads: int) -> Callable[[], A
     if detector.batch is not None:
         batch = detector.batch
         return lambda: batch(pictures)
-    device.set_threads(1)
+    set_threads(1)
     pool, workers = ThreadPoolExecutor(threads), [detector.make() for _ in range(threads)]
 
     def share(worker: int) -> list[Any]:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from bench.inputs.scenes import flight, mosaic, town_gray
-from engine import Fix, MatcherOptions, OrthoMap, SceneMatcher, device
+from engine import Fix, MatcherOptions, OrthoMap, SceneMatcher, set_threads
 from engine.formats.geotiff import write_geotiff
 from engine.methods.options import NccOptions
 from engine.sim import build_town
@@ -37,7 +37,7 @@ def _write_map(path: Path, side: int) -> None:
 
 def ours(path: Path, count: int) -> dict[str, Any]:
     """Time, memory and right answers of the engine."""
-    device.set_threads(1)
+    set_threads(1)
     scene = flight()
     start = time.perf_counter()
     site = OrthoMap.open(path)
