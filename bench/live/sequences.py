@@ -31,6 +31,7 @@ from engine import (
     OrthoMap,
     Prior,
     SceneMatcher,
+    set_threads,
 )
 from engine.methods.options import SiftOptions
 from engine.pose import PoseOptions

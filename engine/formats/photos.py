@@ -22,6 +22,7 @@ from engine.errors import TelemetryError
 from engine.formats.frames import PictureFolder
 from engine.formats.telemetry import TelemetryRow, take_off_sigma_m
 from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
+from engine.values import Truth
 
 COMPASS_SIGMA_DEG = 3.0
 """Standard deviation of a heading by a drone's compass."""
@@ -104,6 +105,22 @@ def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryR
         folder = PictureFolder(Path(source))
         source = [folder.path / name for name in folder.names]
     return photo_telemetry([Path(path) for path in source])[0]
+
+
+def photo_truth(folder: Path) -> list[Truth]:
+    """Where photographs were taken, by their own receiver; its heights are left out, a truth needs better ones.
+
+    Raises:
+        TelemetryError: the folder cannot be read, or none of its photographs has a time and a position.
+    """
+    found = [
+        Truth(timestamp_ns=row.timestamp_ns, lat_deg=row.lat_deg, lon_deg=row.lon_deg)
+        for row in exif_telemetry(folder)
+        if row.lat_deg is not None and row.lon_deg is not None
+    ]
+    if not found:
+        raise TelemetryError(f"{folder}: expected photographs with a time and a position in their EXIF, got none")
+    return found
 
 
 def photo_telemetry(paths: Sequence[Path]) -> tuple[list[TelemetryRow], list[str]]:

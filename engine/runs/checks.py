@@ -67,14 +67,28 @@ def check_gimbal(flight: Flight, camera: Camera) -> None:
         )
 
 
+def _needs(method: str, profile: str) -> list[str]:
+    """What of the telemetry a method cannot do without."""
+    needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
+    return [*needs, "heading_deg"] if method == "ncc" else needs
+
+
+def say_what_lacks(flight: Flight, method: str, profile: str, progress: Progress) -> None:
+    """Of how many frames it is known beforehand that the method will refuse them, and which does not."""
+    for name in _needs(method, profile):
+        lacking = sum(getattr(row, name) is None for row in flight.rows)
+        if lacking:
+            other = "" if profile == "paper" else "; sift and auto do without"
+            progress.message(f"{lacking} of {len(flight)} frames lack {name}, {method} refuses them{other}")
+
+
 def check_needs(flight: Flight, method: str, profile: str) -> None:
     """Refuse a method to which no frame gives what it needs.
 
     Raises:
         TelemetryError: every frame would be refused.
     """
-    needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
-    needs += ["heading_deg"] if method == "ncc" else []
+    needs = _needs(method, profile)
     if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
         other = "" if profile == "paper" else "; sift and auto do without"
         asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)

@@ -8,14 +8,13 @@ from typing import Any
 
 from engine.errors import EngineError, TelemetryError
 from engine.formats.corrections import Corrections
-from engine.formats.logs.readers import open_truth
 from engine.formats.settings import nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.report.metrics import Ground
 from engine.runs.folders import StrPath
-from engine.runs.inputs import FlightFiles, open_map
+from engine.runs.inputs import FlightFiles, open_map, open_run_truth
 from engine.runs.progress import SILENT, Progress
 from engine.runs.record import RunRecord, read_record
 from engine.runs.results import SUMMARY, TRACK, ReportFrames, write_results
@@ -27,7 +26,7 @@ def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progres
 
     Args:
         folder: of a finished run.
-        truth: truth.csv or a log; None is the one that the run had.
+        truth: truth.csv, a log or a folder of photographs; None is the one that the run had.
         progress: is shown what the run does.
 
     Returns:
@@ -60,7 +59,8 @@ def redraw(folder: Path, truth: StrPath | None = None, *, progress: Progress = S
     rows = read_track(folder / TRACK)
     record = read_record(folder / SUMMARY)
     path = record.truth if truth is None else truth
-    truth_rows = None if path is None else open_truth(Path(path), rows[0].timestamp_ns if rows else None)
+    start_ns = rows[0].timestamp_ns if rows else None
+    truth_rows = None if path is None else open_run_truth(Path(path), start_ns, progress)
     site = open_recorded_map(record, progress)
     ground = Ground(record.ground_m, record.ground_amsl_m)
     frames = _report_frames(record, rows, site)

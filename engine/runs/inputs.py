@@ -12,12 +12,19 @@ from engine.errors import MapError, OptionError, TelemetryError
 from engine.formats.corrections import Corrections
 from engine.formats.flight import Flight, open_flight, subtitles_beside
 from engine.formats.frames import VIDEO_SUFFIXES
-from engine.formats.logs.readers import LogClock, is_log, open_truth
+from engine.formats.logs.readers import LogClock, is_log, is_photographs, open_truth
 from engine.formats.ros.bags import is_bag
 from engine.orthomap import OrthoMap
 from engine.runs.arguments import is_in_degrees, parse_bounds, parse_position
 from engine.runs.cameras import CameraFiles
-from engine.runs.checks import check_gimbal, check_needs, check_pictures, check_position, check_start
+from engine.runs.checks import (
+    check_gimbal,
+    check_needs,
+    check_pictures,
+    check_position,
+    check_start,
+    say_what_lacks,
+)
 from engine.runs.folders import StrPath
 from engine.runs.progress import SILENT, Progress
 from engine.runs.renaming import renamed_in_errors
@@ -47,7 +54,7 @@ class FlightFiles:
         frames: folder of pictures, video or bag.
         telemetry: telemetry.csv or a log; None takes the bag's own, the subtitles beside a video, or the
             pictures' EXIF.
-        truth: truth.csv or a log; None takes the one beside the telemetry.
+        truth: truth.csv, a log or a folder of photographs; None takes the truth.csv beside the telemetry.
         frame_stamps: with a log, a CSV with timestamp_ns and frame.
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
@@ -224,9 +231,10 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     camera = files.load_camera(flight, progress)
     truth_path = files.find_truth()
     stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
-    truth = open_truth(truth_path, stamp_ns) if truth_path is not None else None
+    truth = None if truth_path is None else open_run_truth(truth_path, stamp_ns, progress)
     for settings in runs:
         check_needs(flight, settings.method, settings.profile)
+        say_what_lacks(flight, settings.method, settings.profile, progress)
         if settings.method == "learned":
             from engine.learned import load_matcher
 
@@ -246,6 +254,17 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
         progress.message(f"height above ground, by source, of {len(flight)} frames: {counts}")
     return FlightInputs(site, camera, flight, truth_path, truth)
+
+
+def open_run_truth(path: Path, stamp_ns: int | None, progress: Progress = SILENT) -> list[Truth]:
+    """Read a truth (:func:`engine.formats.logs.readers.open_truth`), and say where it is a receiver's only."""
+    truth = open_truth(path, stamp_ns)
+    if is_photographs(path):
+        progress.message(
+            f"truth: {len(truth)} positions in the photographs' EXIF, by their receiver: the errors hold its own, "
+            "of metres"
+        )
+    return truth
 
 
 def _columns(runs: Sequence[TrackSettings]) -> Mapping[str, str]:

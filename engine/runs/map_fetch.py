@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from engine.errors import OptionError
+from engine.formats.photos import exif_telemetry
+from engine.geo import LocalFrame
 from engine.maps.fetching.client import Client, check_url, shown
 from engine.maps.fetching.heights import (
     GLO30,
@@ -35,6 +39,10 @@ SURFACE = "surface.tif"
 """Name of the surface model among the pieces, until the map is complete."""
 NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"
 _MAX_RADIUS_M = 100_000.0
+GSD_M_PER_PX = 0.5
+_USUAL_HEIGHT_M = 150.0  # of a camera for which a map of that ground sample distance is fine enough
+_MARGIN_M = 50.0  # beyond what photographs saw
+_MUCH_EMPTY = 0.5  # of a map: more is worth a word
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,10 +50,12 @@ class FetchSettings:
     """What is fetched, and how; None where not given.
 
     Attributes:
-        around: "LAT,LON", the middle of the map.
-        radius_m: half the side of the square that the map covers at least.
+        around: "LAT,LON", the middle of the map, or a folder of photographs, the middle of their positions.
+        radius_m: half the side of the square that the map covers at least; None is what the
+            photographs saw, and 50 m.
         source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
-        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels.
+        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels. None is 0.5, around photographs that were
+            taken from less than 150 m as much less.
         layer: of a service that has several.
         crs: of a service that offers several, EPSG:N.
         image_format: of a service that offers several, such as image/jpeg.
@@ -63,9 +73,9 @@ class FetchSettings:
     """
 
     around: str
-    radius_m: float
     source: str
-    gsd_m_per_px: float = 0.5
+    radius_m: float | None = None
+    gsd_m_per_px: float | None = None
     layer: str | None = None
     crs: str | None = None
     image_format: str | None = None
@@ -102,13 +112,13 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     """
     out = Path(out)
     surface_out = out.with_name(f"{out.stem}-surface.tif")
-    place = _checked(settings)
+    wanted = _checked(settings, progress)
     for file in (out, surface_out) if settings.surface else (out,):
         check_file(file, settings.force)
     progress.message(f"note: {NOTE}")
     client = Client(settings.pause_ms, settings.timeout_s, progress.message)
-    mosaic = _planned(settings, place, client)
-    _say_what_comes(mosaic, settings, progress)
+    mosaic = _planned(settings, wanted, client)
+    _say_what_comes(mosaic, settings, wanted, progress)
     folder = out.with_name(f"{out.name}.tiles")
     facts = _plan_facts(settings, mosaic, folder)
     if settings.dry_run:
@@ -117,7 +127,7 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
     surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
     asked = sum(progress.track(fetch_pieces(mosaic, client, folder), len(mosaic.pieces), "fetching"))
-    written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc))
+    written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc), progress)
     if surface is not None:
         os.replace(folder / SURFACE, surface_out)
     remove_pieces(folder)
@@ -125,34 +135,40 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     return {"file": str(out)} | facts | received | written | _surface_facts(surface, surface_out)
 
 
-def _say_what_comes(mosaic: Mosaic, settings: FetchSettings, progress: Progress) -> None:
+def _say_what_comes(mosaic: Mosaic, settings: FetchSettings, wanted: Wanted, progress: Progress) -> None:
     """What a person should know before the pictures come."""
     for name, text in mosaic.states.items():
         progress.message(f"the server states as {name}: {text}")
-    got, asked = mosaic.gsd_m_per_px, settings.gsd_m_per_px
+    got, asked = mosaic.gsd_m_per_px, wanted.gsd_m_per_px
     coarser = ", coarser than asked: the server has no finer level" if got > asked * FINE_ENOUGH else ""
     progress.message(f"{mosaic.kind} level {mosaic.level}: {got:.3g} m/px{coarser}")
     if settings.map_sigma_m is None:
         progress.message("the map's accuracy is not stated (`map_sigma_m`): matching will assume 3 m per axis")
 
 
-def _write(mosaic: Mosaic, folder: Path, out: Path, tags: dict[str, object]) -> dict[str, Any]:
+def _write(mosaic: Mosaic, folder: Path, out: Path, tags: dict[str, object], progress: Progress) -> dict[str, Any]:
     """Write the map of fetched pieces."""
     gaps = sum(piece_file(folder, piece).stat().st_size == 0 for piece in mosaic.pieces)
     nodata_share = write_map(mosaic, folder, out, tags)
+    if nodata_share > _MUCH_EMPTY:
+        progress.message(
+            f"{nodata_share:.0%} of the map is empty: the server had nothing for {gaps} of {len(mosaic.pieces)} "
+            "pieces, or sent transparent ones; is `around` within what it covers?"
+        )
     return {"gaps": gaps, "nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
 
 
-def _checked(settings: FetchSettings) -> Place:
-    """The place, where the settings can be.
+def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
+    """What is asked for, where the settings can be.
 
     Raises:
         OptionError: one cannot.
+        TelemetryError: the folder of photographs cannot be read.
     """
-    lat_deg, lon_deg = parse_place("around", settings.around)
+    wanted = _wanted(settings, progress)
+    check_above("radius_m", wanted.place.radius_m, 0.0, _MAX_RADIUS_M)
+    check_above("gsd_m_per_px", wanted.gsd_m_per_px, 0.0, 1e3)
     for name, most in (
-        ("radius_m", _MAX_RADIUS_M),
-        ("gsd_m_per_px", 1e3),
         ("timeout_s", 3600.0),
         ("map_sigma_m", MAX_SIGMA_M),
         ("surface_slope_sigma_deg", 45.0),
@@ -171,20 +187,62 @@ def _checked(settings: FetchSettings) -> Place:
             if getattr(settings, name) is not None:
                 raise OptionError(f"{name}: expected with a WMS or WMTS only, not with a template of tiles")
     check_url("source", settings.source)
-    return Place(lat_deg, lon_deg, settings.radius_m)
+    return wanted
 
 
-def _planned(settings: FetchSettings, place: Place, client: Client) -> Mosaic:
-    """What is to be asked for; a service is asked for its capabilities first."""
-    url = settings.source
-    wanted = Wanted(
+def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
+    """The place that was named, or that of photographs, and what is asked for there.
+
+    Raises:
+        OptionError: it is no place, or its radius is missing.
+        TelemetryError: the folder cannot be read.
+    """
+    radius_m, gsd_m_per_px = settings.radius_m, settings.gsd_m_per_px
+    if Path(settings.around).is_dir():
+        place, finest_m_per_px = _seen_by_photographs(Path(settings.around))
+        place = place if radius_m is None else replace(place, radius_m=radius_m)
+        gsd_m_per_px = finest_m_per_px if gsd_m_per_px is None else gsd_m_per_px
+        progress.message(
+            f"the photographs' place: {place.lat_deg:.6f},{place.lon_deg:.6f}, radius {place.radius_m:.0f} m; "
+            f"asked for {gsd_m_per_px:.2g} m/px"
+        )
+    elif radius_m is None:
+        raise OptionError("radius_m: expected with LAT,LON; only around photographs it may be left out")
+    else:
+        place = Place(*parse_place("around", settings.around), radius_m)
+    return Wanted(
         place=place,
-        gsd_m_per_px=settings.gsd_m_per_px,
+        gsd_m_per_px=GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px,
         max_tiles=settings.max_tiles,
         layer=settings.layer,
         crs=settings.crs,
         image_format=settings.image_format,
     )
+
+
+def _seen_by_photographs(folder: Path) -> tuple[Place, float]:
+    """The square that photographs saw, and the ground sample distance of a map that suits their height.
+
+    Raises:
+        OptionError: they have no positions.
+    """
+    rows = [row for row in exif_telemetry(folder) if row.lat_deg is not None]
+    if not rows:
+        raise OptionError(f"around: expected LAT,LON or photographs with positions, got none in {folder}")
+    lat_deg, lon_deg = (np.array([getattr(row, name) for row in rows]) for name in ("lat_deg", "lon_deg"))
+    frame = LocalFrame(float(lat_deg[0]), float(lon_deg[0]))
+    where = frame.enu_from_geodetic(lat_deg, lon_deg)[..., :2]
+    low, high = where.min(axis=0), where.max(axis=0)
+    middle = frame.geodetic_from_enu(*((low + high) / 2.0))
+    heights_m = [row.height_agl_m for row in rows if row.height_agl_m is not None] or [_USUAL_HEIGHT_M]
+    radius_m = float((high - low).max()) / 2.0 + max(heights_m) + _MARGIN_M
+    finest_m_per_px = min(GSD_M_PER_PX, float(np.median(heights_m)) / _USUAL_HEIGHT_M * GSD_M_PER_PX)
+    return Place(float(middle[0]), float(middle[1]), radius_m), finest_m_per_px
+
+
+def _planned(settings: FetchSettings, wanted: Wanted, client: Client) -> Mosaic:
+    """What is to be asked for; a service is asked for its capabilities first."""
+    url = settings.source
     if is_template(url):
         return plan_xyz(url, wanted, settings.tile_px)
     is_document = url.partition("?")[0].lower().endswith(".xml")
@@ -265,8 +323,6 @@ def _fetch_surface(
 
 def _surface_facts(surface: tuple[Heights, float | None] | None, file: Path) -> dict[str, Any]:
     """What was written of a surface."""
-    import numpy as np
-
     if surface is None:
         return {"surface": None}
     heights, slope_sigma_deg = surface

@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from engine.errors import CalibrationError
+from engine.errors import CalibrationError, TelemetryError
 from engine.formats.flight import open_flight
+from engine.formats.logs.readers import open_truth
 from engine.formats.photo_camera import photo_camera
 from engine.formats.photos import COMPASS_SIGMA_DEG, GIMBAL_SIGMA_DEG, exif_telemetry, photo_telemetry
 from engine.formats.telemetry import DEFAULT_PRIOR_SIGMA_M
@@ -206,3 +207,20 @@ def test_a_real_survey_says_camera_place_height_and_heading_itself():
             assert abs(row.pitch_deg) < 0.2
     turned = [row.frame for row in flight.rows if row.heading_deg is None]
     assert turned == ["DJI_0025.JPG", "DJI_0027.JPG", "DJI_0029.JPG"]  # saved by a viewer, upside down
+
+
+def test_positions_of_photographs_serve_as_truth_at_their_own_times(tmp_path):
+    place = {1: "N", 2: (48.0, 15.0, 0.0), 3: "E", 4: (16.0, 30.0, 0.0), 5: b"\x00", 6: 300.0}
+    photograph(tmp_path / "b.jpg", taken="2024:05:06 07:08:19", gps=place, xmp=gimbal())
+    photograph(tmp_path / "a.jpg", gps=place | {2: (48.0, 16.0, 12.0)})
+    photograph(tmp_path / "without.jpg", taken="2024:05:06 07:08:29")
+    early, late = open_truth(tmp_path)
+    stamps = [row.timestamp_ns for row in exif_telemetry(tmp_path)]
+    assert [early.timestamp_ns, late.timestamp_ns] == stamps[:2]
+    assert (early.lat_deg, late.lat_deg, late.lon_deg) == pytest.approx((48.27, 48.25, 16.5), abs=1e-12)
+    assert (late.alt_amsl_m, late.height_agl_m, late.heading_deg) == (None, None, None)  # no truth
+    only = tmp_path / "only"
+    only.mkdir()
+    photograph(only / "a.jpg")
+    with pytest.raises(TelemetryError, match="expected photographs with a time and a position in their EXIF"):
+        open_truth(only)

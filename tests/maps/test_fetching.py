@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from engine.runs.single_image import locate_image
 from engine.sim import plan_flight
 from engine.values import Window
 from tests.support.map_servers import HALF_WORLD_M, serving
+from tests.support.photos import gimbal, photograph
 from tests.support.towns import drawn_town
 
 SIZE = 700
@@ -523,3 +525,27 @@ def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
     assert (found["argument"], "exists" in found["error"]) == ("--out", True)
     assert run([*given, "--force", "--max-tiles=1", "--radius-m=150"]) == 2
     assert "--max-tiles: expected at most 1 tiles" in capsys.readouterr().err
+
+
+def test_around_photographs_the_map_holds_what_they_saw_as_fine_as_their_height_needs(server, tmp_path):
+    """Two photographs 100 m apart from 75 m: half of 100 m, the height and 50 m about their middle, 0.25 m/px."""
+    lat, lon = 48.246, 16.5245
+    further = lat + 100.0 / 111_200.0
+    for name, degrees in (("a.jpg", lat), ("b.jpg", further)):
+        place = {1: "N", 2: (degrees, 0.0, 0.0), 3: "E", 4: (lon, 0.0, 0.0)}
+        photograph(tmp_path / name, gps=place, xmp=gimbal(height="+75.00"))
+    said: list[str] = []
+    wanted = FetchSettings(around=str(tmp_path), source=f"{server.url}/wms", crs="EPSG:32633", dry_run=True)
+    facts = fetch_map(wanted, tmp_path / "map.tif", SimpleNamespace(message=said.append))
+    west, south, east, north = facts["bounds_deg"]
+    assert ((south + north) / 2.0, (west + east) / 2.0) == pytest.approx(((lat + further) / 2.0, lon), abs=2e-5)
+    half_m = (north - south) / 2.0 * 111_200.0  # at least what was asked for; UTM is turned by 1.1 degrees there
+    assert 50.0 + 75.0 + 50.0 <= half_m < 1.05 * 175.0
+    assert facts["gsd_m_per_px"] == pytest.approx(0.25, rel=1e-3)
+    assert any(line.startswith("the photographs' place: 48.246") for line in said)
+    with pytest.raises(OptionError, match="radius_m: expected with LAT,LON"):
+        fetch_map(FetchSettings(around="48.25,16.44", source=f"{server.url}/wms"), tmp_path / "map.tif")
+    (tmp_path / "none").mkdir()
+    photograph(tmp_path / "none" / "a.jpg")
+    with pytest.raises(OptionError, match="around: expected LAT,LON or photographs with positions"):
+        fetch_map(FetchSettings(around=str(tmp_path / "none"), source=f"{server.url}/wms"), tmp_path / "map.tif")

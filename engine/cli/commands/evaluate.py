@@ -14,7 +14,8 @@ from engine.cli.options import JsonOption
 def evaluate(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
     truth: Annotated[
-        Path | None, typer.Option("--truth", metavar="FILE", help="truth.csv; without it the one that track used.")
+        Path | None,
+        typer.Option("--truth", metavar="FILE", help="truth.csv, log or photographs; else track's."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

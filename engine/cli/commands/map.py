@@ -97,8 +97,9 @@ def audit(
 
 
 def fetch(
-    around: Annotated[str, typer.Option("--around", metavar="LAT,LON", help="The middle of the map.")],
-    radius_m: Annotated[float, typer.Option("--radius-m", metavar="M", help="From there to each edge, at least.")],
+    around: Annotated[
+        str, typer.Option("--around", metavar="LAT,LON|DIR", help="The middle; or photographs with positions.")
+    ],
     source: Annotated[
         str,
         typer.Option(
@@ -106,10 +107,16 @@ def fetch(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.")],
+    radius_m: Annotated[
+        float | None,
+        typer.Option("--radius-m", metavar="M", help="To each edge, at least; else what the photographs saw."),
+    ] = None,
     gsd_m_per_px: Annotated[
-        float,
-        typer.Option("--gsd-m-per-px", metavar="M", help="Of the map; tiles are so fine or finer."),
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            "--gsd-m-per-px", metavar="M", help="Tiles are so fine or finer; 0.5, or as photographs need."
+        ),
+    ] = None,
     layer: Annotated[
         str | None, typer.Option("--layer", metavar="NAME", help="Of a WMS or WMTS that has several.")
     ] = None,

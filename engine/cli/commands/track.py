@@ -77,7 +77,7 @@ def track(
     truth: Annotated[
         Path | None,
         typer.Option(
-            "--truth", metavar="FILE", help="truth.csv, or a log; without it the one beside the telemetry."
+            "--truth", metavar="FILE", help="truth.csv, a log or photographs; else the one beside the telemetry."
         ),
     ] = None,
     settings_path: SettingsOption = None,

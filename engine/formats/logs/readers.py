@@ -15,7 +15,7 @@ from engine.formats.frames import FrameSource, VideoFile
 from engine.formats.logs.dataflash import read_dataflash
 from engine.formats.logs.dji_srt import read_srt
 from engine.formats.logs.ulog import read_ulog
-from engine.formats.photos import exif_telemetry
+from engine.formats.photos import exif_telemetry, photo_truth
 from engine.formats.resampling import UTC_FROM_NS, FlightLog, TimeSeries, truth_from_log
 from engine.formats.ros.bags import BagFrames, is_bag, read_bag
 from engine.formats.telemetry import read_telemetry
@@ -56,6 +56,11 @@ AS_LOGGED = LogClock()
 def is_log(path: str | Path) -> bool:
     """Whether a path is a flight log or a bag, by its suffix."""
     return Path(path).suffix.lower() in LOG_SUFFIXES or is_bag(path)
+
+
+def is_photographs(path: str | Path) -> bool:
+    """Whether a path is a folder, and no bag."""
+    return Path(path).is_dir() and not is_bag(path)
 
 
 def open_log(path: str | Path) -> FlightLog:
@@ -153,12 +158,14 @@ def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
     """Read truth from truth.csv, or from the positions of a log; from a bag's ``/truth`` topics where it has them.
 
     Args:
-        path: truth.csv or a log.
+        path: truth.csv, a log, or a folder of photographs whose EXIF has positions.
         stamp_ns: a stamp of the frames; where it is UTC, the truth of a log is converted to UTC.
 
     Raises:
         TelemetryError: the file cannot be read or has no positions.
     """
+    if is_photographs(path):
+        return photo_truth(Path(path))
     if not is_log(path):
         return read_truth(path)
     log = read_bag(Path(path), truth=True) if is_bag(path) else open_log(path)
