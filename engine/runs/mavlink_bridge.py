@@ -17,6 +17,8 @@ from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
 from engine.evidence import position_of
+from engine.formats.flight import open_flight
+from engine.formats.frames import VIDEO_SUFFIXES
 from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
@@ -52,10 +54,11 @@ class BridgeFiles:
 
     Attributes:
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration.
+        camera: calibration; None takes that of the pictures that are played, or ``hfov_deg``.
+        hfov_deg: horizontal field of view of the pictures that are played, in place of a calibration.
         surface: surface model, a GeoTIFF of heights.
         frames: pictures that are played at their own pace, a folder or a video.
-        telemetry: telemetry.csv, whose stamps set that pace.
+        telemetry: telemetry.csv or a log, whose stamps set that pace; None takes a video's own times.
         camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: pace of pictures without stamps; None is 10.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
@@ -71,7 +74,8 @@ class BridgeFiles:
     """
 
     map: StrPath
-    camera: StrPath
+    camera: StrPath | None = None
+    hfov_deg: float | None = None
     surface: StrPath | None = None
     frames: StrPath | None = None
     telemetry: StrPath | None = None
@@ -91,6 +95,7 @@ class BridgeFiles:
             raise OptionError("frames: expected either `frames` or `camera_source`")
         if self.frames is None:
             check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz}, "frames")
+            self._check_live_camera()
         else:
             check_unused({"exposure_to_grab_ms": self.exposure_to_grab_ms}, "camera_source")
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
@@ -100,9 +105,26 @@ class BridgeFiles:
                 f"exposure_to_grab_ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
             )
 
+    def _check_live_camera(self) -> None:
+        if self.camera is None:
+            raise OptionError("camera: expected a calibration of the camera that `camera_source` opens")
+        source = Path(self.camera_source or "")
+        if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():  # it would be read as fast as it can
+            raise OptionError(f"camera_source: expected a camera, got the video {source}; `frames` plays it")
+
     def camera_files(self) -> CameraFiles:
         """What is said of the camera."""
-        return CameraFiles(calibration=Path(self.camera), mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
+        return CameraFiles(
+            calibration=None if self.camera is None else Path(self.camera),
+            hfov_deg=self.hfov_deg, mount=self.mount, camera_pitch_deg=self.camera_pitch_deg,
+        )  # fmt: skip
+
+    def load_camera(self, progress: Progress = SILENT) -> Camera:
+        """The calibration, else what is said of the pictures that are played, or by them."""
+        if self.camera is not None or self.frames is None:
+            return self.camera_files().load(None)
+        flight = open_flight(self.frames, self.telemetry)
+        return self.camera_files().load(flight.source, flight.names, progress=progress)
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Generator[CapturedImage | None, None, None]:
         """Pictures as they are captured, None where a camera gives none for a while.
@@ -267,7 +289,7 @@ def run_mavlink_bridge(
     site = open_map(
         files.map, files.surface, files.map_sigma_m, bounds=files.map_bounds, crs=files.map_crs, progress=progress
     )
-    camera = files.camera_files().load(None)
+    camera = files.load_camera(progress)
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
@@ -282,6 +304,8 @@ def run_mavlink_bridge(
     start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
 
     end_on_sigterm()
+    # Before the link: an autopilot on the bench takes off when the bridge listens.
+    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
     with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
@@ -295,11 +319,8 @@ def run_mavlink_bridge(
         with bridge:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
-            pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
-            with (
-                closing(pictures),
-                suppress(KeyboardInterrupt),
-            ):  # the usual end beside a camera, and no reason to lose the counts
+            # Ctrl-C is the usual end beside a camera, and no reason to lose the counts.
+            with closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress)
             if files.camera_source is not None:
                 remember_delay(bridge.status.least_age_ms)

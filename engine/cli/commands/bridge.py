@@ -17,6 +17,7 @@ from engine.cli.options import (
     DeadlineOption,
     DeviceOption,
     FirmwareOption,
+    HfovOption,
     JsonOption,
     KeyOption,
     ListenAnywhereOption,
@@ -29,6 +30,7 @@ from engine.cli.options import (
     MethodOption,
     MountOption,
     NiceOption,
+    OptionalCameraOption,
     RealtimeOption,
     RerunConnectOption,
     RerunOption,
@@ -52,7 +54,8 @@ def mavlink(
         ),
     ],
     map_path: MapOption,
-    camera: CameraOption,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
     surface: SurfaceOption = None,
@@ -64,7 +67,10 @@ def mavlink(
         typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
     ] = None,
     telemetry: Annotated[
-        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
+        Path | None,
+        typer.Option(
+            "--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace; else a video's own."
+        ),
     ] = None,
     rate_hz: Annotated[
         float | None,
@@ -132,7 +138,7 @@ def mavlink(
 
     use_threads(threads)
     files = BridgeFiles(
-        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry,
         camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
         map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
         camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
