@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # The stamps follow pyproject.toml: a changed dependency is installed at the next make, and nothing otherwise.
 $(VENV)/run.stamp: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet --editable .
+	$(PIP) install --quiet --editable '.[desk]'
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/run.stamp
@@ -43,13 +43,18 @@ check: $(VENV)/dev.stamp
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The wheel as a stranger gets it: built, installed beside nothing else, and flown from another folder.
+# The wheel as a stranger gets it: built, installed beside nothing else, and flown from another folder, first as on a
+# vehicle and then as on a desk.
 package: $(VENV)/dev.stamp
 	rm -rf dist build/clean build/flown
 	$(BIN)/python -m build --outdir dist .
 	$(PYTHON) -m venv build/clean
 	build/clean/bin/pip --disable-pip-version-check install --quiet dist/*.whl
-	cd build && clean/bin/scenematch doctor && clean/bin/scenematch demo --frames 4 --out flown
+	cd build && clean/bin/scenematch doctor && clean/bin/scenematch simulate --frames 4 --out flown
+	cd build/flown && ../clean/bin/scenematch track --map map.tif --surface dsm.tif --camera camera.yaml \
+		--frames frames --telemetry telemetry.csv --out track
+	build/clean/bin/pip --disable-pip-version-check install --quiet "$$(echo dist/*.whl)[desk]"
+	cd build && clean/bin/scenematch demo --frames 4 --out flown/demo
 
 extras: package
 	.ci/extras

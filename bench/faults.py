@@ -23,9 +23,9 @@ from bench import DOCS
 from bench.inputs.faults import Fault, Told, faults, load
 from bench.pages.text import table
 from engine import Fix, Navigator, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.diagnosis import diagnose
 from engine.formats.truth import interpolate_truth
+from engine.threads import set_threads
 
 BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0

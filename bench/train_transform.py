@@ -21,9 +21,9 @@ from torch import Tensor
 from bench import ROOT
 from bench.accuracy.years import YEARS, opened, places, shift, vintages
 from bench.transform import SHAPES, Weights, forward
-from engine.device import set_threads
 from engine.scores import enhance
 from engine.sim import build_town
+from engine.threads import set_threads
 from engine.values import Window
 
 Gray = NDArray[np.uint8]

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from engine.budget import Budget
     from engine.camera import Camera
     from engine.covariance import AssumedErrors
-    from engine.device import set_threads
     from engine.errors import (
         BackendError,
         CalibrationError,
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
     from engine.pose import PoseOptions
     from engine.realtime import Realtime, set_realtime
+    from engine.threads import set_threads
     from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 __all__ = [
@@ -85,7 +85,7 @@ _NAMES = {
     "engine.budget": "Budget",
     "engine.camera": "Camera",
     "engine.covariance": "AssumedErrors",
-    "engine.device": "set_threads",
+    "engine.threads": "set_threads",
     "engine.errors": "BackendError CalibrationError DeviceError DtypeError EngineError MapError MissingExtraError "
     "OptionError ShapeError StateError TelemetryError",
     "engine.live": "Answer Live LiveOptions",

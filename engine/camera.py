@@ -297,6 +297,26 @@ class Camera:
         undistorted = cv2.remap(image, *self._undistort_maps, cv2.INTER_LINEAR)
         return np.asarray(undistorted, dtype=np.uint8)
 
+    def undistort_points(self, xy_px: Array) -> Array:
+        """Places on the plane one ahead of the lens, on which a pinhole camera of matrix 1 has its pixels.
+
+        Args:
+            xy_px: (N, 2) pixels of pictures as they were taken.
+
+        Returns:
+            (N, 2) x and y over z of the rays that the pixels see.
+        """
+        import cv2
+
+        if not len(xy_px):
+            return np.zeros((0, 2))
+        pixels = np.asarray(xy_px, np.float64)[:, None]
+        if self.distortion_model in ("equidistant", "fisheye"):
+            flat = cv2.fisheye.undistortPoints(pixels, self.matrix, self.distortion)
+        else:
+            flat = cv2.undistortPoints(pixels, self.matrix, self.distortion)
+        return np.asarray(flat, np.float64)[:, 0]
+
     def check_size(self, shape: tuple[int, ...]) -> None:
         """Refuse a picture of another resolution than the calibration's.
 

@@ -1,16 +1,13 @@
-"""Selection of the device, copies to it and from it, number of threads, and synchronisation.
-
-torch is imported by what uses it: arguments are checked, and live frames queued, without.
-"""
+"""Where pictures are worked on: NumPy arrays on the CPU, and on a GPU tensors, for which torch is loaded."""
 
 from __future__ import annotations
 
-import os
-import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeVar
+import ctypes
+import re
+import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +15,30 @@ from numpy.typing import NDArray
 from engine.errors import DeviceError, OptionError
 
 if TYPE_CHECKING:
-    import torch
+    from engine.tensors import torch
 
-T = TypeVar("T")
-R = TypeVar("R")
 AnyArray = NDArray[Any]
-_ALIGNMENT = 16  # bytes; no element is larger
-_WORKER = "scenematch-worker"
-_chosen = threading.Event()  # whether the number of threads was chosen, for the whole process as torch's is
+Picture: TypeAlias = Any
+"""An array on the CPU, a tensor on a GPU; what both have, such as slices and shapes, is written once."""
+
+_NAME = re.compile(r"(cpu|cuda)(:[0-9]+)?")
 
 
-def resolve(device: str | torch.device = "auto") -> torch.device:
+class Device(str):
+    """The name of a device, as torch takes it: "cpu", "cuda" or "cuda:N"."""
+
+    __slots__ = ()
+
+    @property
+    def type(self) -> str:
+        """The name without the number."""
+        return self.partition(":")[0]
+
+
+CPU = Device("cpu")
+
+
+def resolve(device: str | torch.device = "auto") -> Device:
     """The device of a name, if it is available.
 
     Args:
@@ -38,127 +48,94 @@ def resolve(device: str | torch.device = "auto") -> torch.device:
         DeviceError: the device was requested by name and is missing; only "auto" falls back.
         OptionError: the name is not a device.
     """
-    import torch
-
     if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        requested = torch.device(device)
-    except RuntimeError:
-        raise OptionError(f"device: expected cpu, cuda or auto, got {device!r}") from None
-    if requested.type not in ("cpu", "cuda"):
+        return Device("cuda") if _cuda_devices() else CPU
+    match = _NAME.fullmatch(str(device))
+    if match is None:
         raise OptionError(f"device: expected cpu, cuda or auto, got {device!r}")
-    if requested.type == "cuda":
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if (requested.index or 0) >= count:
-            raise DeviceError(f"device: {requested} was asked for, but this machine offers {count} CUDA devices")
-    return requested
+    if match[1] == "cuda" and int((match[2] or ":0")[1:]) >= _cuda_devices():
+        raise DeviceError(
+            f"device: {device} was asked for, but this machine offers {_cuda_devices()} CUDA devices"
+        )
+    return Device(match[0])
 
 
-def synchronise(device: torch.device) -> None:
+def _cuda_devices() -> int:
+    """How many devices torch has; it is not loaded to say that there are none."""
+    if not _may_have_cuda():
+        return 0
+    from engine.tensors import torch
+
+    return torch.cuda.device_count() if torch.cuda.is_available() else 0
+
+
+@cache
+def _may_have_cuda() -> bool:
+    """Whether there is a driver of CUDA or ROCm; without one torch need not be asked."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return Path("/dev/kfd").exists()
+    return True
+
+
+def synchronise(device: Device | torch.device) -> None:
     """Wait until all work queued on ``device`` is done, for instance before reading a clock."""
     if device.type == "cuda":
-        import torch
+        from engine.tensors import torch
 
         torch.cuda.synchronize(device)
 
 
-def upload(arrays: Sequence[AnyArray], device: torch.device) -> list[torch.Tensor]:
-    """Arrays as tensors on a device, in one copy; on the CPU they share memory with the arrays.
+def placed(array: AnyArray, device: Device | torch.device) -> Picture:
+    """An array where it is worked on: itself on the CPU, elsewhere a tensor.
 
     Args:
-        arrays: of any shapes and of types that torch has.
-        device: of the tensors.
-
-    Returns:
-        As many, of the same shapes and types.
+        array: of any shape.
+        device: of the tensor.
     """
-    import torch
-
-    tensors = [torch.from_numpy(np.ascontiguousarray(array)) for array in arrays]
     if device.type == "cpu":
-        return tensors
-    return _unpacked(_packed(tensors).to(device), tensors)
+        return array
+    from engine.tensors import torch
+
+    return torch.from_numpy(array).to(device)
 
 
-def download(tensors: Sequence[torch.Tensor]) -> list[AnyArray]:
-    """Tensors of one device as arrays, in one copy; those of the CPU share memory with the arrays.
-
-    Args:
-        tensors: of any shapes.
-
-    Returns:
-        As many, of the same shapes and types.
-    """
-    if all(tensor.device.type == "cpu" for tensor in tensors):
-        return [tensor.numpy() for tensor in tensors]
-    return [tensor.numpy() for tensor in _unpacked(_packed(tensors).cpu(), tensors)]
+def on_host(picture: Picture) -> AnyArray:
+    """The array of a picture: itself, or what is copied from its device."""
+    return picture if isinstance(picture, np.ndarray) else np.asarray(picture.cpu())
 
 
-def _packed(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The bytes of tensors, each beginning on a multiple of what the largest element needs."""
-    import torch
-
-    parts = [tensor.contiguous().view(-1).view(torch.uint8) for tensor in tensors]
-    return torch.cat([torch.nn.functional.pad(part, (0, -len(part) % _ALIGNMENT)) for part in parts])
+def element_type(picture: Picture) -> str:
+    """The name of the element type, such as "float32"."""
+    return str(picture.dtype).removeprefix("torch.")
 
 
-def _unpacked(packed: torch.Tensor, like: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    out, begin = [], 0
-    for tensor in like:
-        size = tensor.numel() * tensor.element_size()
-        out.append(packed[begin : begin + size].view(tensor.dtype).view(tensor.shape))
-        begin += size + -size % _ALIGNMENT
-    return out
+def as_float(picture: Picture, name: str) -> Picture:
+    """The picture in float32 or float64."""
+    if isinstance(picture, np.ndarray):
+        return picture.astype(name, copy=False)
+    return picture.double() if name == "float64" else picture.float()
 
 
-def set_threads(count: int) -> None:
-    """Set the number of threads of torch and of OpenCV, before or after a matcher is made.
-
-    Without it, and without ``OMP_NUM_THREADS``, the first matcher sets one: where other work shares the processor,
-    several threads wait for each other, and frames come late.
-
-    Raises:
-        OptionError: ``count`` is below 1.
-    """
-    import cv2
-    import torch
-
-    if count < 1:
-        raise OptionError(f"threads: expected 1 or more, got {count}")
-    _chosen.set()
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)
+def plain(*pictures: Picture) -> list[Picture]:
+    """The arrays of tensors on the CPU, in the same memory; those of a GPU, or with gradients, as they are."""
+    if any(not isinstance(v, np.ndarray) and (v.device.type != "cpu" or v.requires_grad) for v in pictures):
+        return list(pictures)
+    return [v if isinstance(v, np.ndarray) else v.numpy() for v in pictures]
 
 
-def default_threads() -> None:
-    """One thread, unless :func:`set_threads` or ``OMP_NUM_THREADS`` chose otherwise."""
-    if not _chosen.is_set() and "OMP_NUM_THREADS" not in os.environ:
-        set_threads(1)
+def as_tensor(picture: Picture) -> Picture:
+    """A tensor as it is, and an array as one, in the same memory."""
+    if not isinstance(picture, np.ndarray):
+        return picture
+    from engine.tensors import torch
+
+    return torch.from_numpy(np.ascontiguousarray(picture))
 
 
-def parts(size: int, max_count: int) -> list[tuple[int, int]]:
-    """Divide a range of ``size`` into at most ``max_count`` parts (begin, end), and at most one per thread."""
-    import torch
-
-    count = max(1, min(max_count, torch.get_num_threads()))
-    return [(size * i // count, size * (i + 1) // count) for i in range(count)]
-
-
-def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
-    """Return the results of a function on each piece, computed by as many threads as torch has.
-
-    It is faster only where the function releases Python's global lock. A call inside a worker runs in that worker,
-    so that no worker waits for another.
-    """
-    import torch
-
-    threads = torch.get_num_threads()
-    if len(pieces) == 1 or threads == 1 or threading.current_thread().name.startswith(_WORKER):
-        return [work(piece) for piece in pieces]
-    return list(_workers(threads).map(work, pieces))
-
-
-@lru_cache(maxsize=1)
-def _workers(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix=_WORKER)
+def like(given: Picture, found: Picture) -> Picture:
+    """What was found as an array or a tensor, as what was given is."""
+    if isinstance(given, np.ndarray):
+        return found if isinstance(found, np.ndarray) else found.numpy()
+    return as_tensor(found)

@@ -24,14 +24,12 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
-from engine.device import in_parallel
-from engine.errors import DtypeError, OptionError, ShapeError
+from engine.errors import DtypeError, OptionError, ShapeError, require
 from engine.sift.descriptors import describe, dominant_angle
 from engine.sift.keypoints import Points, detect, strongest
 from engine.sift.scale_space import make_plan
+from engine.tensors import Tensor, torch
+from engine.threads import in_parallel
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +62,17 @@ class Features:
         Returns:
             (B, N, 2, 3) affine matrices.
 
+        Raises:
+            MissingExtraError: kornia is not installed.
+
         Convention:
             The first two columns are the images of the patch's x and y axes, the third is the centre.
             kornia's own angles turn the other way, so ``kornia.feature.get_laf_orientation`` gives -angle_deg.
         """
-        from kornia.feature import laf_from_center_scale_ori
-
+        kornia_feature = require("kornia.feature", "learned")
         scale = (magnification * self.scale_px)[..., None, None]
-        return laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
+        lafs: Tensor = kornia_feature.laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
+        return lafs
 
 
 def sift(

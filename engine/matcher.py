@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import torch
 
 from engine import device as devices
+from engine import threads
 from engine import workers as processes
 from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
 from engine.errors import EngineError, OptionError
-from engine.features import plans_created
 from engine.kernels import loops_compiled
 from engine.methods import method_type
 from engine.methods.costs import Costs
@@ -28,8 +30,23 @@ from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
 
+if TYPE_CHECKING:
+    from engine.tensors import torch
+
 _WARMUP_SHARES = (0.25, 0.12)  # of the map's shorter side that a synthetic frame sees
 _WARMUP_SIDE_PX = 4096  # of a larger map it is a part of this side
+
+
+def _plans_created() -> int:
+    """Layouts of pictures that SIFT made so far; its module is not imported to say that there are none."""
+    features = sys.modules.get("engine.features")
+    return 0 if features is None else int(features.plans_created())
+
+
+def _give_back_memory() -> None:
+    """Give the system what was allocated for the warm-up alone: glibc keeps it otherwise."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)
 
 
 def _bounded(prior: Prior) -> Prior:
@@ -72,7 +89,7 @@ class SceneMatcher:
         self.camera = camera
         self.method = method
         self.device = devices.resolve(device)
-        devices.default_threads()
+        threads.default_threads()
         self._method: Method = build(site, self.device, self.options)
         self._costs = Costs()
         # What an undistorted picture obeys; the mount stays.
@@ -96,6 +113,8 @@ class SceneMatcher:
                 self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
             if self.site.is_searchable:
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
+        _give_back_memory()
+        self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # takes again what a frame needs of it
 
     def _synthetic_frame(self, share: float) -> tuple[Frame, Prior]:
         """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""
@@ -117,7 +136,7 @@ class SceneMatcher:
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far; after :meth:`warmup` none rises on a small map."""
-        shared = {"feature plans": plans_created(), "compiled loops": loops_compiled()}
+        shared = {"feature plans": _plans_created(), "compiled loops": loops_compiled()}
         return self._method.cache_counters | shared
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:

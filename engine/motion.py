@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.geo import chi_square
-from engine.values import MAX_SIGMA_M, Fix, Frame, Prior
+from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
 Array = NDArray[np.float64]
 
@@ -24,11 +24,61 @@ class OdometrySample:
         time_s: since the first frame.
         moved_m: (2,) displacement east and north since then.
         blind_s: the part of that time without a measured velocity.
+        stated_s: the part of it whose velocity came with its own accuracy, which the next two add up.
+        lasting_m: errors that last, of both axes.
+        noise_m2: variance per axis of those that do not.
     """
 
     time_s: float
     moved_m: Array
     blind_s: float
+    stated_s: float = 0.0
+    lasting_m: float = 0.0
+    noise_m2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class GroundMotion:
+    """How far the vehicle moved over the ground between two pictures, as these show it.
+
+    Attributes:
+        interval_s: between them.
+        moved_m: (2,) east and north.
+        noise_m2: (2, 2) covariance of the errors of this step.
+        lasting_share: of the way; the error by height and heading, which stays the same for long.
+        drift: by how much more than alone such steps add to the variance of a long way, since an error stays the
+            same for some of them.
+        points: that agreed.
+    """
+
+    interval_s: float
+    moved_m: Array
+    noise_m2: Array
+    lasting_share: float
+    drift: float
+    points: int
+
+    @property
+    def velocity_mps(self) -> Array:
+        """(2,) east and north, the mean between the two pictures."""
+        return self.moved_m / self.interval_s
+
+    @property
+    def velocity_covariance_m2ps2(self) -> Array:
+        """(2, 2) of that velocity, with the error that lasts."""
+        lasting_m2 = self.lasting_share**2 * float(self.moved_m @ self.moved_m)
+        return np.asarray((self.noise_m2 + lasting_m2 * np.eye(2)) / self.interval_s**2)
+
+    def added_to(self, last: OdometrySample, interval_s: float) -> OdometrySample:
+        """The sample so long after the last one."""
+        return OdometrySample(
+            last.time_s + interval_s,
+            last.moved_m + self.moved_m,
+            last.blind_s,
+            last.stated_s + interval_s,
+            last.lasting_m + self.lasting_share * float(np.hypot(*self.moved_m)),
+            last.noise_m2 + self.drift * float(np.linalg.eigvalsh(self.noise_m2)[-1]),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +127,15 @@ class DeadReckoning:
             )
         return True
 
-    def sample(self, frame: Frame, velocity: VelocityEstimate | None) -> OdometrySample:
+    def sample(
+        self, frame: Frame, velocity: VelocityEstimate | None, seen: GroundMotion | None = None
+    ) -> OdometrySample:
         """The sample of a frame; nothing is changed by it.
 
         Args:
             frame: a new one, or a late one.
             velocity: assumed where the frame came without one; None assumes none.
+            seen: by the pictures, since the newest frame; in place of a velocity that is assumed.
         """
         last = self.last
         if last is None:
@@ -95,9 +148,24 @@ class DeadReckoning:
         measured = _velocity_of(frame)
         if measured is not None:
             mean = measured if self._measured is None else 0.5 * (measured + self._measured)
-            return OdometrySample(last.time_s + interval_s, last.moved_m + mean * interval_s, last.blind_s)
-        step = np.zeros(2) if velocity is None else velocity.mps * interval_s
-        return OdometrySample(last.time_s + interval_s, last.moved_m + step, last.blind_s + interval_s)
+            step_m, sigma_mps = mean * interval_s, frame.velocity_sigma_mps
+            stated_s, lasting_m = (0.0, 0.0) if sigma_mps is None else (interval_s, sigma_mps * interval_s)
+            return replace(
+                last,
+                time_s=last.time_s + interval_s,
+                moved_m=last.moved_m + step_m,
+                stated_s=last.stated_s + stated_s,
+                lasting_m=last.lasting_m + lasting_m,
+            )
+        if seen is not None:
+            return seen.added_to(last, interval_s)
+        step_m = np.zeros(2) if velocity is None else velocity.mps * interval_s
+        return replace(
+            last,
+            time_s=last.time_s + interval_s,
+            moved_m=last.moved_m + step_m,
+            blind_s=last.blind_s + interval_s,
+        )
 
     def append(self, frame: Frame, sample: OdometrySample) -> None:
         """Add a frame that was matched."""
@@ -116,9 +184,9 @@ class DeadReckoning:
     def _between(self, time_s: float) -> OdometrySample:
         """The sample at a time between two frames; of an earlier time the first of all."""
         times = [sample.time_s for sample in self._samples]
-        rows = np.array([(*sample.moved_m, sample.blind_s) for sample in self._samples])
-        east, north, blind = (float(np.interp(time_s, times, column)) for column in rows.T)
-        return OdometrySample(time_s, np.array([east, north]), blind)
+        rows = np.array([(*s.moved_m, s.blind_s, s.stated_s, s.lasting_m, s.noise_m2) for s in self._samples])
+        east, north, *others = (float(np.interp(time_s, times, column)) for column in rows.T)
+        return OdometrySample(time_s, np.array([east, north]), *others)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,12 +215,13 @@ class DriftModel:
             velocity: assumed where none was measured; None where none was assumed.
         """
         blind_s = abs(end.blind_s - start.blind_s)
-        measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s)
+        measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s - abs(end.stated_s - start.stated_s))
+        lasting_m = self.measured_sigma_mps * measured_s + abs(end.lasting_m - start.lasting_m)
         blind_m = 0.5 * self.max_speed_mps * blind_s
         if velocity is not None:
             changed_m = self.acceleration_mps2 * math.sqrt(blind_s**3 / 3.0)  # a random walk of the velocity
             blind_m = min(velocity.sigma_mps * blind_s + changed_m, 2.0 * blind_m)
-        return self.measured_sigma_mps * measured_s + blind_m
+        return math.hypot(lasting_m + blind_m, math.sqrt(abs(end.noise_m2 - start.noise_m2)))
 
     def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate | None:
         """The velocity at the later of two fixes; None where they are so far apart that it predicts nothing.
@@ -202,6 +271,13 @@ class PositionEstimate:
     def chi_square(self, fix: Fix) -> float:
         """Squared distance of a fix in units of both covariances: two degrees of freedom."""
         return chi_square(en_m(fix) - self.en_m, self.difference_covariance_m2(fix))
+
+    def refusal(self, fix: Fix) -> NoFix:
+        """The refusal of a fix that contradicts this."""
+        apart_m = float(np.hypot(*(en_m(fix) - self.en_m)))
+        sigma_m = math.hypot(self.sigma_m, fix.relative_sigma_m if self.on_map else fix.sigma_m)
+        detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
+        return fix.refused(Reason.INCONSISTENT, detail)
 
     def prior(self, widened: float = 1.0, moved_m: Array | None = None, map_sigma_m: float = 0.0) -> Prior:
         """The same as a prior.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from engine.anchors import Anchor, RecentAnchors
 from engine.attitude_bias import Bias
 from engine.budget import Budget
+from engine.camera import Camera
 from engine.covariance import map_sigma_of
 from engine.evidence import (
     MAX_PROBABILITY,
@@ -24,16 +25,10 @@ from engine.evidence import (
 )
 from engine.hypotheses import Hypotheses, Hypothesis, Match
 from engine.map_offset import MapOffset, MapOffsetEstimator
-from engine.motion import (
-    DeadReckoning,
-    DriftModel,
-    OdometrySample,
-    PositionEstimate,
-    en_m,
-    is_valid,
-)
+from engine.motion import DeadReckoning, DriftModel, GroundMotion, OdometrySample, PositionEstimate, en_m, is_valid
 from engine.navigator_options import NavigatorOptions
 from engine.navigator_state import NavigatorState
+from engine.odometry import VisualOdometry
 from engine.orthomap import OrthoMap
 from engine.repeats import Repeats
 from engine.telemetry_errors import Calibration, TelemetryErrors
@@ -47,6 +42,7 @@ class Matcher(Protocol):
     """What a navigator needs of a matcher; :class:`engine.matcher.SceneMatcher` is one."""
 
     site: OrthoMap
+    camera: Camera
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """Where the camera was when the frame was taken."""
@@ -78,14 +74,15 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._errors = TelemetryErrors(o)
+        self._pictures = VisualOdometry(matcher.camera) if o.odometry else None
+        self._motion: GroundMotion | None = None  # up to the newest frame
         self._repeats = Repeats()
         self._velocity = VelocityCheck(o.measured_velocity_sigma_mps, o.acceleration_mps2)
         self._recent = RecentAnchors(self._drift)
         self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
         self._hypotheses = Hypotheses(self._drift, o.gate)
-        self._refusals = 0  # in a row
-        self._frames_lost = 0
+        self._refusals = self._frames_lost = 0  # in a row
         self._fixed = self._lost = False  # whether the newest frame was; whether the flight is
         self._resets = 0
 
@@ -127,9 +124,13 @@ class Navigator:
         """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
         now = self._odometry.last
         estimate = None if now is None else self._reckoned(now)
-        if estimate is None:
-            return None
-        return estimate.prior(map_sigma_m=map_sigma_of(self._matcher.site) if estimate.on_map else 0.0)
+        map_m = map_sigma_of(self._matcher.site) if estimate is not None and estimate.on_map else 0.0
+        return None if estimate is None else estimate.prior(map_sigma_m=map_m)
+
+    @property
+    def ground_motion(self) -> GroundMotion | None:
+        """The way to the newest frame as pictures show it; None where they do not, or were not asked."""
+        return self._motion
 
     @property
     def map_offset(self) -> MapOffset | None:
@@ -167,7 +168,8 @@ class Navigator:
         """
         late, told = self._odometry.is_late(frame), frame
         frame = self._velocity.shown(frame)
-        now = self._odometry.sample(frame, self._recent.velocity)
+        self._motion = None if late or self._pictures is None else self._seen_motion(self._pictures, frame)
+        now = self._odometry.sample(frame, self._recent.velocity, self._motion)
         repeated = None if late else self._repeats.refusal(frame, now)
         if repeated is not None:
             self._odometry.append(frame, now)
@@ -197,6 +199,11 @@ class Navigator:
 
     # ------------------------------------------------------------------------------------------ predictions
 
+    def _seen_motion(self, pictures: VisualOdometry, frame: Frame) -> GroundMotion | None:
+        """How far the vehicle moved since the last frame, where the pictures show it."""
+        motion = pictures.update(self._errors.without_bias(self._with_height(frame)))
+        return motion if isinstance(motion, GroundMotion) else None
+
     def _reckoned(self, now: OdometrySample, anchor: Anchor | None = None) -> PositionEstimate | None:
         """Dead reckoning from an anchor, or from the last one."""
         anchor = anchor or self._anchor
@@ -215,7 +222,7 @@ class Navigator:
         anchor = self._anchor
         if anchor is not None and anchor.sample is not None:
             unknown_s = now.time_s - anchor.sample.time_s
-            start = OdometrySample(anchor.sample.time_s, now.moved_m, now.blind_s - unknown_s)
+            start = replace(now, time_s=anchor.sample.time_s, blind_s=now.blind_s - unknown_s)
             self._anchor = replace(anchor, sample=start)
         self._recent = RecentAnchors(self._drift)
         self._hypotheses.clear()
@@ -227,10 +234,8 @@ class Navigator:
         chosen, chosen_prior = self._searched(sources, now, late=late)
         misled = self._refusals >= self._options.lost_after and self._is_turn(self._refusals)
         if prior is not None and not misled and (chosen_prior is None or prior.sigma_m < chosen_prior.sigma_m):
-            chosen, chosen_prior = (
-                given,
-                replace(prior, sigma_m=math.hypot(prior.sigma_m, map_sigma_of(self._matcher.site))),
-            )
+            sigma_m = math.hypot(prior.sigma_m, map_sigma_of(self._matcher.site))
+            chosen, chosen_prior = given, replace(prior, sigma_m=sigma_m)
         return replace(sources, searched=chosen, prior=chosen_prior)
 
     def _searched(
@@ -248,9 +253,8 @@ class Navigator:
         growth = options.growth ** min(self._refusals, options.lost_after)
         last = self._odometry.last
         moved_m = None if late or last is None else now.moved_m - last.moved_m
-        return estimate, estimate.prior(
-            growth, moved_m, 0.0 if estimate.on_map else map_sigma_of(self._matcher.site)
-        )
+        map_m = 0.0 if estimate.on_map else map_sigma_of(self._matcher.site)
+        return estimate, estimate.prior(growth, moved_m, map_m)
 
     def _is_turn(self, count: int) -> bool:
         """Whether this one of the frames that know no better searches the whole map."""
@@ -264,9 +268,8 @@ class Navigator:
     def _ground_below(self, fix: Fix) -> float | None:
         """Height of the ground below a fix that measured its height; None over ground that is taken for flat."""
         site = self._matcher.site
-        if fix.up_m is None or not site.has_surface:
-            return None
-        return float(site.ground_at(np.array(fix.map_xy_px)))
+        known = fix.up_m is not None and site.has_surface
+        return float(site.ground_at(np.array(fix.map_xy_px))) if known else None
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame with the last fix's height where it came without one."""
@@ -299,9 +302,8 @@ class Navigator:
             return self._refuse_match(fix, against, own + others)
         match = Match(fix, others if against is not None else own + others)
         found = self._hypotheses.add([match], now, sources, self._map_m2(fix), told.height_agl_m)
-        return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(
-            fix, against, match.log_odds if found is None else found.log_odds
-        )
+        odds = match.log_odds if found is None else found.log_odds
+        return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(fix, against, odds)
 
     def _add_doubted(
         self, refusal: NoFix, now: OdometrySample, sources: Sources, height_m: float | None
@@ -378,10 +380,7 @@ class Navigator:
     def _refuse_match(self, fix: Fix, against: PositionEstimate | None, odds: float) -> NoFix:
         """The refusal of a match that is not accepted."""
         if against is not None:
-            apart_m = float(np.hypot(*(en_m(fix) - against.en_m)))
-            sigma_m = math.hypot(against.sigma_m, fix.relative_sigma_m if against.on_map else fix.sigma_m)
-            detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
-            return replace(fix.refused(Reason.INCONSISTENT, detail), candidates=(fix,))
+            return replace(against.refusal(fix), candidates=(fix,))
         asked = f"{self._options.min_confidence:g} is asked for"
         return fix.refused(Reason.UNCONFIRMED, f"right with a probability of {probability(odds):.4f}, {asked}")
 

@@ -34,6 +34,8 @@ class NavigatorOptions:
         tilt_bias_deg: standard deviation of a lasting error of roll and of pitch while no picture measured it.
         heading_bias_deg: of the heading.
         healthy_s: age of the last fix up to which the navigator calls itself healthy.
+        odometry: whether frames that come without a velocity are followed from one to the next, as
+            ``docs/odometry.md`` says.
     """
 
     measured_velocity_sigma_mps: float = 0.5
@@ -54,9 +56,10 @@ class NavigatorOptions:
     tilt_bias_deg: float = 1.0
     heading_bias_deg: float = 5.0
     healthy_s: float = 1.0
+    odometry: bool = False
 
     def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
+        check_positive(self, *(name for name in self.__dataclass_fields__ if name != "odometry"))
         if self.growth < 1.0:
             raise OptionError(f"growth: expected 1 or more, got {self.growth}")
         if self.min_confidence >= 1.0:

@@ -10,18 +10,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
+from engine.device import Picture, as_float, as_tensor, element_type, like, plain
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.kernels import ncc as kernels
-from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit, peak_of, summits
+from engine.peaks import FAR, NEAR, best_positions, find_peak, fit_summit, peak_of
 from engine.values import Peak
 
-_DTYPES = (torch.uint8, torch.int16, torch.uint16, torch.int32, torch.float16, torch.float32, torch.float64)
-_DOUBLE = (torch.float64, torch.int32)  # float32 would round these
+if TYPE_CHECKING:
+    from engine.tensors import Tensor
+
+FloatImage = NDArray[np.float32]
+Given = TypeVar("Given", NDArray[Any], "Tensor")  # answers are of the kind of what is asked about
+
+_TYPES = ("uint8", "int16", "uint16", "int32", "float16", "float32", "float64")
+_DOUBLE = ("float64", "int32")  # float32 would round these
 
 # Coarse to fine: templates are halved while they stay at least this wide and the window is large enough.
 _COARSE_TEMPLATE_PX = 48
@@ -33,15 +40,17 @@ _UPHILL_STEPS = 4  # within the reach of one LocalScores
 
 
 def ncc(
-    search: Tensor,
-    templates: Tensor,
+    search: Given,
+    templates: Given,
     *,
     zero_mean: bool = True,
-    search_valid: Tensor | None = None,
-    templates_valid: Tensor | None = None,
+    search_valid: Given | None = None,
+    templates_valid: Given | None = None,
     min_overlap: float = 0.5,
-) -> Tensor:
+) -> Given:
     """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
+
+    All arguments are tensors, or all are arrays. What is on the CPU is computed without torch, but for float64.
 
     Args:
         search: (B, H, W), any of uint8, int16, uint16, int32, float16, float32, float64.
@@ -62,25 +71,28 @@ def ncc(
         OptionError: different devices, NaN or infinity, or masks without ``zero_mean``.
     """
     _check(search, templates)
+    types = (element_type(search), element_type(templates))
     if search_valid is not None or templates_valid is not None:
-        masks = _masks(search, templates, search_valid, templates_valid)
+        masks = _mask("search_valid", search, search_valid), _mask("templates_valid", templates, templates_valid)
         if not zero_mean:
             raise OptionError("zero_mean: expected True where masks are given, got False")
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
-        scores = kernels.masked_ncc_surface(search, masks[0], templates, masks[1], min_overlap=min_overlap)
-        kernels.check_finite(search=search, templates=templates)  # last: the host waits for it
+        pictures = plain(search, masks[0], templates, masks[1])
+        scores = kernels.masked_ncc_surface(*pictures, min_overlap=min_overlap)
+    elif types[0] in _DOUBLE or types[1] in _DOUBLE:
+        scores = kernels.ncc_surface(
+            *(as_tensor(as_float(v, "float64")) for v in (search, templates)), zero_mean=zero_mean
+        )
     else:
-        work = torch.float64 if search.dtype in _DOUBLE or templates.dtype in _DOUBLE else torch.float32
-        scores = kernels.ncc_surface(_as(search, work), _as(templates, work), zero_mean=zero_mean)
-    return _as(scores, torch.float64 if torch.float64 in (search.dtype, templates.dtype) else torch.float32)
+        scores = kernels.ncc_surface(
+            *plain(as_float(search, "float32"), as_float(templates, "float32")), zero_mean=zero_mean
+        )
+    found: Given = like(search, as_float(scores, "float64" if "float64" in types else "float32"))
+    return found
 
 
-def _as(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    return tensor if tensor.dtype == dtype else tensor.to(dtype)  # which takes a while even if it does nothing
-
-
-def _check(search: Tensor, templates: Tensor) -> None:
+def _check(search: Picture, templates: Picture) -> None:
     if search.ndim != 3 or 0 in search.shape:
         raise ShapeError(f"search: expected (B, H, W) with no empty axis, got {tuple(search.shape)}")
     if templates.ndim != 4 or 0 in templates.shape:
@@ -90,34 +102,32 @@ def _check(search: Tensor, templates: Tensor) -> None:
     (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
-    for name, tensor in (("search", search), ("templates", templates)):
-        if tensor.dtype not in _DTYPES:
-            raise DtypeError(f"{name}: expected uint8, int16, uint16, int32 or a float, got {tensor.dtype}")
-    if search.device != templates.device:
-        raise OptionError(f"templates: expected on {search.device} like search, got {templates.device}")
+    for name, picture in (("search", search), ("templates", templates)):
+        if element_type(picture) not in _TYPES:
+            raise DtypeError(f"{name}: expected uint8, int16, uint16, int32 or a float, got {picture.dtype}")
+    places = ["numpy" if isinstance(v, np.ndarray) else str(v.device) for v in (search, templates)]
+    if places[0] != places[1]:
+        raise OptionError(f"templates: expected on {places[0]} like search, got {places[1]}")
 
 
-def _masks(
-    search: Tensor, templates: Tensor, search_valid: Tensor | None, templates_valid: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Both masks, all True where none was given."""
-    found = []
-    for name, tensor, mask in (
-        ("search_valid", search, search_valid),
-        ("templates_valid", templates, templates_valid),
-    ):
-        mask = torch.ones_like(tensor, dtype=torch.bool) if mask is None else mask
-        if mask.dtype != torch.bool:
-            raise DtypeError(f"{name}: expected bool, got {mask.dtype}")
-        if mask.shape != tensor.shape:
-            raise ShapeError(f"{name}: expected {tuple(tensor.shape)}, got {tuple(mask.shape)}")
-        found.append(mask)
-    return found[0], found[1]
+def _mask(name: str, picture: Picture, mask: Picture | None) -> Picture:
+    """A mask, all True where none was given."""
+    if mask is None:
+        return (
+            np.ones(picture.shape, bool)
+            if isinstance(picture, np.ndarray)
+            else as_tensor(picture).new_ones(picture.shape).bool()
+        )
+    if element_type(mask) != "bool":
+        raise DtypeError(f"{name}: expected bool, got {mask.dtype}")
+    if mask.shape != picture.shape:
+        raise ShapeError(f"{name}: expected {tuple(picture.shape)}, got {tuple(mask.shape)}")
+    return mask
 
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Part of a map prepared for matching: what does not depend on the frame.
+    """Part of a map prepared for matching: what does not depend on the frame. Arrays on the CPU, tensors on a GPU.
 
     Attributes:
         image: (H, W) float32, its mean small against its standard deviation.
@@ -126,8 +136,8 @@ class Search:
             None on the coarsest level.
     """
 
-    image: Tensor
-    sums: Tensor
+    image: Picture
+    sums: Picture
     half: Search | None = None
 
     def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
@@ -142,7 +152,7 @@ class Search:
         return Search(self.image[rows, columns], self.sums[:, y0 : y0 + height + 1, x0 : x0 + width + 1], half)
 
 
-def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
+def prepare(image: Picture, *, halvings: int = _MAX_HALVINGS) -> Search:
     """Compute running sums and half-resolution levels.
 
     Args:
@@ -158,15 +168,17 @@ def prepare(image: Tensor, *, halvings: int = _MAX_HALVINGS) -> Search:
     """
     if image.ndim != 2 or 0 in image.shape:
         raise ShapeError(f"image: expected (H, W) with no empty axis, got {tuple(image.shape)}")
-    if image.dtype != torch.float32:
+    if element_type(image) != "float32":
         raise DtypeError(f"image: expected float32, got {image.dtype}")
+    (image,) = plain(image)
+    image = np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image.contiguous()
     half = None
     if halvings > 0 and min(image.shape) >= 2 * _COARSE_TEMPLATE_PX:
         half = prepare(kernels.halved(image), halvings=halvings - 1)
-    return Search(image.contiguous(), kernels.integrals(image), half)
+    return Search(image, kernels.integrals(image), half)
 
 
-def surface(search: Search, templates: Tensor) -> Tensor:
+def surface(search: Search, templates: Given) -> Given:
     """Zero-mean NCC of templates with a prepared part of a map.
 
     Args:
@@ -185,13 +197,13 @@ def surface(search: Search, templates: Tensor) -> Tensor:
     return next(surfaces(search, templates, group=templates.shape[0]))
 
 
-def _check_fit(search: Search, templates: Tensor) -> None:
+def _check_fit(search: Search, templates: Picture) -> None:
     (H, W), (h, w) = search.image.shape, templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
 
 
-def surfaces(search: Search, templates: Tensor, *, group: int) -> Iterator[Tensor]:
+def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]:
     """Zero-mean NCC for a group of templates at a time, which bounds the memory of many templates on a large map.
 
     Args:
@@ -203,15 +215,18 @@ def surfaces(search: Search, templates: Tensor, *, group: int) -> Iterator[Tenso
         Yields (group, H-h+1, W-w+1) float32, the last one with the remainder of T.
     """
     inverse_norms = kernels.inverse_norm(search.sums, *templates.shape[-2:])
-    for part in templates.split(group):
-        yield kernels.prepared_surface(search.image, inverse_norms, _centred(part))
+    for first in range(0, len(templates), group):
+        part = _of_kind(search, templates[first : first + group])
+        found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))
+        yield like(templates, found)
 
 
-def _centred(templates: Tensor) -> Tensor:
-    return templates - templates.mean(dim=(-2, -1), keepdim=True)
+def _of_kind(search: Search, template: Picture) -> Picture:
+    """A template as an array where the map is one; else as it is."""
+    return plain(template)[0] if isinstance(search.image, np.ndarray) else template
 
 
-def match_template(search: Search, template: Tensor, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
+def match_template(search: Search, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
     """The peak of one template in a prepared part of a map.
 
     Coarse to fine: all positions are scored at reduced resolution, the best few at full resolution. The error of
@@ -233,17 +248,19 @@ def match_template(search: Search, template: Tensor, *, exclusion_px: float, exh
         ShapeError: the template is not (h, w), is empty, or is larger than the map.
     """
     _check_template(search, template)
-    with torch.inference_mode():
-        if search.image.device.type != "cpu":
-            return _peaks_on_device([search], [template], exclusion_px)[0]
-        if not exhaustive:
-            found = _coarse_to_fine(search, template, exclusion_px)
-            if found is not None:
-                return found
-        return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)
+    if not isinstance(search.image, np.ndarray):
+        return _peaks_on_device([search], [template], exclusion_px)[0]
+    (template,) = plain(template)
+    if not exhaustive:
+        found = _coarse_to_fine(search, template, exclusion_px)
+        if found is not None:
+            return found
+    return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)
 
 
-def match_templates(searches: Sequence[Search], templates: Sequence[Tensor], *, exclusion_px: float) -> list[Peak]:
+def match_templates(
+    searches: Sequence[Search], templates: Sequence[Picture], *, exclusion_px: float
+) -> list[Peak]:
     """The peaks of many templates, each in its own part of a map: one copy from a GPU for all of them.
 
     On a GPU pairs of equal shapes are matched at once.
@@ -263,14 +280,13 @@ def match_templates(searches: Sequence[Search], templates: Sequence[Tensor], *, 
         raise ShapeError(f"templates: expected {len(searches)} (searches), got {len(templates)}")
     for search, template in zip(searches, templates, strict=True):
         _check_template(search, template)
-    if not searches or searches[0].image.device.type == "cpu":
+    if not searches or isinstance(searches[0].image, np.ndarray):
         pairs = zip(searches, templates, strict=True)
         return [match_template(search, template, exclusion_px=exclusion_px) for search, template in pairs]
-    with torch.inference_mode():
-        return _peaks_on_device(searches, templates, exclusion_px)
+    return _peaks_on_device(searches, templates, exclusion_px)
 
 
-def _check_template(search: Search, template: Tensor) -> None:
+def _check_template(search: Search, template: Picture) -> None:
     if template.ndim != 2 or 0 in template.shape:
         raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
     _check_fit(search, template[None])
@@ -278,15 +294,15 @@ def _check_template(search: Search, template: Tensor) -> None:
 
 def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], exclusion_px: float) -> list[Peak]:
     """:func:`find_peak` of the surfaces, bit for bit; 28 numbers a surface are copied from the device, at once."""
-    groups: dict[tuple[torch.Size, torch.Size], list[int]] = {}
+    from engine.kernels.summits import of_groups
+
+    groups: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = {}
     for index, (search, template) in enumerate(zip(searches, templates, strict=True)):
         groups.setdefault((search.image.shape, template.shape), []).append(index)
-    rows = []
-    for members in groups.values():
-        images = torch.stack([searches[i].image for i in members])
-        sums = torch.stack([searches[i].sums for i in members])
-        rows.append(match_on_device(images, sums, torch.stack([templates[i] for i in members]), exclusion_px))
-    found = torch.cat(rows).cpu().numpy()
+    found = of_groups(
+        [[(searches[i].image, searches[i].sums, templates[i]) for i in members] for members in groups.values()],
+        exclusion_px,
+    )
     peaks: dict[int, Peak] = {}
     for (size, shape), members in groups.items():
         width, height = size[1] - shape[1] + 1, size[0] - shape[0] + 1
@@ -295,24 +311,7 @@ def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], ex
     return [peaks[index] for index in range(len(searches))]
 
 
-def match_on_device(images: Tensor, sums: Tensor, templates: Tensor, exclusion_px: float) -> Tensor:
-    """Match a batch where its tensors are: fixed shapes, no copy, and nothing to wait for.
-
-    Args:
-        images: (B, H, W) float32 of :class:`Search`.
-        sums: (B, 2, H+1, W+1) of :class:`Search`.
-        templates: (B, h, w) float32.
-        exclusion_px: radius about a peak within which no rival is counted.
-
-    Returns:
-        (B, 28) of :func:`engine.peaks.summits`.
-    """
-    inverse_norms = kernels.inverse_norm(sums, *templates.shape[1:])
-    products = kernels.products(images, _centred(templates))
-    return summits(products, inverse_norms, exclusion_px=exclusion_px)
-
-
-def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Peak | None:
+def _coarse_to_fine(search: Search, template: FloatImage, exclusion_px: float) -> Peak | None:
     """The peak by way of the half-resolution levels, or None where their errors do not exclude other positions."""
     levels = [(search, template - template.mean())]
     while True:
@@ -353,19 +352,19 @@ def _coarse_to_fine(search: Search, template: Tensor, exclusion_px: float) -> Pe
     return replace(best, second_score=max([rest, *(found.score for found, _ in rivals)]))
 
 
-def _phase_loss(fine: Tensor, coarse: Tensor) -> float:
+def _phase_loss(fine: FloatImage, coarse: FloatImage) -> float:
     """What a perfect match loses on the coarser of two levels where it is between that level's pixels."""
     between = kernels.halved(fine[1:, 1:]).ravel()
     model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
-    norm = float(torch.linalg.vector_norm(between) * torch.linalg.vector_norm(model))
-    return 1.0 - float(torch.dot(between, model)) / norm if norm > 0.0 else 1.0
+    norm = math.sqrt(float(np.dot(between, between)) * float(np.dot(model, model)))
+    return 1.0 - float(np.dot(between, model)) / norm if norm > 0.0 else 1.0
 
 
 def _coarse_rest(
-    scores: Tensor, rivals: list[tuple[int, int, float]], scale: int, best: Peak, exclusion_px: float
+    scores: FloatImage, rivals: list[tuple[int, int, float]], scale: int, best: Peak, exclusion_px: float
 ) -> float:
     """The best coarse score outside the peak's exclusion zone and away from the refined rivals."""
-    remaining, r = scores.numpy().copy(), _SEPARATION_PX
+    remaining, r = scores.copy(), _SEPARATION_PX
     for x, y, _ in rivals:
         remaining[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
     down, across = (
@@ -375,14 +374,14 @@ def _coarse_rest(
     return float(remaining.max())
 
 
-def _refined(levels: list[tuple[Search, Tensor]], scores: Tensor, x: int, y: int) -> Peak | None:
+def _refined(levels: list[tuple[Search, FloatImage]], scores: FloatImage, x: int, y: int) -> Peak | None:
     """A coarse position at full resolution; None where the ascent reaches the window's edge or its last step."""
     if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
         return None
     (part, model), scale = levels[0], 2 ** (len(levels) - 1)
-    dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].double().numpy())
+    dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
     y, x = round(scale * (y + dy)), round(scale * (x + dx))
-    scorer = kernels.LocalScores(part.image.numpy(), part.sums.numpy(), model.numpy(), (y, x))
+    scorer = kernels.LocalScores(part.image, part.sums, model, (y, x))
     for uphill in range(_UPHILL_STEPS + 1):
         if uphill == _UPHILL_STEPS or not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
             return None

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import MapError
+from engine.maps.colour import read_colour
 from engine.maps.georeference import Georeference
 from engine.maps.grids import Array, Grid, warp_between
 from engine.maps.metric_copy import ProgressCallback
@@ -73,6 +76,7 @@ class OrthoMap(Georeference):
     ) -> None:
         super().__init__(grid)
         self.name, self.source_crs, self._facts = name, source_crs, facts or {}
+        self._source: Callable[[], Source] | None = None
         self._surface: SurfaceModel | None = None
         self.has_surface, self.ground_m = False, 0.0
         self.surface_datum: str | None = None
@@ -117,6 +121,7 @@ class OrthoMap(Georeference):
         facts["surface_path"] = None if surface is None else os.fspath(surface)
         site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)
         heights_file = None if surface is None else open_source(surface, "surface")
+        site._source = partial(open_source, path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
         site._set_accuracy(georeference_sigma_m, slope_sigma_deg, original, heights_file)
         if heights_file is not None:
             site._attach(*open_surface(heights_file, site._grid))
@@ -255,6 +260,18 @@ class OrthoMap(Georeference):
             OptionError: as :meth:`gray`.
         """
         return self._pyramid.crop(window, level)[1].copy()
+
+    def rgb(self, window: Window, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
+        """Colours of a window as the map's file has them, for pictures.
+
+        Args:
+            window: in full-resolution pixels, inside the map.
+            shape: rows and columns of the result.
+
+        Returns:
+            (h, w, 3) RGB, undefined on nodata; None where the map has no colours, or no file.
+        """
+        return None if self._source is None else read_colour(self._source(), self._grid, window, shape)
 
     def level_shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""

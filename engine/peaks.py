@@ -5,21 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from engine.device import Picture, on_host
 from engine.errors import ShapeError
-from engine.kernels import ncc as kernels
 from engine.values import Peak
 
 # Of surfaces with more positions than this only the best of every tile is a candidate.
 _TILED_PX = 1 << 18
 _TILE_PX = 16
-_REACH_PX = 2  # of the scores about a peak, on either side, that refine it
 
 
-def best_positions(scores: Tensor, separation_px: int, count: int) -> list[tuple[int, int, float]]:
+def best_positions(scores: Picture, separation_px: int, count: int) -> list[tuple[int, int, float]]:
     """The highest positions of a surface that are apart from each other.
 
     Of every tile of 16 x 16 pixels of a large surface only the highest position is a candidate.
@@ -32,7 +29,7 @@ def best_positions(scores: Tensor, separation_px: int, count: int) -> list[tuple
     Returns:
         (x, y, score) in falling order of the score.
     """
-    values = scores.cpu().numpy()
+    values = on_host(scores)
     if values.size > _TILED_PX:
         return _best_of_tiles(values, separation_px, count)
     remaining, positions, r = values.copy(), [], separation_px
@@ -66,7 +63,7 @@ def _best_of_tiles(values: NDArray[np.float32], separation_px: int, count: int) 
     return positions
 
 
-def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
+def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     """The maximum of a surface, refined to sub-pixel accuracy, with its best rival.
 
     Args:
@@ -82,11 +79,11 @@ def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
     """
     if scores.ndim != 2 or 0 in scores.shape:
         raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
-    if scores.device.type != "cpu":
-        ones = torch.ones((), device=scores.device).expand(scores.shape)
-        found = summits(scores.float()[None], ones, exclusion_px=exclusion_px).cpu().numpy()[0]
-        return peak_of(found, *scores.shape)
-    values = scores.numpy()
+    if not isinstance(scores, np.ndarray) and scores.device.type != "cpu":
+        from engine.kernels.summits import of_surface
+
+        return peak_of(of_surface(scores, exclusion_px), *scores.shape)
+    values = on_host(scores)
     y, x = divmod(int(values.argmax()), values.shape[1])
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
     r = min(2, x, y, values.shape[1] - 1 - x, values.shape[0] - 1 - y)
@@ -96,35 +93,11 @@ def find_peak(scores: Tensor, *, exclusion_px: float) -> Peak:
     return Peak(x + dx, y + dy, float(values[y, x]), second, curvature)
 
 
-def summits(products: Tensor, inverse_norms: Tensor, *, exclusion_px: float) -> Tensor:
-    """What the peaks of surfaces are made of, where the surfaces are: nothing is copied from a GPU.
-
-    Args:
-        products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32, or (T, H', W').
-        exclusion_px: radius about a peak within which no rival is counted.
-
-    Returns:
-        (T, 28) float64: flat index, score, the rival's score, and the 5 x 5 scores about it, those on the border
-        repeated beyond it.
-    """
-    best, position = kernels.peak(products, inverse_norms)
-    second = kernels.rival(products, inverse_norms, position, math.floor(exclusion_px * exclusion_px))
-    count, height, width = products.shape
-    near = torch.arange(-_REACH_PX, _REACH_PX + 1, device=position.device)
-    rows = ((position // width)[:, None] + near).clamp_(0, height - 1)[:, :, None]
-    columns = ((position % width)[:, None] + near).clamp_(0, width - 1)[:, None, :]
-    of = torch.arange(count, device=position.device)[:, None, None]
-    norms = inverse_norms.expand(products.shape)
-    around = (products[of, rows, columns] * norms[of, rows, columns]).nan_to_num_(nan=-1.0).clamp_(-1.0, 1.0)
-    return torch.cat([torch.stack([position.double(), best.double(), second.double()], 1), around.flatten(1)], 1)
-
-
 def peak_of(summit: NDArray[np.float64], height: int, width: int) -> Peak:
     """The peak of one surface.
 
     Args:
-        summit: (28,) of :func:`summits`, on the CPU.
+        summit: (28,) of :func:`engine.kernels.summits.summits`, on the CPU.
         height: of the surface.
         width: of the surface.
 
@@ -133,9 +106,11 @@ def peak_of(summit: NDArray[np.float64], height: int, width: int) -> Peak:
     """
     y, x = divmod(int(summit[0]), width)
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
-    r = min(_REACH_PX, x, y, width - 1 - x, height - 1 - y)
+    side = math.isqrt(len(summit) - 3)
+    reach = side // 2
+    r = min(reach, x, y, width - 1 - x, height - 1 - y)
     if r > 0:
-        side, inner = 2 * _REACH_PX + 1, slice(_REACH_PX - r, _REACH_PX + r + 1)
+        inner = slice(reach - r, reach + r + 1)
         dx, dy, curvature = fit_summit(summit[3:].reshape(side, side)[inner, inner])
     return Peak(x + dx, y + dy, float(summit[1]), float(summit[2]), curvature)
 

@@ -46,7 +46,7 @@ class Attitude:
 # Fields of a frame that are finite or None.
 _FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps",
            "height_correction_m")  # fmt: skip
-_SIGMAS = ("height_sigma_m", "heading_sigma_deg", "tilt_sigma_deg")
+_SIGMAS = ("height_sigma_m", "heading_sigma_deg", "tilt_sigma_deg", "velocity_sigma_mps")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +65,7 @@ class Frame:
         height_sigma_m: standard deviation of the height; None is what the matcher assumes, as of the next two.
         heading_sigma_deg: standard deviation of the heading.
         tilt_sigma_deg: standard deviation of roll and of pitch.
+        velocity_sigma_mps: standard deviation of the velocity, per axis; None is what the navigator assumes.
         tilt_lag_deg: by how much roll and pitch may have changed since they were measured; adds to their
             standard deviation.
         heading_lag_deg: the same of the heading.
@@ -89,6 +90,7 @@ class Frame:
     height_sigma_m: float | None = None
     heading_sigma_deg: float | None = None
     tilt_sigma_deg: float | None = None
+    velocity_sigma_mps: float | None = None
     tilt_lag_deg: float | None = None
     heading_lag_deg: float | None = None
     height_correction_m: float | None = None

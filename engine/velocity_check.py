@@ -37,7 +37,7 @@ class _Seen:
         sigma_m: of the place.
         told_mps: (2,) velocity that came with it.
         told_m: (2,) its integral since the first match.
-        coarse_m: by which that may be off because matches are sparse.
+        coarse_m: by which that may be off because matches are sparse, or the velocity is said to be inaccurate.
     """
 
     time_s: float
@@ -93,6 +93,7 @@ class VelocityCheck:
         last = self._seen[-1]
         told_m = last.told_m + 0.5 * (last.told_mps + told_mps) * leg_s
         coarse_m = last.coarse_m + self._acceleration_mps2 * leg_s**2 / 12.0
+        coarse_m += max((frame.velocity_sigma_mps or 0.0) - self._sigma_mps, 0.0) * leg_s
         self._seen.append(_Seen(time_s, en_m(fix), fix.relative_sigma_m, told_mps, told_m, coarse_m))
         while len(self._seen) > _LEAST and self._seen[1].time_s <= time_s - _WAY_S:
             self._seen.popleft()

@@ -101,18 +101,20 @@ def _by_workers(work: Callable[[int], T], tasks: range, workers: int) -> Iterato
 def _forkable() -> Iterator[None]:
     """One thread of torch and OpenCV while copies are made: a copy has no pool's threads, but waits for them."""
     import cv2
-    import torch
 
-    threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
+    torch = sys.modules.get("torch")
+    threads = cv2.getNumThreads(), 0 if torch is None else torch.get_num_threads()
     cv2.setNumThreads(1)
+    if torch is not None:
+        torch.set_num_threads(1)
     try:
         with warnings.catch_warnings():  # from Python 3.12 on about any thread, also BLAS's, which expect a fork
             warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
             yield
     finally:
-        torch.set_num_threads(threads[0])
-        cv2.setNumThreads(threads[1])
+        cv2.setNumThreads(threads[0])
+        if torch is not None:
+            torch.set_num_threads(threads[1])
 
 
 def _start(work: Callable[[int], Any], started: _Workers) -> None:

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from engine.camera import Camera, mount_rotation
 from engine.errors import CalibrationError
@@ -105,6 +106,22 @@ def test_kalibrs_camchain_undistorts_as_opencv_with_its_numbers(tmp_path, text, 
     else:
         wanted = cv2.undistort(image, matrix, lens)
     assert np.abs(read.undistort(image).astype(int) - wanted).mean() < 0.5
+
+
+def test_a_camchain_by_the_call_with_which_kalibr_writes_it(tmp_path):
+    """Kalibr's ConfigReader.writeYaml, of what kalibr_calibrate_imu_camera puts into a camera's block."""
+    chain = {
+        "cam0": {
+            "T_cam_imu": np.eye(4).tolist(), "cam_overlaps": [], "camera_model": "pinhole",
+            "distortion_coeffs": FISHEYE.tolist(), "distortion_model": "equidistant",
+            "intrinsics": [500.0, 505.0, 319.5, 239.5], "line_delay": 0, "resolution": [640, 480],
+            "rostopic": "/camera/image_raw", "timeshift_cam_imu": -0.0042,
+        }
+    }  # fmt: skip
+    read = Camera.load(saved(tmp_path, yaml.dump(chain, default_flow_style=None, width=2147483647)))
+    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "equidistant")
+    np.testing.assert_array_equal(read.matrix, K)
+    np.testing.assert_array_equal(read.distortion, FISHEYE)
 
 
 def test_openvins_first_line_and_a_mount_in_a_camchain(tmp_path):

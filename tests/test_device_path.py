@@ -11,11 +11,11 @@ import torch
 import engine.device
 from bench.inputs.scenes import flight
 from engine import Fix, SceneMatcher
-from engine.device import download, upload
 from engine.errors import OptionError, ShapeError
 from engine.features import match, sift
 from engine.ncc_fft import match_template, match_templates, ncc, prepare
 from engine.peaks import find_peak
+from engine.tensors import download, upload
 from tests.support.pretended import DEVICE, Pretended, pretended_device
 
 CPU = torch.device("cpu")

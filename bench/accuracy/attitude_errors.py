@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera, Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import read_truth
+from engine.threads import set_threads
 from engine.values import Truth
 
 Array = NDArray[np.float64]

@@ -28,9 +28,9 @@ from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.align import view_of
 from engine.audit.availability import Audit, audit_site, regressors
-from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.sim import build_town
+from engine.threads import set_threads
 from engine.values import Attitude, Truth, Window
 
 Array = NDArray[np.float64]

@@ -20,8 +20,8 @@ from bench.accuracy.judged import FIRST_LOOK, SECOND_LOOK, Bench, Row
 from bench.accuracy.trials import Trial, ground
 from bench.accuracy.year_pairs import matched as year_matched
 from engine.confidence import PeakModel, PoseModel
-from engine.device import set_threads
 from engine.methods.options import SiftOptions
+from engine.threads import set_threads
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
 MODELS = {FIRST_LOOK: PeakModel, SECOND_LOOK: PeakModel, "SIFT": PoseModel}

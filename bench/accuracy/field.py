@@ -26,7 +26,6 @@ from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
 from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.formats.flight import Flight
 from engine.formats.track import TrackRow, read_track, track_row
 from engine.formats.truth import interpolate_truth
@@ -36,6 +35,7 @@ from engine.runs import FlightFiles, TrackSettings, track
 from engine.runs.arguments import parse_position
 from engine.runs.inputs import FlightInputs, open_inputs
 from engine.runs.settings import with_weights
+from engine.threads import set_threads
 from engine.values import Window
 
 Array = NDArray[np.float64]

@@ -25,7 +25,6 @@ from bench.pages import flights
 from bench.pages.flights import Run
 from bench.speed.peers import OpenCvFeatures
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.telemetry import ground_amsl_m
 from engine.formats.track import TrackRow, track_row
@@ -36,6 +35,7 @@ from engine.navigator import Matcher
 from engine.navigator_options import ACCEPT_ALL
 from engine.report.metrics import Ground, errors_en_m, summarise
 from engine.sim import plan_flight
+from engine.threads import set_threads
 from engine.values import Attitude, Truth
 
 STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "nust": 2, "caliterra": 1}

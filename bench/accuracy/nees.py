@@ -23,12 +23,12 @@ from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
 from bench.pages.text import paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.covariance import AssumedErrors
-from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
 from engine.methods.options import NccOptions, SiftOptions
 from engine.report.metrics import FALSE_SIGMAS, WRONG_M
 from engine.sim import plan_flight
 from engine.sim.town import EXACT
+from engine.threads import set_threads
 
 Array = NDArray[np.float64]
 

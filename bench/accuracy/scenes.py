@@ -24,7 +24,6 @@ from bench import DOCS
 from bench.accuracy.field import figures
 from bench.pages import scenes as page
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.formats.track import TrackRow, track_row
 from engine.geo import enu_from_body
 from engine.report.metrics import errors_en_m
@@ -32,6 +31,7 @@ from engine.sim import FlightStyle, Town, build_town, plan_flight, render_frame
 from engine.sim.flight import paper_camera
 from engine.sim.render import grid_from_enu
 from engine.sim.town import MAP_SENSOR
+from engine.threads import set_threads
 from engine.values import Attitude, Truth
 
 Array = NDArray[np.float64]

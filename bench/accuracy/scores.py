@@ -26,7 +26,6 @@ from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.confidence import PriorAgreement, peak_features
 from engine.covariance import score_sigma
-from engine.device import set_threads
 from engine.formats.flight import open_flight
 from engine.formats.truth import interpolate_truth, read_truth
 from engine.indexes.prepared import PreparedMap
@@ -37,6 +36,7 @@ from engine.methods.scheduler import Scheduler
 from engine.ncc_fft import match_template, prepare
 from engine.scores import SCORES, enhance
 from engine.sim import plan_flight
+from engine.threads import set_threads
 from engine.window import level_for
 
 Gray = NDArray[np.uint8]

@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from bench import DOCS
 from bench.pages.text import machine, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.formats.track import track_row
 from engine.geo import LocalFrame
 from engine.navigator_options import ACCEPT_ALL
 from engine.report.metrics import Ground, summarise
 from engine.sim import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
 from engine.sim.render import transformer
+from engine.threads import set_threads
 from engine.values import Attitude
 
 SEEDS = (71, 72, 73, 74, 75)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 Row = dict[str, Any]
-PARTS = ("Python", "import torch", "import engine", "open map and flight", "warm-up", "first frame")
+PARTS = ("Python", "import engine", "open map and flight", "warm-up", "first frame")
 ENTRIES = {
     "scenematch --help": ("-m", "engine.cli", "--help"),
     "scenematch track --help": ("-m", "engine.cli", "track", "--help"),
@@ -97,13 +97,9 @@ def _row(root: Path, method: str, kept: str, maps: Path, compiled: Path, rounds:
 def measured() -> Row:
     """This process, part by part."""
     marks = [float(sys.argv[3]), time.time()]
-    import torch
-
-    torch.set_num_threads(1)
-    marks.append(time.time())
     from engine import Camera, Fix, OrthoMap, SceneMatcher
-    from engine.device import set_threads
     from engine.formats.flight import open_flight
+    from engine.threads import set_threads
 
     set_threads(1)
     marks.append(time.time())

@@ -106,10 +106,10 @@ class Browser:
         return [entry["message"] for entry in self.driver.get_log("browser")]
 
     def requests(self) -> list[str]:
-        """The addresses that were asked for, those inside the page (data:) left out."""
+        """The addresses that were asked for, those inside the page and the browser's own left out."""
         events = (json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance"))
         sent = (e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent")
-        return [url for url in sent if not url.startswith("data:")]
+        return [url for url in sent if not url.startswith(("data:", "chrome:"))]
 
     def save(self, path: Path, element: str | None = None) -> None:
         """A picture of the window, or of one element."""

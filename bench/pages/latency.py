@@ -17,7 +17,7 @@ from bench.pages.text import machine, table
 
 Row = dict[str, Any]
 COLOURS = {"ncc": "#0072b2", "sift": "#d55e00", "auto": "#009e73"}
-PART_COLOURS = ("#999999", "#e69f00", "#0072b2", "#56b4e9", "#d55e00", "#009e73")
+PART_COLOURS = ("#999999", "#0072b2", "#56b4e9", "#d55e00", "#009e73")
 INTRO = (
     "Made by `make bench-latency`, one run of it, on {machine}; one thread where nothing else is said. The "
     "built-in flight is drawn once and flown forth and back with rising stamps, between 110 and 150 m high, so "

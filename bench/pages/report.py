@@ -20,7 +20,7 @@ from bench import DOCS
 from bench.pages import sift
 from bench.pages.text import machine, table
 from bench.speed import growth, stages, whole_map
-from engine import device
+from engine.threads import set_threads
 
 STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its pictures")
     options = parser.parse_args()
     run = json.loads(options.run.read_text(encoding="utf-8"))
-    device.set_threads(1)
+    set_threads(1)
     rows = [_row(entry) for entry in run["benchmarks"]]
     curves = [] if options.quick else growth.curves()
     big = [] if options.quick else whole_map.run()

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from engine import device
+from engine.threads import set_threads
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -28,9 +28,9 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     count: int = request.param
     if count > (os.cpu_count() or 1):
         pytest.skip(f"this machine has fewer than {count} cores")
-    device.set_threads(count)
+    set_threads(count)
     yield count
-    device.set_threads(1)
+    set_threads(1)
 
 
 def peak_memory_mb(call: Callable[[], Any]) -> float | None:

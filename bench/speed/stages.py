@@ -24,8 +24,8 @@ from bench.inputs.faults import load
 from bench.live.endless import draw
 from bench.speed.peers import OpenCvStep
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.device import set_threads
 from engine.formats.truth import interpolate_truth
+from engine.threads import set_threads
 
 Array = NDArray[np.float64]
 FRAMES, BLOCK, SKIPPED = 160, 20, 4  # in all, in turns, and at the start of a block whose caches are the peer's

@@ -182,7 +182,7 @@ class MavlinkBridge:
         """
         vehicle = self.telemetry.vehicle(captured_ns)
         if not self._use_velocity:
-            vehicle = replace(vehicle, east_velocity_mps=None, north_velocity_mps=None)
+            vehicle = replace(vehicle, east_velocity_mps=None, north_velocity_mps=None, velocity_sigma_mps=None)
         frame = vehicle.frame(image, captured_ns)
         self._live.submit(frame, captured_ns=captured_ns)
 

@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.gimbal import body_behind, from_device, from_mount
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
+from engine.adapters.vision_in import vision_velocity
 from engine.values import Attitude
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
@@ -49,6 +50,8 @@ HANDLED_MESSAGES = frozenset(
     {
         *(number for rates in REQUESTED_RATES_HZ.values() for number in rates),
         *GIMBAL_RATES_HZ["px4"],
+        mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE,
+        mavlink.MAVLINK_MSG_ID_ODOMETRY,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
@@ -149,7 +152,7 @@ class MavlinkTelemetry:
         self._lock = threading.Lock()
         self._clock = AutopilotClock()
         self._gimbal_mount, self._holder = gimbal_mount, RecentValues(ANGLES)
-        self._attitude, self._velocity = RecentValues(ANGLES), RecentValues()
+        self._attitude, self._velocity, self._vision = RecentValues(ANGLES), RecentValues(), RecentValues()
         self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
         self._alt_amsl, self._down = RecentValues(), RecentValues()
         self._unix_offset_ns: int | None = None
@@ -188,9 +191,11 @@ class MavlinkTelemetry:
         """The vehicle state at a local time; what is not known is None."""
         with self._lock:
             attitude = self._attitude.at(time_ns)
-            velocity = self._velocity.at(time_ns) if self._has_velocity else None
+            told = self._velocity.at(time_ns) if self._has_velocity else None
+            velocity = told or (None, None, None)
             roll, pitch, heading = attitude or (None, None, None)
-            east, north, up = velocity or (None, None, None)
+            # By another camera's odometry, where there is one: it does not depend on the fixes.
+            east, north, up, sigma = self._vision.at(time_ns) or (*velocity, 0.0)
             return VehicleState(
                 roll_deg=roll,
                 pitch_deg=pitch,
@@ -198,6 +203,7 @@ class MavlinkTelemetry:
                 east_velocity_mps=east,
                 north_velocity_mps=north,
                 up_velocity_mps=up,
+                velocity_sigma_mps=sigma or None,
                 height_agl_m=self._height_agl_m(time_ns, roll or 0.0, pitch or 0.0),
                 alt_amsl_m=scalar(self._alt_amsl.at(time_ns)),
                 down_m=self._down_m(time_ns),
@@ -238,6 +244,10 @@ class MavlinkTelemetry:
             self._set_origin(message)
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
+        elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that nobody else has
+            seen = vision_velocity(message, self._attitude.at(arrival_ns))
+            if seen is not None:
+                self._vision.add(arrival_ns, *seen)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
             # Where it knows no velocity it goes on to report one, of zero.
             self._has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
@@ -265,6 +275,7 @@ class MavlinkTelemetry:
         self._has_velocity, self._home_down_m = True, 0.0
         for series in (self._holder, self._attitude, self._velocity, self._range, self._clearance, self._relative):
             series.clear()
+        self._vision.clear()
         self._alt_amsl.clear()
         self._down.clear()
 

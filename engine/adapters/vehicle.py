@@ -46,6 +46,7 @@ class VehicleState:
         east_velocity_mps: velocity over ground.
         north_velocity_mps: velocity over ground.
         up_velocity_mps: positive in a climb.
+        velocity_sigma_mps: standard deviation of the velocity, per axis, where its source states one.
         height_agl_m: height above the ground by the rangefinder, else the clearance that the autopilot reports,
             else the height above home.
         alt_amsl_m: height above mean sea level.
@@ -60,6 +61,7 @@ class VehicleState:
     east_velocity_mps: float | None = None
     north_velocity_mps: float | None = None
     up_velocity_mps: float | None = None
+    velocity_sigma_mps: float | None = None
     height_agl_m: float | None = None
     alt_amsl_m: float | None = None
     down_m: float | None = None
@@ -76,6 +78,7 @@ class VehicleState:
             *(own if held is None else (held.heading_deg, held.roll_deg, held.pitch_deg)),
             self.east_velocity_mps,
             self.north_velocity_mps,
+            velocity_sigma_mps=self.velocity_sigma_mps,
         )
 
 

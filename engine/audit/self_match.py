@@ -12,11 +12,11 @@ from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.audit.plan import AuditPlan
 from engine.covariance import score_sigma
+from engine.device import CPU
 from engine.indexes.prepared import PreparedMap
 from engine.methods.options import NccOptions
 from engine.ncc_fft import surface
@@ -77,12 +77,11 @@ def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
     A large map is read on demand, and by one core.
     """
     options = plan.options.ncc
-    prepared = PreparedMap(plan.site, torch.device("cpu"), options.enhance_radius_px, options.score)
+    prepared = PreparedMap(plan.site, CPU, options.enhance_radius_px, options.score)
     noise, centers_px = _noise(plan.shape), plan.centers_px[plan.audited]
 
     def measured(index: int) -> SelfMatchStatistics:
-        with torch.inference_mode():
-            return _measure(plan, prepared, noise, centers_px[index])
+        return _measure(plan, prepared, noise, centers_px[index])
 
     reads_files = any(site is not None and site.reads_files for site in (plan.site, plan.other))
     yield from in_order(measured, len(centers_px), 1 if reads_files else safe_count())
@@ -112,8 +111,7 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     other = None if plan.other is None else _seen_on(plan.other, plan, extent)
     # Nodata is 0 once enhanced: rivals there are weak, as with the masked NCC that a flight uses.
     region = prepared.cut(_window(plan, middle), level)
-    templates = torch.from_numpy(_templates(gray, noise, plan.options.ncc, other))
-    scores = surface(region.search, templates).numpy()
+    scores = surface(region.search, _templates(gray, noise, plan.options.ncc, other))
     x, y = x0 - region.window.x0, y0 - region.window.y0
     own, rivals = _own_and_rivals(scores, x, y, plan.exclusion_px)
     leads = own - rivals

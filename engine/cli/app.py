@@ -30,6 +30,7 @@ from engine.cli.commands import (
     export,
     init,
     locate,
+    report,
     simulate,
     track,
 )
@@ -57,6 +58,7 @@ app.command(cls=Command)(init.init)
 app.command(cls=Command)(locate.locate)
 app.command(cls=Command)(simulate.simulate)
 app.command(cls=Command)(evaluate.evaluate)
+app.command(cls=Command)(report.report)
 app.command(cls=Command)(export.export)
 app.command(cls=Command)(bag.bag)
 app.command(cls=Command)(doctor.doctor)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,6 +29,29 @@ _PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
 def say(text: str) -> None:
     """One line for a person, on standard error; never folded."""
     print(" ".join(text.split()), file=sys.stderr, flush=True)
+
+
+def next_step(command: str, *, as_json: bool = False, hint: str = "") -> None:
+    """What a person may do next: one command, on standard error, and never where a program reads.
+
+    Args:
+        command: without the program's name; what the user has yet to choose is in capitals.
+        as_json: whether the results went to a program.
+        hint: what is to be done before it, such as a file to open.
+    """
+    if not as_json:
+        say(f"next: {f'{hint}; ' if hint else ''}scenematch {command}")
+
+
+def quoted(value: object) -> str:
+    """A value as a shell takes it for one word."""
+    return shlex.quote(str(value))
+
+
+def options(**values: object) -> str:
+    """Options with their values as they are typed, those that are None left out: ``log_offset_s=2``."""
+    given = ((name, value) for name, value in values.items() if value is not None)
+    return " ".join(f"--{name.replace('_', '-')} {quoted(value)}" for name, value in given)
 
 
 @cache

@@ -134,6 +134,9 @@ BridgeDeadlineOption = Annotated[
 SecondsOption = Annotated[
     float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
 ]
+OdometryOption = Annotated[
+    bool, typer.Option("--odometry", help="Follow the pictures where the telemetry has no velocity.")
+]
 OptionalDeviceOption = Annotated[
     str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless given.")
 ]
@@ -169,7 +172,7 @@ CoresOption = Annotated[
 
 def use_threads(count: int) -> None:
     """Threads of torch and OpenCV."""
-    from engine.device import set_threads
+    from engine.threads import set_threads
 
     set_threads(count)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.camera import Camera
@@ -91,7 +90,7 @@ def _is_enough(found: Sequence[Sighting], frames: Sequence[Frame]) -> bool:
 
 def _mirrored(frame: Frame) -> Frame:
     image = frame.image
-    flipped = image.flip(1) if isinstance(image, torch.Tensor) else np.ascontiguousarray(image[:, ::-1])
+    flipped = np.ascontiguousarray(image[:, ::-1]) if isinstance(image, np.ndarray) else image.flip(1)
     return replace(frame, image=flipped)
 
 

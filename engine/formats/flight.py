@@ -105,6 +105,7 @@ def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
         height_sigma_m=row.height_sigma_m,
         heading_sigma_deg=row.heading_sigma_deg,
         tilt_sigma_deg=row.tilt_sigma_deg,
+        velocity_sigma_mps=row.velocity_sigma_mps,
     )
 
 
@@ -147,6 +148,7 @@ def open_flight(
         log = open_log(telemetry)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
+        _check_is_table(Path(telemetry))
         table = open_telemetry(telemetry, source, source.description, columns)
         rows, remarks = table.rows, table.remarks
     elif isinstance(source, VideoFile):
@@ -159,6 +161,15 @@ def open_flight(
     if camera is not None:
         camera.check_size(source.read(flight.names[0]).shape)
     return flight
+
+
+def _check_is_table(telemetry: Path) -> None:
+    """Metadata in a video is not read: no library for it is kept, light and made for every supported Python."""
+    if telemetry.suffix.lower() in (*VIDEO_SUFFIXES, ".klv", ".360"):
+        raise TelemetryError(
+            f"{telemetry}: expected a table or a flight log, got a video's metadata (MISB KLV, GoPro GPMF), "
+            "which is not read; convert it to a .SRT as docs/map-and-flight-files.md shows"
+        )
 
 
 def subtitles_beside(frames: str | Path) -> Path | None:
@@ -235,6 +246,7 @@ def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow
         height_sigma_m=frame.height_sigma_m,
         heading_sigma_deg=frame.heading_sigma_deg,
         tilt_sigma_deg=frame.tilt_sigma_deg,
+        velocity_sigma_mps=frame.velocity_sigma_mps,
         lat_deg=prior.lat_deg if prior else None,
         lon_deg=prior.lon_deg if prior else None,
         sigma_m=prior.sigma_m if prior else None,

@@ -179,8 +179,9 @@ def _delimiter(file: TextIO) -> str:
 
 
 def _names(reader: Iterator[list[str]]) -> list[str]:
-    """The columns of the header, none of an empty file."""
-    return [name.strip() for name in next(reader, [])]
+    """The columns of the header, none of an empty file; some programs quote the header as one cell."""
+    names = next(reader, [])
+    return [name.strip() for name in (names[0].split(",") if len(names) == 1 else names)]
 
 
 @dataclass(frozen=True, slots=True)

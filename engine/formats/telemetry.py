@@ -65,6 +65,7 @@ class TelemetryRow:
         tilt_sigma_deg: standard deviation of roll and of pitch, where it is known.
         east_velocity_mps: velocity over ground.
         north_velocity_mps: velocity over ground.
+        velocity_sigma_mps: standard deviation of it, per axis, where it is known.
         lat_deg: WGS84 latitude of a prior.
         lon_deg: WGS84 longitude of the prior.
         sigma_m: standard deviation of the prior, per axis.
@@ -82,6 +83,7 @@ class TelemetryRow:
     tilt_sigma_deg: float | None = None
     east_velocity_mps: float | None = None
     north_velocity_mps: float | None = None
+    velocity_sigma_mps: float | None = None
     lat_deg: float | None = None
     lon_deg: float | None = None
     sigma_m: float | None = None
@@ -116,6 +118,7 @@ _BOUNDS = {
     "tilt_sigma_deg": POSITIVE_SIGMA,
     "east_velocity_mps": ANY,
     "north_velocity_mps": ANY,
+    "velocity_sigma_mps": POSITIVE_SIGMA,
     "lat_deg": QUARTER_TURN,
     "lon_deg": LONGITUDE,
     "sigma_m": SIGMA,

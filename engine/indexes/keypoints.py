@@ -10,12 +10,12 @@ import math
 from functools import partial
 
 import numpy as np
-import torch
 
 from engine.indexes.landmarks import as_picture
 from engine.indexes.recently_used import RecentlyUsed
 from engine.learned import KeypointMatcher, Keypoints
 from engine.orthomap import OrthoMap
+from engine.tensors import torch
 from engine.values import Window
 
 TILE_PX = 512

@@ -12,14 +12,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from engine.device import download, upload
 from engine.features import Features, sift
 from engine.indexes.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.indexes.recently_used import RecentlyUsed
 from engine.orthomap import OrthoMap
+from engine.tensors import download, torch, upload
 from engine.values import Window
 
 Array = NDArray[np.float64]
@@ -78,7 +77,7 @@ class LandmarkMap:
         device: of detection and of the returned features; the cache is in the CPU's memory.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device) -> None:
+    def __init__(self, site: OrthoMap, device: str | torch.device) -> None:
         self._site, self._device = site, device
         self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
         self._max_landmarks = MAX_LANDMARKS
@@ -203,7 +202,7 @@ def _count(tile: NamedArrays) -> int:
     return len(tile["rank"])
 
 
-def as_picture(gray: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
+def as_picture(gray: NDArray[np.uint8], device: str | torch.device) -> torch.Tensor:
     """Grey levels as a batch of one picture for :func:`engine.features.sift`.
 
     Args:

@@ -11,9 +11,9 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from engine.device import Device, Picture, placed
 from engine.ncc_fft import Search, prepare
 from engine.orthomap import OrthoMap
 from engine.scores import enhance
@@ -42,7 +42,7 @@ class Region:
 
     window: Window
     search: Search
-    valid: torch.Tensor | None
+    valid: Picture | None
     mask: NDArray[np.bool_] | None = None
 
 
@@ -51,12 +51,12 @@ class PreparedMap:
 
     Args:
         site: the map.
-        device: of the regions' tensors.
+        device: of the regions.
         radius_px: of the local normalisation, see :func:`engine.scores.enhance`.
         score: see :func:`engine.scores.enhance`.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, radius_px: int, score: str = "local") -> None:
+    def __init__(self, site: OrthoMap, device: Device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
         self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the most recently used is last
         # Guards the regions, not their preparation: a thread that hangs there must not block the next one.
@@ -138,11 +138,11 @@ class PreparedMap:
         inner = np.s_[
             window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
         ]
-        image = torch.from_numpy(np.ascontiguousarray(picture[inner])).to(self._device)
+        image = placed(np.ascontiguousarray(picture[inner]), self._device)
         if mask is None or mask[inner].all():
             return Region(window, prepare(image), None)
         own = np.ascontiguousarray(mask[inner])
-        return Region(window, prepare(image), torch.from_numpy(own).to(self._device), own)
+        return Region(window, prepare(image), placed(own, self._device), own)
 
 
 def _contains(region: Window, window: Window) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.dense import Samples
+from engine.device import on_host
 from engine.indexes.prepared import WHOLE_LEVEL_PX, PreparedMap
 from engine.indexes.recently_used import RecentlyUsed
 from engine.orthomap import OrthoMap
@@ -90,7 +91,7 @@ class SampleMap:
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         region = self._prepared.cut(cell, level)
         inner = np.s_[cell.y0 - region.window.y0 :, cell.x0 - region.window.x0 :]
-        picture = region.search.image.cpu().numpy()[inner]
+        picture = on_host(region.search.image)[inner]
         across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
         rows, columns = _steepest(cv2.magnitude(across, down), shape)

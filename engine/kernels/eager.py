@@ -7,18 +7,12 @@ that wrap around are never returned. The denominator comes from running sums in 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
-
-import cv2
-import numpy as np
-import torch
-from torch import Tensor
 
 from engine.errors import OptionError
+from engine.kernels import sums
+from engine.kernels.transform_sizes import FLOAT32_NORM_RATIO, fast_length
+from engine.tensors import Tensor, torch
 
-# A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
-# norm of a patch: where a patch's norm is smaller than the window's by this factor, the transform is in float64.
-FLOAT32_NORM_RATIO = 16.0
 # A patch is flat where its sum of squares is below this share of the window's, which is rounding.
 _FLAT_SHARE = 1e-12
 # Windows of more pixels than this are processed in blocks where the templates are much smaller.
@@ -31,21 +25,6 @@ _TINY = 1e-12
 _CHUNK_NUMBERS = 1 << 24
 
 
-@lru_cache(maxsize=4096)
-def fast_length(n: int) -> int:
-    """The smallest length of at least ``n`` without prime factors above 5, for which FFTs are fast."""
-    best = 1 << (n - 1).bit_length()
-    five = 1
-    while five < best:
-        three = five
-        while three < best:
-            length = three << max(0, (-(-n // three) - 1).bit_length())
-            best = min(best, length)
-            three *= 3
-        five *= 5
-    return best
-
-
 def check_finite(**tensors: Tensor) -> None:
     """Check that no value is NaN or infinity; finite sums imply that, are faster, and are copied at once.
 
@@ -55,8 +34,8 @@ def check_finite(**tensors: Tensor) -> None:
     Raises:
         OptionError: one is.
     """
-    sums = torch.stack([tensor.detach().sum().double() for tensor in tensors.values()]).cpu().tolist()
-    for (name, tensor), total in zip(tensors.items(), sums, strict=True):
+    totals = torch.stack([tensor.detach().sum().double() for tensor in tensors.values()]).cpu().tolist()
+    for (name, tensor), total in zip(tensors.items(), totals, strict=True):
         if not (math.isfinite(total) or bool(torch.isfinite(tensor).all())):
             raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 
@@ -254,9 +233,7 @@ def integrals(image: Tensor) -> Tensor:
         (2, H+1, W+1) float64 running sums; the first row and column are 0.
     """
     if image.device.type == "cpu":
-        both = np.empty((2, image.shape[0] + 1, image.shape[1] + 1))
-        cv2.integral2(image.contiguous().numpy(), both[0], both[1], sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
-        return torch.from_numpy(both)
+        return torch.from_numpy(sums.integrals(image.detach().numpy()))
     wide = torch.nn.functional.pad(image.double(), (1, 0, 1, 0))
     return torch.stack([wide, wide.square()]).cumsum_(-1).cumsum_(-2)
 
@@ -271,11 +248,7 @@ def halved(image: Tensor) -> Tensor:
         (H // 2, W // 2) float32.
     """
     height, width = image.shape[0] & ~1, image.shape[1] & ~1
-    even = image[:height, :width]
-    if image.device.type == "cpu":
-        size = (width // 2, height // 2)
-        return torch.from_numpy(cv2.resize(even.numpy(), size, interpolation=cv2.INTER_AREA))
-    return torch.nn.functional.avg_pool2d(even[None, None], 2)[0, 0]
+    return torch.nn.functional.avg_pool2d(image[None, None, :height, :width], 2)[0, 0]
 
 
 def box_sum(total: Tensor, h: int, w: int) -> Tensor:

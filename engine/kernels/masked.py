@@ -7,10 +7,8 @@ their differences cancel, so all of it is in float64.
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
-
-from engine.kernels.eager import fast_length
+from engine.kernels.transform_sizes import fast_length
+from engine.tensors import Tensor, torch
 
 # Sums of squares below this share of their own terms are rounding.
 _FLAT_SHARE = 1e-10

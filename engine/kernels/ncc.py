@@ -1,21 +1,26 @@
-"""The interface to NCC's kernels: a function with two kernels selects one with plain ifs."""
+"""The interface to NCC's kernels: a function with several kernels selects one with plain ifs.
+
+Arrays are the CPU's, and go to OpenCV and to compiled loops; tensors go to tensor ops, or to Triton. Kernels are
+imported where they are selected: torch and numba take a while.
+"""
 
 from __future__ import annotations
 
 from functools import cache
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from engine.kernels import eager
-from engine.kernels.eager import check_finite, halved, integrals, products
+from engine.device import Picture
+from engine.kernels import sums
 from engine.kernels.local import LocalScores
-from engine.kernels.masked import ncc_surface as masked_ncc_surface
+
+if TYPE_CHECKING:
+    from engine.tensors import Tensor
 
 __all__ = [
     "LocalScores",
-    "check_finite",
     "halved",
     "integrals",
     "inverse_norm",
@@ -23,35 +28,68 @@ __all__ = [
     "ncc_surface",
     "peak",
     "prepared_surface",
-    "products",
     "rival",
 ]
 
 
-def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
+def ncc_surface(search: Picture, templates: Picture, *, zero_mean: bool) -> Picture:
     """NCC by equation 1.
 
     Args:
-        search: (B, H, W) float32 or float64.
-        templates: (B, T, h, w) of the same dtype.
+        search: (B, H, W) float32 array, or float32 or float64 tensor.
+        templates: (B, T, h, w) of the same kind and type.
         zero_mean: subtract the means first.
 
     Returns:
-        (B, T, H-h+1, W-w+1) of the same dtype, in [-1, 1]; 0 where patch or template is flat.
+        (B, T, H-h+1, W-w+1) of the same kind and type, in [-1, 1]; 0 where patch or template is flat.
 
     Raises:
         OptionError: NaN or infinity.
     """
-    if _by_opencv(search, templates):
+    if isinstance(search, np.ndarray):
         from engine.kernels import by_opencv
 
         return by_opencv.ncc_surface(search, templates, zero_mean=zero_mean)
+    from engine.kernels import eager
+
     scores = eager.ncc_surface(search, templates, zero_mean=zero_mean)
     eager.check_finite(search=search, templates=templates)  # last: the host waits for it
     return scores
 
 
-def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
+def masked_ncc_surface(
+    search: Picture, search_valid: Picture, templates: Picture, templates_valid: Picture, *, min_overlap: float
+) -> Picture:
+    """Zero-mean NCC over the pixels that are valid in both.
+
+    Args:
+        search: (B, H, W).
+        search_valid: (B, H, W) bool, of the same kind.
+        templates: (B, T, h, w), of the same kind.
+        templates_valid: (B, T, h, w) bool, of the same kind.
+        min_overlap: positions with a smaller share of the template's valid pixels in common score -1.
+
+    Returns:
+        (B, T, H-h+1, W-w+1) float64 in [-1, 1].
+
+    Raises:
+        OptionError: NaN or infinity.
+    """
+    if isinstance(search, np.ndarray):
+        from engine.kernels import masked_by_opencv
+
+        sums.check_finite(search=search, templates=templates)
+        return masked_by_opencv.ncc_surface(
+            search, search_valid, templates, templates_valid, min_overlap=min_overlap
+        )
+    from engine.kernels import eager, masked
+
+    scores = masked.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
+    eager.check_finite(search=search, templates=templates)  # last: the host waits for it
+    return scores
+
+
+def prepared_surface(image: Picture, inverse_norms: Picture, templates: Picture) -> Picture:
     """Zero-mean NCC with a picture whose patches' norms are known.
 
     Args:
@@ -62,36 +100,58 @@ def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) ->
     Returns:
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
-    if _by_opencv(image, templates):
+    if isinstance(image, np.ndarray):
         from engine.kernels import by_opencv
 
         return by_opencv.prepared_surface(image, inverse_norms, templates)
+    from engine.kernels import eager
+
     return eager.prepared_surface(image, inverse_norms, templates)
 
 
-def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
+def inverse_norm(running: Picture, h: int, w: int) -> Picture:
     """Reciprocal norm about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's, or (B, 2, H+1, W+1).
+        running: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's; tensors also in batches.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (H-h+1, W-w+1) float32, or (B, H-h+1, W-w+1); 0 where a patch is flat.
+        (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    if sums.device.type == "cpu" and sums.ndim == 3:
+    if isinstance(running, np.ndarray):
         from engine.kernels import by_opencv
 
-        return by_opencv.inverse_norm(sums, h, w)
-    return eager.inverse_norm(sums, h, w)
+        return by_opencv.inverse_norm(running, h, w)
+    from engine.kernels import eager
+
+    return eager.inverse_norm(running, h, w)
+
+
+def integrals(image: Picture) -> Picture:
+    """Integral images of a picture (H, W) and of its square: (2, H+1, W+1) float64 running sums, from 0."""
+    if isinstance(image, np.ndarray):
+        return sums.integrals(image)
+    from engine.kernels import eager
+
+    return eager.integrals(image)
+
+
+def halved(image: Picture) -> Picture:
+    """Means (H // 2, W // 2) of 2 x 2 pixels of a picture (H, W) float32."""
+    if isinstance(image, np.ndarray):
+        return sums.halved(image)
+    from engine.kernels import eager
+
+    return eager.halved(image)
 
 
 def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
     """Maximum of every template's surface; nothing is copied from the device.
 
     Args:
-        products: (T, H', W') float32 from :func:`products`.
+        products: (T, H', W') float32 from :func:`engine.kernels.eager.products`.
         inverse_norms: (H', W') float32, or (T, H', W').
 
     Returns:
@@ -101,6 +161,8 @@ def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
         from engine.kernels import triton_peak
 
         return triton_peak.peak(products, inverse_norms)
+    from engine.kernels import eager
+
     return eager.peak(products, inverse_norms)
 
 
@@ -108,7 +170,7 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
     """Maximum of every template's surface outside a disc.
 
     Args:
-        products: (T, H', W') float32 from :func:`products`.
+        products: (T, H', W') float32 from :func:`engine.kernels.eager.products`.
         inverse_norms: (H', W') float32, or (T, H', W').
         winner: (T,) int64, the flat index of the disc's centre, on the device.
         radius_squared: positions of at most this squared distance are inside, in squared pixels.
@@ -120,16 +182,9 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
         from engine.kernels import triton_peak
 
         return triton_peak.rival(products, inverse_norms, winner, radius_squared)
+    from engine.kernels import eager
+
     return eager.rival(products, inverse_norms, winner, radius_squared)
-
-
-def _by_opencv(search: Tensor, templates: Tensor) -> bool:
-    """Whether both are float32 on the CPU, and no gradient is asked for."""
-    return (
-        search.dtype == templates.dtype == torch.float32
-        and search.device.type == "cpu"
-        and not (search.requires_grad or templates.requires_grad)
-    )
 
 
 def _by_triton(tensor: Tensor) -> bool:

@@ -6,10 +6,10 @@ plain torch versions of the same names are in :mod:`engine.kernels.eager`, and a
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
+
+from engine.tensors import Tensor, torch
 
 _BLOCK = 2048
 # Sizes, strides and offsets of views change with the window; specialising on them would compile in flight.

@@ -15,11 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import torch
-from torch import Tensor, nn
-from torch.nn.functional import pad
-
 from engine.learned import superpoint
+from engine.tensors import Tensor, functional, nn, torch
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +88,9 @@ class SuperPointKeypoints:
         """The strongest keypoints; see :class:`Extractor`."""
         height, width = picture.shape[2:]
         cell = superpoint.CELL_PX
-        scores, descriptors = self.network(pad(picture, (0, -width % cell, 0, -height % cell), mode="replicate"))
+        scores, descriptors = self.network(
+            functional.pad(picture, (0, -width % cell, 0, -height % cell), mode="replicate")
+        )
         xy, strength = superpoint.strongest(scores[0, :height, :width], count)
         return Keypoints(xy, strength, superpoint.sample(descriptors[0], xy))
 

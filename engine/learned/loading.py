@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import nn
-
 from engine import device as devices
-from engine.errors import OptionError
+from engine.errors import OptionError, require
 from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
 from engine.learned.matchers import KeypointMatcher, Loftr
 from engine.learned.superpoint import SuperPoint
 from engine.learned.weights import KINDS, Weights, fill, read_weights
+from engine.tensors import nn, torch
 
 _EXTRACTORS = ("DISK", "ALIKED", "SuperPoint")
 _EXPECTED = "LoFTR, or LightGlue with DISK, ALIKED or SuperPoint"
@@ -40,6 +38,7 @@ def load_matcher(
         OptionError: a file is missing, is not one of tensors, holds no known network or does not fit it, or the
             files do not make a matcher.
         DeviceError: the device is not there.
+        MissingExtraError: kornia is not installed.
     """
     if max_keypoints < 2:
         raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
@@ -47,7 +46,7 @@ def load_matcher(
         raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
     if not paths:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got none")
-    target, files = devices.resolve(device), [read_weights(path) for path in paths]
+    target, files = torch.device(devices.resolve(device)), [read_weights(path) for path in paths]
     for weights in files:
         if weights.kind is None:
             some = ", ".join(sorted(weights.tensors)[:2])
@@ -73,10 +72,11 @@ def load_loftr(path: str | Path, *, device: str | torch.device = "auto", min_con
     Raises:
         OptionError: the file is missing, is not one of tensors, or does not fit the network.
         DeviceError: the device is not there.
+        MissingExtraError: kornia is not installed.
     """
     if not 0.0 <= min_confidence <= 1.0:
         raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
-    return Loftr(_loftr(read_weights(path), devices.resolve(device)), min_confidence)
+    return Loftr(_loftr(read_weights(path), torch.device(devices.resolve(device))), min_confidence)
 
 
 def load_disk_lightglue(
@@ -93,10 +93,11 @@ def load_disk_lightglue(
     Raises:
         OptionError: a file is missing, is not one of tensors, or does not fit its network.
         DeviceError: the device is not there.
+        MissingExtraError: kornia is not installed.
     """
     if max_keypoints < 2:
         raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
-    target = devices.resolve(device)
+    target = torch.device(devices.resolve(device))
     detector = Disk(_disk(read_weights(disk), target))
     return KeypointMatcher(detector, _lightglue(read_weights(lightglue), 128, target), max_keypoints)
 
@@ -118,32 +119,30 @@ def _keypoint_matcher(
     return KeypointMatcher(wrap(network), _lightglue(lightglue, numbers, device), max_keypoints)
 
 
-def _loftr(weights: Weights, device: torch.device) -> nn.Module:
-    from kornia.feature import LoFTR
+def _kornia() -> Any:
+    """Kornia's networks; an extra, since most vehicles match without."""
+    return require("kornia.feature", "learned")
 
-    return fill(LoFTR(pretrained=None), weights, device)
+
+def _loftr(weights: Weights, device: torch.device) -> nn.Module:
+    return fill(_kornia().LoFTR(pretrained=None), weights, device)
 
 
 def _disk(weights: Weights, device: torch.device) -> nn.Module:
-    from kornia.feature import DISK
-
-    return fill(DISK(), weights, device)
+    return fill(_kornia().DISK(), weights, device)
 
 
 def _aliked(weights: Weights, device: torch.device) -> nn.Module:
     """ALIKED of the size that its tensors have."""
-    try:
-        from kornia.feature import ALIKED
-    except ImportError:
-        raise OptionError("weights: ALIKED takes kornia 0.9 or later, got an older one") from None
-
+    if not hasattr(features := _kornia(), "ALIKED"):
+        raise OptionError("weights: ALIKED takes kornia 0.9 or later, got an older one")
     if len(weights.tensors["block1.conv1.weight"]) == 8:
         name = "aliked-t16"
     else:
         offsets = weights.tensors.get("desc_head.agg_weights")
         name = "aliked-n32" if offsets is not None and len(offsets) == 32 else "aliked-n16"
     # Without a threshold every local maximum is a keypoint; how many are taken is said picture by picture.
-    return fill(ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
+    return fill(features.ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
 
 
 def _superpoint(weights: Weights, device: torch.device) -> nn.Module:
@@ -156,8 +155,7 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
     Raises:
         OptionError: it is for descriptors of another length, or for keypoints with a scale and an angle.
     """
-    from kornia.feature import LightGlue
-
+    light_glue = _kornia().LightGlue
     tensors, unnamed = weights.tensors, None  # named features would make kornia fetch their weights
     projection, positions = tensors.get("input_proj.weight"), tensors.get("posenc.Wr.weight")
     taken = 256 if projection is None else int(projection.shape[-1])
@@ -172,4 +170,4 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
             raise OptionError(f"weights: {weights.path}: {what}")
     layers = 1 + max((int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment.")), default=8)
     settings: dict[str, Any] = {"features": unnamed, "input_dim": numbers, "n_layers": layers}
-    return fill(LightGlue(**settings), weights, device)
+    return fill(light_glue(**settings), weights, device)

@@ -15,12 +15,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor, nn
-from torch.nn.functional import pad
-
 from engine.errors import DtypeError, ShapeError
 from engine.learned.keypoints import Extractor, Keypoints
+from engine.tensors import Tensor, functional, nn, torch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +123,7 @@ def _device_of(network: nn.Module) -> torch.device:
 def _padded(image: Tensor, multiple: int) -> Tensor:
     """The picture, its edge replicated at the right and at the bottom to whole cells."""
     height, width = image.shape[2:]
-    return pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+    return functional.pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 
 
 def _inside(points: Tensor, image: Tensor) -> Tensor:

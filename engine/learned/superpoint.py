@@ -7,9 +7,7 @@ References:
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor, nn
-from torch.nn.functional import grid_sample, max_pool2d, normalize, pixel_shuffle, relu
+from engine.tensors import Tensor, functional, nn, torch
 
 CELL_PX = 8
 """Side of the cell of pixels that shares one descriptor, and in which the detector chooses at most one place."""
@@ -47,12 +45,14 @@ class SuperPoint(nn.Module):
         x = images
         for block in range(1, 5):
             if block > 1:
-                x = max_pool2d(x, 2)
-            x = relu(getattr(self, f"conv{block}a")(x))
-            x = relu(getattr(self, f"conv{block}b")(x))
-        logits = self.convPb(relu(self.convPa(x)))
-        scores = pixel_shuffle(torch.softmax(logits, dim=1)[:, :-1], CELL_PX)[:, 0]  # the last is "no keypoint"
-        return scores, normalize(self.convDb(relu(self.convDa(x))), dim=1)
+                x = functional.max_pool2d(x, 2)
+            x = functional.relu(getattr(self, f"conv{block}a")(x))
+            x = functional.relu(getattr(self, f"conv{block}b")(x))
+        logits = self.convPb(functional.relu(self.convPa(x)))
+        scores = functional.pixel_shuffle(torch.softmax(logits, dim=1)[:, :-1], CELL_PX)[
+            :, 0
+        ]  # the last is "no keypoint"
+        return scores, functional.normalize(self.convDb(functional.relu(self.convDa(x))), dim=1)
 
 
 def strongest(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -66,7 +66,7 @@ def strongest(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
         (N, 2) whole pixels (x, y) and (N,) their scores, falling.
     """
     side = 2 * _SEPARATION_PX + 1
-    highest = max_pool2d(scores[None, None], side, stride=1, padding=_SEPARATION_PX)[0, 0]
+    highest = functional.max_pool2d(scores[None, None], side, stride=1, padding=_SEPARATION_PX)[0, 0]
     kept = (scores == highest) & (scores > _MIN_SCORE)
     kept[:_BORDER_PX], kept[-_BORDER_PX:], kept[:, :_BORDER_PX], kept[:, -_BORDER_PX:] = (False,) * 4
     y, x = torch.nonzero(kept, as_tuple=True)
@@ -88,5 +88,5 @@ def sample(descriptors: Tensor, xy_px: Tensor) -> Tensor:
     cells = (xy_px - (CELL_PX - 1) / 2) / CELL_PX
     last = xy_px.new_tensor([descriptors.shape[2] - 1, descriptors.shape[1] - 1]).clamp(min=1)
     at = (2.0 * cells / last - 1.0)[None, None]
-    found = grid_sample(descriptors[None], at, padding_mode="border", align_corners=True)[0, :, 0]
-    return normalize(found.T, dim=1)
+    found = functional.grid_sample(descriptors[None], at, padding_mode="border", align_corners=True)[0, :, 0]
+    return functional.normalize(found.T, dim=1)

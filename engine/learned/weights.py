@@ -9,10 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor, nn
-
 from engine.errors import OptionError
+from engine.tensors import Tensor, nn, torch
 
 KINDS = {
     "DISK": ("unet.path_down.0.1.3.weight",),

@@ -260,7 +260,7 @@ class GrayReader:
             raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
         self.levels = stored_levels(source)
         self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
-        self._palette = _palette(dataset)
+        self._palette = palette_of(dataset)
         shrink = max(1.0, max(dataset.width, dataset.height) / OVERVIEW_PX)
         size = (math.ceil(dataset.height / shrink), math.ceil(dataset.width / shrink))
         data, valid = self._read(Window(0, 0, dataset.width, dataset.height), size)
@@ -338,8 +338,15 @@ def stored_levels(source: Source) -> tuple[int, ...]:
     return (0, *sorted(factor.bit_length() - 1 for factor in factors if factor > 1 and factor & (factor - 1) == 0))
 
 
-def _palette(dataset: Any) -> Gray | None:
-    """(3, N) colours of a colour table, or None."""
+def palette_of(dataset: Any) -> Gray | None:
+    """Find the colour table of a raster.
+
+    Args:
+        dataset: an open raster.
+
+    Returns:
+        (3, N) uint8 red, green and blue by index, or None without a table.
+    """
     if dataset.count != 1 or dataset.colorinterp[0].name != "palette":
         return None
     table = np.zeros((3, int(np.iinfo(dataset.dtypes[0]).max) + 1), np.uint8)

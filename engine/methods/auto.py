@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.acceptance import are_consistent
+from engine.device import Device
 from engine.methods.explanation import Explanation
 from engine.methods.method import Method
 from engine.methods.ncc import Ncc
@@ -32,7 +32,7 @@ class Auto(Method):
         options: settings of both.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.ncc = Ncc(site, device, options)
         self.sift = Sift(site, device, options)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
+from engine.device import Picture, placed
 from engine.indexes.prepared import PreparedMap, Region
 from engine.methods.oblique import is_oblique, oblique_patch
 from engine.methods.options import NccOptions
@@ -46,7 +46,7 @@ class Aligned:
     jacobian: Array
     view: GroundView
     patch: Patch
-    template: torch.Tensor
+    template: NDArray[np.float32]
 
     def work_px(self, window: Window) -> float:
         """Pixels of a window on this level."""
@@ -97,8 +97,7 @@ class Correlator:
             detail = "the frame covers fewer than 8 x 8 pixels of the map"
             return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
         enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
-        template = torch.from_numpy(enhanced).to(query.device)
-        return Aligned(pose, level, jacobian, view, patch, template)
+        return Aligned(pose, level, jacobian, view, patch, enhanced)
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
         """The patches of the null hypothesis, as large as the frame's: upside down, and mirrored.
@@ -127,8 +126,7 @@ class Correlator:
         extent = (float(size[0]), float(size[1]))
         view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
         enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
-        template = torch.from_numpy(enhanced).to(query.device)
-        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, template)
+        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
 
     def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
         """Rise (2,) of the ground per pixel of the level, about a wider area the vaguer the prior is."""
@@ -169,7 +167,10 @@ class Correlator:
         with query.scheduler.stage("match"):
             if region.valid is None:
                 peak = match_template(
-                    region.search, aligned.template, exclusion_px=exclusion_px, exhaustive=options.exhaustive
+                    region.search,
+                    placed(aligned.template, query.device),
+                    exclusion_px=exclusion_px,
+                    exhaustive=options.exhaustive,
                 )
             else:
                 scores = self.masked_scores(region, aligned.template[None])
@@ -179,7 +180,7 @@ class Correlator:
         x, y = peak.x + region.window.x0, peak.y + region.window.y0
         return Peak(x, y, peak.score, peak.second_score, peak.curvature)
 
-    def surface(self, aligned: Aligned, window: Window) -> tuple[torch.Tensor, Array] | None:
+    def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
         """The whole surface that :meth:`search` finds its peak on, for reports.
 
         Returns:
@@ -192,17 +193,17 @@ class Correlator:
             return None
         template = aligned.template[None]
         if region.valid is None:
-            scores = ncc(region.search.image[None], template[None])[0, 0]
+            scores = ncc(region.search.image[None], placed(template[None], self.query.device))[0, 0]
         else:
             scores = self.masked_scores(region, template)[0]
         return scores, np.array([region.window.x0, region.window.y0], np.float64)
 
-    def masked_scores(self, region: Region, templates: torch.Tensor) -> torch.Tensor:
+    def masked_scores(self, region: Region, templates: NDArray[np.float32]) -> Picture:
         """Scores (T, H', W') where the region has nodata; -1 where too little of a template lies on map."""
         assert region.valid is not None
         scores = ncc(
             region.search.image[None],
-            templates[None],
+            placed(templates[None], self.query.device),
             search_valid=region.valid[None],
             min_overlap=self.options.min_valid_share,
         )

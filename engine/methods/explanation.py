@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.align import Patch, rectify, view_of
+from engine.device import on_host
 from engine.methods.correlation import Aligned, Correlator
-from engine.methods.feature_pose import FeatureMatcher
 from engine.methods.query import Query
 from engine.pose import PoseStats
 from engine.values import Window
+
+if TYPE_CHECKING:
+    from engine.methods.feature_pose import FeatureMatcher
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -92,7 +95,7 @@ def explain_correlation(correlator: Correlator, window: Window) -> Explanation:
     found = correlator.surface(aligned, window)
     if found is None:
         return Explanation(query.gray, aligned.patch.gray)
-    scores, corner = found[0].cpu().numpy(), found[1]
+    scores, corner = on_host(found[0]), found[1]
     middle = site.full_from_level(outline_of(corner, aligned.patch.gray).mean(axis=0), level)
     surface = score_surface(scores, middle, 2.0**level)
     outline = site.full_from_level(outline_of(corner + surface.peak_px, aligned.patch.gray), level)
@@ -106,8 +109,7 @@ def explain_features(matcher: FeatureMatcher, window: Window) -> Explanation:
     explanation = Explanation(query.gray, None if patch is None else patch.gray)
     if query.telemetry.height_agl_m is None:
         return explanation
-    with torch.inference_mode():
-        frame_px, ground_m, stats = matcher.matches_in(window)
+    frame_px, ground_m, stats = matcher.matches_in(window)
     agree = np.zeros(len(frame_px), bool) if stats is None else stats.inliers
     matches = PointMatches(frame_px, query.site.pixel_from_enu(ground_m[:, :2]), agree)
     outline = None if stats is None else _footprint(query, stats, float(np.median(ground_m[agree, 2])))

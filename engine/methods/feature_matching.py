@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.align import Orthophoto, orthorectify
-from engine.device import download, upload
 from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
 from engine.indexes.landmarks import LandmarkMap, Landmarks, as_picture
@@ -28,6 +26,7 @@ from engine.methods.views import MapView, TelemetryHypothesis, map_px_per_pixel,
 from engine.methods.votes import Vote, similarity, vote
 from engine.orthomap import OrthoMap
 from engine.pose import PoseStart
+from engine.tensors import download, torch, upload
 from engine.values import Attitude
 
 Array = NDArray[np.float64]

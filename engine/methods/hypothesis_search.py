@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from engine.device import Picture, placed
 from engine.indexes.prepared import Region
 from engine.methods.correlation import Aligned, Correlator
 from engine.methods.options import NccOptions
@@ -164,24 +164,25 @@ def _coarse(
     return _separated(found, separation * 2.0**level)
 
 
-def _surfaces(correlator: Correlator, region: Region, templates: torch.Tensor) -> Iterator[torch.Tensor]:
+def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.float32]) -> Iterator[Picture]:
     """One surface (H', W') after the other, of which only a few are in memory."""
     area_px = region.window.width_px * region.window.height_px
     if region.valid is None:
-        for group in surfaces(region.search, templates, group=max(_MIN_GROUP, _MAX_GROUP_PX // area_px)):
-            yield from group
+        own, group = placed(templates, correlator.query.device), max(_MIN_GROUP, _MAX_GROUP_PX // area_px)
+        for several in surfaces(region.search, own, group=group):
+            yield from several
     else:
         for template in templates:
             yield correlator.masked_scores(region, template[None])[0]
 
 
-def _same_size(fitting: list[Aligned]) -> tuple[torch.Tensor, list[Array]]:
+def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]]:
     """Templates (T, h, w) cut about their middles to the smallest, and what was cut off (x, y) at their corner."""
     h = min(aligned.template.shape[0] for aligned in fitting)
     w = min(aligned.template.shape[1] for aligned in fitting)
     trims = [((a.template.shape[1] - w) // 2, (a.template.shape[0] - h) // 2) for a in fitting]
     cut = [a.template[y : y + h, x : x + w] for a, (x, y) in zip(fitting, trims, strict=True)]
-    return torch.stack(cut), [np.array(trim, dtype=np.float64) for trim in trims]
+    return np.stack(cut), [np.array(trim, dtype=np.float64) for trim in trims]
 
 
 def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -> list[tuple[GridPose, Array]]:

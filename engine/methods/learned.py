@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import torch
-
+from engine.device import Device
 from engine.indexes.keypoints import KeypointMap
 from engine.learned import KeypointMatcher, load_matcher
 from engine.methods.explanation import Explanation, explain_features
@@ -35,7 +34,7 @@ class Learned(Method):
         OptionError: there are no weights, or they make no matcher.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         own = options.learned
         matcher = load_matcher(own.weights, device=device, min_confidence=own.min_match_confidence)
         self.keypoints = KeypointMap(site, matcher) if isinstance(matcher, KeypointMatcher) else None

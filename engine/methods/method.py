@@ -6,8 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
-import torch
-
+from engine.device import Device
 from engine.methods.explanation import Explanation
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
@@ -24,7 +23,7 @@ class Method(ABC):
         options: settings of all methods.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:  # noqa: B027
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:  # noqa: B027
         """Keep nothing; a method that prepares something of the map has a constructor of its own."""
 
     @property

@@ -6,10 +6,10 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from engine.acceptance import judge_peak, judge_second_look
 from engine.confidence import SECOND_LOOK_MODEL, peak_features, probability
+from engine.device import Device
 from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
@@ -44,11 +44,11 @@ class Ncc(Method):
 
     Args:
         site: the map.
-        device: where tensors live.
+        device: where pictures are correlated.
         options: settings; ``options.ncc`` counts.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.options = options.ncc
         self.prepared = PreparedMap(site, device, self.options.enhance_radius_px, self.options.score)
         self.samples = SampleMap(site, self.prepared)
@@ -231,7 +231,7 @@ class Ncc(Method):
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where its peak is accepted, else a refusal."""
-        pixels, fix = found.aligned.template.numel(), found.fix
+        pixels, fix = found.aligned.template.size, found.fix
         rule, confidence = self.options.rule, fix.confidence
         refusal = judge_peak(found.peak, pixels, found.features, confidence, rule, searched=found.searched)
         if refusal is not None:
@@ -279,7 +279,7 @@ class Ncc(Method):
             with query.scheduler.costed("ncc", work):
                 found = self.find(turned, coarser=coarser)
             if isinstance(found, NoFix) or judge_peak(
-                found.peak, found.aligned.template.numel(), found.features, found.fix.confidence, rule
+                found.peak, found.aligned.template.size, found.features, found.fix.confidence, rule
             ):
                 continue
             if best is None or (found.fix.confidence or 0.0) > (best.confidence or 0.0):

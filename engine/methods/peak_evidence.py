@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import torch
-
 from engine.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
 from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.methods.correlation import METHOD, Aligned, Correlator
@@ -51,7 +49,7 @@ def with_confidence(correlator: Correlator, found: PeakCandidate) -> PeakCandida
 
 def features_of(query: Query, aligned: Aligned, peak: Peak, fix: Fix) -> PeakFeatures:
     """What the confidence model is told of a peak."""
-    return peak_features(peak, score_sigma(aligned.template.numel()), agreement_of(query, fix))
+    return peak_features(peak, score_sigma(aligned.template.size), agreement_of(query, fix))
 
 
 def agreement_of(query: Query, fix: Fix) -> PriorAgreement:
@@ -68,8 +66,7 @@ def _null_score(correlator: Correlator, aligned: Aligned, window: Window) -> flo
     options, best = correlator.options, -1.0
     for patch in correlator.nowhere(aligned):
         enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
-        template = torch.from_numpy(enhanced).to(correlator.query.device)
-        rival = correlator.search(replace(aligned, template=template), window)
+        rival = correlator.search(replace(aligned, template=enhanced), window)
         best = best if rival is None else max(best, rival.score)
     return best
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.align import RIM_PX
@@ -15,6 +14,7 @@ from engine.indexes.landmarks import as_picture
 from engine.learned import KeypointMatcher, PairMatcher
 from engine.methods.query import Query
 from engine.methods.views import MapView
+from engine.tensors import torch
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.covariance import AssumedErrors, with_frame_accuracy
+from engine.device import Device
 from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
 from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
@@ -38,7 +38,7 @@ class Query:
         camera: the pinhole that the undistorted picture obeys.
         site: the map.
         prior: where the vehicle should be, or None: anywhere on the map.
-        device: where tensors live.
+        device: where pictures are correlated.
         scheduler: times its stages, and decides which steps there is time for.
     """
 
@@ -47,7 +47,7 @@ class Query:
     camera: Camera
     site: OrthoMap
     prior: Prior | None
-    device: torch.device
+    device: Device
     scheduler: Scheduler = field(repr=False)
 
     @cached_property

@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeVar
 
-import torch
-
 from engine.budget import Deadline
-from engine.device import synchronise
+from engine.device import Device, synchronise
 from engine.methods.costs import Costs
 from engine.methods.preemption import thread_usage, waited_ms
 from engine.values import Timings
@@ -34,7 +32,7 @@ class Scheduler:
         costs: of the steps, updated by each that runs.
     """
 
-    def __init__(self, deadline: Deadline, device: torch.device, costs: Costs | None = None) -> None:
+    def __init__(self, deadline: Deadline, device: Device, costs: Costs | None = None) -> None:
         self.deadline = deadline
         self._device = device
         self._costs = costs or Costs()

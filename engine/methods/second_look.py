@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from engine.device import on_host, placed
 from engine.methods.correlation import Aligned, Correlator
 from engine.ncc_fft import ncc
 from engine.peaks import find_peak
@@ -61,15 +61,12 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
     search = _channels(gray, options.enhance_radius_px, valid)
     patches = [aligned.patch.gray, *correlator.nowhere(aligned)]
     stacked = np.stack([_channels(patch, options.enhance_radius_px, None) for patch in patches], axis=1)
-    templates = torch.from_numpy(stacked).to(query.device)
-    with torch.inference_mode():
-        scores = ncc(torch.from_numpy(search).to(query.device), templates).mean(dim=0)
+    scores = on_host(ncc(placed(search, query.device), placed(stacked, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, about their mean, and costs places that are mostly on the map little.
-        share = torch.from_numpy(_share_on_map(valid, height, width)).to(query.device)
-        scores = torch.where(share >= options.min_valid_share, scores, -1.0)
+        scores[:, _share_on_map(valid, height, width) < options.min_valid_share] = -1.0
     chance = scores[1:][scores[1:] > -1.0]
-    if not chance.numel():
+    if not chance.size:
         return None
     peak = find_peak(
         scores[0], exclusion_px=options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
@@ -80,7 +77,7 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
         y=peak.y + crop.y0,
         second_score=max(peak.second_score, float(chance.max())),
     )
-    return SecondLook(peak, max(float(chance.std(correction=0)), 1e-3))
+    return SecondLook(peak, max(float(chance.std(dtype=np.float64)), 1e-3))
 
 
 def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[np.float64]:

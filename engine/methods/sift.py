@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import torch
-
 from engine.align import MAX_PICTURE_PX, SIDE_STEP_PX
+from engine.device import Device
 from engine.features import prepare_plans
 from engine.indexes.landmarks import LandmarkMap
 from engine.methods.explanation import Explanation, explain_features
@@ -16,6 +15,7 @@ from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
 from engine.orthomap import OrthoMap
+from engine.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
@@ -30,7 +30,7 @@ class Sift(Method):
         options: settings; ``options.sift`` counts.
     """
 
-    def __init__(self, site: OrthoMap, device: torch.device, options: MatcherOptions) -> None:
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.options = options.sift
         self.landmarks = LandmarkMap(site, device)
 
@@ -48,7 +48,7 @@ class Sift(Method):
         """Run every variant of every step, so that it is compiled and its cost known."""
         # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
         longest_px = min(3 * max(query.gray.shape), math.isqrt(MAX_PICTURE_PX))
-        prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), query.device)
+        prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), torch.device(query.device))
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed("sift", work_px):
                 self._at_scale(query, share)

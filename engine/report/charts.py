@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Limits = tuple[float, float]
 
-WIDTH, HEIGHT = 720.0, 230.0
-_TOP, _RIGHT, _BOTTOM = 12.0, 14.0, 44.0
+WIDTH, HEIGHT = 720.0, 236.0
+_TOP, _RIGHT, _BOTTOM = 12.0, 14.0, 50.0
 _MAX_POINTS = 4000  # of a line; more are not visible
 
 
@@ -87,9 +87,9 @@ class ChartArea:
         return f'{segment}{name}text-anchor="{anchor}">{escape(text)}</text>'
 
     def overflow(self, x: Array, y: Array, kind: str) -> str:
-        """A triangle at the upper edge for each value above it."""
+        """A stroke at the upper edge for each value above it."""
         above = self.x(x[y > self.y_limits[1]])
-        marks = "".join(f"M{v - 4:.1f} {_TOP + 7}h8l-4 -7z" for v in np.unique(np.round(above, 1)))
+        marks = "".join(f"M{v:.1f} {_TOP}v9" for v in np.unique(np.round(above, 1)))
         return f'<path class="{kind}" d="{marks}"/>' if marks else ""
 
     def bars(self, edges: Array, counts: Array, kind: str) -> str:
@@ -116,35 +116,53 @@ class ChartArea:
                 begin = i + 1
         return "".join(parts)
 
-    def svg(self, label: str, x_label: str, marks: Sequence[str], *, rows: Sequence[str] = (), timed: bool) -> str:
+    def svg(
+        self,
+        label: str,
+        x_label: str,
+        marks: Sequence[str],
+        *,
+        rows: Sequence[str] = (),
+        timed: bool,
+        fixed: Sequence[str] = (),
+        period: float | None = None,
+    ) -> str:
         """The complete chart.
 
         Args:
             label: alternative text.
             x_label: label of the x axis.
-            marks: SVG elements, from bottom to top.
+            marks: SVG elements, from bottom to top; the page's script stretches them along x.
             rows: labels of y = 0, 1, ... instead of numbers.
-            timed: whether x is time, so that the page's cursor is shown.
+            timed: whether x is time, so that the page's cursor is shown and the axis zooms.
+            fixed: SVG elements that are never stretched, such as labelled lines.
+            period: of y, whose ticks are then labelled from 0 to it; None without one.
         """
-        foot = HEIGHT - _BOTTOM
-        grid = "".join(self._x_tick(v, t, i) for i, (v, t) in enumerate(ticks(*self.x_limits, 6)))
+        foot, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
+        x_grid = "".join(self._x_tick(v, t, i) for i, (v, t) in enumerate(ticks(*self.x_limits, 6)))
         y_ticks = list(enumerate(rows)) if rows else ticks(*self.y_limits, 4)
-        grid += "".join(self._y_tick(v, t) for v, t in y_ticks)
-        middle = (self.left + WIDTH - _RIGHT) / 2
+        if period is not None:
+            y_ticks = [(value, f"{value % period:g}") for value, _ in y_ticks]
+        y_grid = "".join(self._y_tick(v, t) for v, t in y_ticks)
+        middle = (self.left + right) / 2.0
         name = f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text>'
-        axis = _segment(self.left, foot, WIDTH - _RIGHT, foot, "axis")
-        cursor, data = "", ""
+        axis = _segment(self.left, foot, right, foot, "axis")
+        place = f"{self.left:g} {_TOP:g} {right - self.left:g} {foot - _TOP:g}".split()
+        at = " ".join(f'{key}="{v}"' for key, v in zip(("x", "y", "width", "height"), place, strict=True))
+        cursor = _segment(-999, _TOP, -999, foot, "cursor") if timed else ""
+        plot = f'<svg class="plot" {at} viewBox="{" ".join(place)}"><g class="data">{"".join(marks)}</g>'
+        plot += f"{cursor}</svg>"
+        data = ""
         if timed:
-            cursor = _segment(-9, _TOP, -9, foot, "cursor")
-            limits = f'data-from="{self.x_limits[0]:g}" data-to="{self.x_limits[1]:g}"'
-            data = f' {limits} data-left="{self.left:g}" data-right="{WIDTH - _RIGHT:g}"'
+            limits = f'data-from="{self.x_limits[0]:.9g}" data-to="{self.x_limits[1]:.9g}"'
+            data = f' {limits} data-left="{self.left:g}" data-right="{right:g}"'
         head = f'<svg class="chart" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img"'
-        head = f'{head} aria-label="{escape(label, quote=True)}"{data}>'
-        return f"{head}{grid}{''.join(marks)}{axis}{cursor}{name}</svg>"
+        head = f'{head} aria-label="{escape(label, quote=True)}"{data}><g class="x-grid">{x_grid}</g>'
+        return f"{head}{y_grid}{plot}{''.join(fixed)}{axis}{name}</svg>"
 
     def _x_tick(self, value: float, text: str, index: int) -> str:
         at, foot = float(self.x(value)), HEIGHT - _BOTTOM
-        place = f'x="{at:.1f}" y="{foot + 19}" text-anchor="middle"'
+        place = f'x="{at:.1f}" y="{foot + 20}" text-anchor="middle"'
         return _segment(at, _TOP, at, foot, "grid") + f'<text class="tick{index % 2}" {place}>{text}</text>'
 
     def _y_tick(self, value: float, text: str) -> str:

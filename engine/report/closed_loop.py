@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from engine.formats.tables import cell_text, write_table
 from engine.geo import attitude_from_rotation
 from engine.report.figures import DPI, FIX, GRID, REFUSED, TRUTH
+from engine.report.loop_record import SETTLING_S
 from engine.sim.faults import Fault
 from engine.sim.loop import LoopResult, LoopSample, Mode
 from engine.sim.vehicle import START_NS
@@ -28,7 +29,6 @@ _COLUMNS = (
     "true_roll_deg", "true_pitch_deg", "true_heading_deg",
     "roll_deg", "pitch_deg", "heading_deg",
 )  # fmt: skip
-_SETTLING_S = 5.0  # after which the initial error has decayed
 
 
 def write_loop_csv(path: Path, result: LoopResult) -> None:
@@ -65,7 +65,7 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
         ``fixes``, ``used`` and ``resets``; ``unhealthy_s`` and ``hold_s``.
     """
     plan, estimate = result.plan_error_m, result.estimate_error_m
-    settled = [k for k, row in enumerate(result.record) if row.time_s >= _SETTLING_S] or [len(result.record) - 1]
+    settled = [k for k, row in enumerate(result.record) if row.time_s >= SETTLING_S] or [len(result.record) - 1]
     covariance = np.array([result.record[k].estimate.covariance[:2, :2] for k in settled])
     flat = estimate[settled][:, :2]
     nees = np.einsum("ni,nij,nj->n", flat, np.linalg.inv(covariance), flat)
@@ -166,7 +166,7 @@ def _in_time(result: LoopResult, title: str, fault: Fault) -> Any:
     estimate.plot(time, np.hypot(*result.estimate_error_m[:, :2].T), color=FIX, linewidth=1.1, label="error")
     estimate.set_ylabel("estimate's error (m)")
     estimate.legend(frameon=False, fontsize=9, loc="upper right")
-    late = time > _SETTLING_S
+    late = time > SETTLING_S
     if late.any():  # the initial uncertainty would dominate the scale
         errors = np.hypot(*result.estimate_error_m[:, :2].T)
         estimate.set_ylim(0.0, max(1.5, 1.1 * float(max((3.0 * sigma)[late].max(), errors[late].max()))))

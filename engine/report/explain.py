@@ -18,7 +18,7 @@ from engine.formats.track import TrackRow
 from engine.matcher import SceneMatcher
 from engine.methods.explanation import Explanation, PointMatches, ScoreSurface
 from engine.orthomap import OrthoMap
-from engine.report.metrics import WRONG_M, TrackErrors
+from engine.report.metrics import TrackErrors
 from engine.values import Frame, Window
 from engine.window import level_crop
 
@@ -29,7 +29,7 @@ MAX_FRAMES = 60
 """Maximum number of frames that are shown of a flight."""
 SIDE_PX = 360
 """Longer side of an image of the slider."""
-_MAX_REMARKABLE = 40  # wrong fixes and refusals among them, so that ordinary frames remain
+_MAX_REMARKABLE = 40  # fixes beyond three sigmas and refusals among them, so that ordinary frames remain
 _MAX_BYTES = 32_000  # per image, so that a report of 60 frames stays below 15 MB
 _QUALITIES = (82, 70, 55, 40, 25)
 _AGREE, _OTHER = (0, 158, 115), (200, 200, 200)
@@ -65,7 +65,7 @@ class SliderFrame:
 
 
 def choose_frames(rows: Sequence[TrackRow], errors: TrackErrors, max_frames: int = MAX_FRAMES) -> list[int]:
-    """Select the frames to show: wrong fixes first, then refusals, then evenly spaced others.
+    """Select the frames to show: fixes beyond three sigmas first, then refusals, then evenly spaced others.
 
     Args:
         rows: the track.
@@ -78,13 +78,13 @@ def choose_frames(rows: Sequence[TrackRow], errors: TrackErrors, max_frames: int
     if len(rows) <= max_frames:
         return list(range(len(rows)))
     remarkable = max_frames * _MAX_REMARKABLE // MAX_FRAMES
-    refused, wrong = np.array([not row.fixed for row in rows]), errors.distance_m > WRONG_M
+    refused, beyond = np.array([not row.fixed for row in rows]), errors.beyond
     chosen: list[int] = []
     for kind, limit in (
-        (wrong, remarkable),
+        (beyond, remarkable),
         (refused, remarkable),
-        (~refused & ~wrong, max_frames),
-        (refused | wrong, max_frames),
+        (~refused & ~beyond, max_frames),
+        (refused | beyond, max_frames),
     ):
         left = np.setdiff1d(np.flatnonzero(kind), chosen)
         chosen += _evenly_spaced(left, limit - len(chosen))

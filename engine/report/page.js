@@ -54,6 +54,114 @@
     });
   }
 
+  // ---- the charts: one time axis, zoomed by dragging across a chart, by buttons, or by Ctrl and the wheel
+  const charts = [...document.querySelectorAll("svg.chart[data-from]")].map((node) => {
+    const { from, to, left, right } = node.dataset;
+    return { node, left: +left, width: right - left, whole: [+from, +to] };
+  });
+  let span = charts.length ? [...charts[0].whole] : [0, 1];
+  const xOf = (chart, t) => chart.left + ((t - span[0]) / (span[1] - span[0] || 1)) * chart.width;
+  const timeAt = (chart, event) => {
+    const x = new DOMPoint(event.clientX, event.clientY).matrixTransform(chart.node.getScreenCTM().inverse()).x;
+    return span[0] + Math.min(Math.max((x - chart.left) / chart.width, 0), 1) * (span[1] - span[0]);
+  };
+  const ticks = (low, high) => { // round ones, about six, as on the whole axis
+    const rough = (high - low) / 6, power = 10 ** Math.floor(Math.log10(rough));
+    const step = [1, 2, 2.5, 5, 10].map((m) => m * power).find((s) => s >= rough * 0.999);
+    const decimals = Math.min(6, [...Array(12).keys()].find((n) => Math.abs(+step.toFixed(n) - step) < 1e-6 * step));
+    const form = { minimumFractionDigits: decimals, maximumFractionDigits: decimals };
+    const values = [];
+    for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++) values.push(n * step || 0);
+    return values.map((value) => [value, value.toLocaleString("en", form)]);
+  };
+  const relabel = (chart) => {
+    const old = chart.node.querySelector(".x-grid"), [line, text] = [old.querySelector("line"), old.querySelector("text")];
+    const [top, foot, below] = [line.getAttribute("y1"), line.getAttribute("y2"), text.getAttribute("y")];
+    old.replaceChildren(...ticks(...span).flatMap(([value, name], i) => {
+      const x = xOf(chart, value);
+      const label = make("text", { class: `tick${i % 2}`, x, y: below, "text-anchor": "middle" }, SVG);
+      label.textContent = name;
+      return [make("line", { class: "grid", x1: x, x2: x, y1: top, y2: foot }, SVG), label];
+    }));
+  };
+  const lookAt = (low, high) => {
+    if (!charts.length) return;
+    const [first, last] = charts[0].whole, least = (last - first) / 1000;
+    const length = Math.min(Math.max(high - low, least), last - first);
+    const begin = Math.min(Math.max(low, first), last - length);
+    span = [begin, begin + length];
+    for (const chart of charts) {
+      const scale = (last - first || 1) / (length || 1);
+      const shift = chart.left - scale * (chart.left + ((begin - first) / (last - first || 1)) * chart.width);
+      chart.node.querySelector(".data").setAttribute("transform", `translate(${shift} 0) scale(${scale} 1)`);
+      chart.node.classList.toggle("zoomed", length < last - first);
+      if (last > first) relabel(chart);
+      if (frames.length) moveCursor(chart, now().t);
+    }
+    const digits = length < 10 ? 2 : length < 100 ? 1 : 0;
+    at("time-span").textContent = span.map((t) => t.toFixed(digits)).join(" to ");
+  };
+  const zoomTime = (factor, about) =>
+    lookAt(about - (about - span[0]) * factor, about + (span[1] - about) * factor);
+  const moveCursor = (chart, t) => {
+    const cursor = chart.node.querySelector(".cursor"), x = t < span[0] || t > span[1] ? -999 : xOf(chart, t);
+    cursor.setAttribute("x1", x);
+    cursor.setAttribute("x2", x);
+  };
+  const follow = (t) => { // the frame that is shown stays in view
+    const length = span[1] - span[0];
+    if (t < span[0] || t > span[1]) lookAt(t - length / 2, t + length / 2);
+    for (const chart of charts) moveCursor(chart, t);
+  };
+  const chosen = make("rect", { class: "chosen" }, SVG);
+  for (const chart of charts) {
+    let grip = null;
+    const end = () => { grip = null; chosen.remove(); };
+    chart.node.addEventListener("pointerdown", (event) => { grip = [timeAt(chart, event), event.clientX]; });
+    chart.node.addEventListener("pointermove", (event) => {
+      if (!grip || !event.buttons || Math.abs(event.clientX - grip[1]) < 6) return;
+      if (!chart.node.hasPointerCapture(event.pointerId)) chart.node.setPointerCapture(event.pointerId);
+      const [x0, x1] = [grip[0], timeAt(chart, event)].map((t) => xOf(chart, t)).sort((a, b) => a - b);
+      const plot = chart.node.querySelector(".plot");
+      const box = { x: x0, width: x1 - x0, y: plot.getAttribute("y"), height: plot.getAttribute("height") };
+      for (const [key, value] of Object.entries(box)) chosen.setAttribute(key, value);
+      chart.node.append(chosen);
+    });
+    chart.node.addEventListener("pointerup", (event) => {
+      if (!grip) return;
+      const [t0, x0] = grip, t1 = timeAt(chart, event);
+      end();
+      if (Math.abs(event.clientX - x0) >= 6) lookAt(Math.min(t0, t1), Math.max(t0, t1));
+      else if (frames.length) {
+        const far = frames.map((frame) => Math.abs(frame.t - t1));
+        show(far.indexOf(Math.min(...far)));
+      }
+    });
+    chart.node.addEventListener("pointercancel", end);
+    chart.node.addEventListener("dblclick", () => lookAt(...chart.whole));
+    chart.node.addEventListener("wheel", (event) => {
+      if (!event.ctrlKey && !event.metaKey) return;
+      event.preventDefault();
+      zoomTime(event.deltaY < 0 ? 0.8 : 1.25, timeAt(chart, event));
+    }, { passive: false });
+  }
+  if (charts.length) {
+    const middle = () => {
+      const t = now().t;
+      return t >= span[0] && t <= span[1] ? t : (span[0] + span[1]) / 2;
+    };
+    at("time-in").onclick = () => zoomTime(0.5, middle());
+    at("time-out").onclick = () => zoomTime(2, middle());
+    at("time-all").onclick = () => lookAt(...charts[0].whole);
+  }
+
+  // ---- several runs: each may be hidden
+  for (const box of document.querySelectorAll("input[data-run]")) {
+    box.onchange = () => {
+      for (const mark of document.querySelectorAll(`.run${box.dataset.run}`)) mark.classList.toggle("hidden", !box.checked);
+    };
+  }
+
   // ---- the frames
   let current = 0;
   const now = () => frames[current] || {};
@@ -84,13 +192,7 @@
     at("facts").replaceChildren(say("h3", frame.name), say("p", frame.answer, `answer ${frame.kind}`),
       ...(frame.detail ? [say("p", frame.detail, "hint")] : []), facts);
     at("pictures").replaceChildren(...frame.pictures.map(figure));
-    for (const chart of document.querySelectorAll("svg.chart[data-from]")) {
-      const { from, to, left, right } = chart.dataset;
-      const x = +left + ((frame.t - from) / (to - from || 1)) * (right - left);
-      const cursor = chart.querySelector(".cursor");
-      cursor.setAttribute("x1", x);
-      cursor.setAttribute("x2", x);
-    }
+    follow(frame.t);
     if (!map) return;
     at("now").setAttribute("d", frame.xy ? `M${frame.xy.join(" ")}h0` : "");
     const [x, y, width, height] = frame.window || [0, 0, 0, 0];
@@ -119,15 +221,7 @@
         slider.focus({ preventScroll: true });
       };
     }
-    for (const chart of document.querySelectorAll("svg.chart[data-from]")) {
-      chart.addEventListener("click", (event) => {
-        const x = new DOMPoint(event.clientX, event.clientY).matrixTransform(chart.getScreenCTM().inverse()).x;
-        const { from, to, left, right } = chart.dataset;
-        const t = +from + ((x - left) / (right - left)) * (to - from);
-        const far = frames.map((frame) => Math.abs(frame.t - t));
-        show(far.indexOf(Math.min(...far)));
-      });
-    }
-    show(0);
   }
+  if (charts.length) lookAt(...span);
+  if (frames.length) show(0);
 })();

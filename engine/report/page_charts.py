@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from engine.formats.notes import FrameNote
 from engine.formats.track import TrackRow
 from engine.report.charts import ChartArea, Limits, dots
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M
+from engine.report.metrics import FALSE_SIGMAS
 from engine.report.plot_data import TrackPlotData, larger_variance_m2
 
 Array = NDArray[np.float64]
+Chart = tuple[str, str]
+"""Caption and SVG."""
 
 _BINS = 48
 _HEADROOM = 1.08  # upper limit relative to the highest value
@@ -21,7 +23,7 @@ _HEADROOM = 1.08  # upper limit relative to the highest value
 
 def draw_charts(
     rows: Sequence[TrackRow], notes: Sequence[FrameNote] | None, plot_data: TrackPlotData, budget_ms: float | None
-) -> list[tuple[str, str]]:
+) -> list[Chart]:
     """The charts with their captions; those without data are omitted.
 
     Args:
@@ -36,68 +38,93 @@ def draw_charts(
     if not rows:
         return []
     time = (float(plot_data.time[0]), float(plot_data.time[-1]))
-    latency_ms = _column(rows, "latency_ms")
-    charts = [_error(plot_data, time), _answers(rows, notes, plot_data, time)]
+    latency_ms = column(rows, "latency_ms")
+    charts = [_error(plot_data, time), *_in_sigmas(plot_data, time), _answers(rows, notes, plot_data, time)]
     if np.isfinite(plot_data.heights).any():
         charts.append(_height(plot_data, time))
-    if np.isfinite(_column(rows, "score")).any():
+    if np.isfinite(column(rows, "score")).any():
         charts.append(_score(rows, plot_data, time))
     if np.isfinite(latency_ms).any():
         charts += [_latency(latency_ms, plot_data, time, budget_ms), _histogram(latency_ms, budget_ms)]
     return charts
 
 
-def _column(rows: Sequence[TrackRow], name: str) -> Array:
-    return np.array([np.nan if (value := getattr(row, name)) is None else value for row in rows], np.float64)
+def column(records: Sequence[object], name: str) -> Array:
+    """(N,) one attribute of each record; NaN where it is None, or where the record is."""
+    values = (getattr(record, name, None) for record in records)
+    return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
-def _error(plot_data: TrackPlotData, time: Limits) -> tuple[str, str]:
-    """The error with one and three stated sigmas; without truth the sigmas only."""
+def _error(plot_data: TrackPlotData, time: Limits) -> Chart:
+    """The error with one and three stated sigmas as lines; without truth the stated sigma."""
     errors, known = plot_data.errors, np.isfinite(plot_data.errors.distance_m)
     sigma = np.sqrt(larger_variance_m2(errors.covariance_en_m2))
-    stated = np.isfinite(sigma)
-    limits = [0.5]
-    if stated.any():
-        limits.append(1.15 * FALSE_SIGMAS * float(np.percentile(sigma[stated], 90)))
-    if known.any():
-        limits.append(1.2 * float(np.percentile(errors.distance_m[known], 97)))
-    area = ChartArea(time, (0.0, max(limits)))
-    zero = np.zeros_like(sigma)
-    wrong = np.where(errors.distance_m > WRONG_M, errors.distance_m, np.nan)
+    stated = sigma[np.isfinite(sigma)]
+    if not known.any():
+        top = 1.2 * float(np.percentile(stated, 98)) if stated.size else 1.0
+        area = ChartArea(time, (0.0, max(top, 0.5)))
+        what = "Stated sigma (m)"
+        marks = [area.dots(plot_data.time, sigma, "fix"), area.overflow(plot_data.time, sigma, "over")]
+        return what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True)
+    typical = float(np.percentile(errors.distance_m[known], 97))
+    # Three sigmas are in view, unless they would flatten the errors.
+    shown = 1.1 * FALSE_SIGMAS * float(np.percentile(stated, 90)) if stated.size else 0.0
+    area = ChartArea(time, (0.0, max(1.3 * typical, min(shown, 5.0 * typical), 0.1)))
+    beyond = np.where(errors.beyond, errors.distance_m, np.nan)
+    lines = [
+        area.line(plot_data.time, np.where(factor * sigma <= area.y_limits[1], factor * sigma, np.nan), kind)
+        for factor, kind in ((FALSE_SIGMAS, "sigmas"), (1.0, "sigma"))
+    ]
     marks = [
-        area.band(plot_data.time, zero, FALSE_SIGMAS * sigma, "sigmas"),
-        area.band(plot_data.time, zero, sigma, "sigma"),
-        area.horizontal(WRONG_M, "limit", f"wrong above {WRONG_M:g} m"),
+        *lines,
         area.dots(plot_data.time, errors.distance_m, "fix"),
-        area.dots(plot_data.time, wrong, "wrong"),
+        area.dots(plot_data.time, beyond, "beyond"),
         area.overflow(plot_data.time, errors.distance_m, "over"),
     ]
-    what = (
-        "Horizontal error (m), on one and three stated sigmas"
-        if known.any()
-        else "Stated sigma (m), one and three"
-    )
+    what = "Horizontal error (m)"
+    if all(lines):
+        what += ", with one and three stated sigmas (lines)"
+    elif stated.size:
+        what += ", with its stated sigma (line)" if any(lines) else f"; stated sigma {np.median(stated):.1f} m"
     return what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True)
+
+
+def _in_sigmas(plot_data: TrackPlotData, time: Limits) -> list[Chart]:
+    """The error in units of the sigma that the fix states in its direction."""
+    sigmas = np.sqrt(plot_data.errors.normalised_squared_errors)
+    known = sigmas[np.isfinite(sigmas)]
+    if not known.size:
+        return []
+    area = ChartArea(time, (0.0, max(1.25 * FALSE_SIGMAS, 1.2 * float(np.percentile(known, 97)))))
+    beyond = plot_data.errors.beyond
+    marks = [
+        area.dots(plot_data.time[~beyond], sigmas[~beyond], "fix"),
+        area.dots(plot_data.time[beyond], sigmas[beyond], "beyond"),
+        area.overflow(plot_data.time, sigmas, "over"),
+    ]
+    fixed = [area.horizontal(FALSE_SIGMAS, "limit", f"{FALSE_SIGMAS:g} sigma")]
+    what = "Horizontal error, in stated sigmas"
+    return [(what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True, fixed=fixed))]
 
 
 def _answers(
     rows: Sequence[TrackRow], notes: Sequence[FrameNote] | None, plot_data: TrackPlotData, time: Limits
-) -> tuple[str, str]:
+) -> Chart:
     """Fix or reason of refusal of each frame, over the state of the navigator."""
     kinds = ["fix", *sorted({row.reason or "unknown" for row in rows if not row.fixed})]
     level = np.array([kinds.index("fix" if row.fixed else row.reason or "unknown") for row in rows], np.float64)
     area = ChartArea(time, (len(kinds) - 0.5, -0.5), left=150.0)
     fixed = np.array([row.fixed for row in rows])
-    wrong = plot_data.errors.distance_m > WRONG_M
+    beyond = plot_data.errors.beyond
     marks = [area.strip(plot_data.time, [note.state for note in notes])] if notes else []
-    for kind, chosen in (("refused", ~fixed), ("fix", fixed & ~wrong), ("wrong", wrong)):
+    for kind, chosen in (("refused", ~fixed), ("fix", fixed & ~beyond), ("beyond", beyond)):
         marks.append(dots(area.points(plot_data.time[chosen], level[chosen]), kind))
     names = [kind.replace("_", " ") for kind in kinds]
     chart = area.svg("Answers over time", plot_data.time_label, marks, rows=names, timed=True)
     return "Answers, over the state of the navigator" if notes else "Answers", chart
 
 
-def _height(plot_data: TrackPlotData, time: Limits) -> tuple[str, str]:
+def _height(plot_data: TrackPlotData, time: Limits) -> Chart:
     measured, true = plot_data.heights.T
     known = plot_data.heights[np.isfinite(plot_data.heights)]
     low, high = np.percentile(known, [1, 99])
@@ -110,8 +137,8 @@ def _height(plot_data: TrackPlotData, time: Limits) -> tuple[str, str]:
     return what, area.svg(what, plot_data.time_label, marks, timed=True)
 
 
-def _score(rows: Sequence[TrackRow], plot_data: TrackPlotData, time: Limits) -> tuple[str, str]:
-    score, methods = _column(rows, "score"), [row.method for row in rows]
+def _score(rows: Sequence[TrackRow], plot_data: TrackPlotData, time: Limits) -> Chart:
+    score, methods = column(rows, "score"), [row.method for row in rows]
     area = ChartArea(time, (min(0.0, float(np.nanmin(score))), 1.0))
     fixed = np.array([row.fixed for row in rows])
     sift = np.array([method in ("sift", "learned") for method in methods])
@@ -124,19 +151,17 @@ def _score(rows: Sequence[TrackRow], plot_data: TrackPlotData, time: Limits) -> 
     return what, area.svg(what, plot_data.time_label, marks, timed=True)
 
 
-def _latency(
-    latency_ms: Array, plot_data: TrackPlotData, time: Limits, budget_ms: float | None
-) -> tuple[str, str]:
+def _latency(latency_ms: Array, plot_data: TrackPlotData, time: Limits, budget_ms: float | None) -> Chart:
     area = ChartArea(time, (0.0, _top_ms(latency_ms, budget_ms)))
     marks = [
         area.dots(plot_data.time, latency_ms, "fix"),
         area.overflow(plot_data.time, latency_ms, "over"),
-        "" if budget_ms is None else area.horizontal(budget_ms, "limit", f"budget {budget_ms:g} ms"),
     ]
-    return "Latency (ms)", area.svg("Latency over time", plot_data.time_label, marks, timed=True)
+    fixed = [] if budget_ms is None else [area.horizontal(budget_ms, "limit", f"budget {budget_ms:g} ms")]
+    return "Latency (ms)", area.svg("Latency over time", plot_data.time_label, marks, timed=True, fixed=fixed)
 
 
-def _histogram(latency_ms: Array, budget_ms: float | None) -> tuple[str, str]:
+def _histogram(latency_ms: Array, budget_ms: float | None) -> Chart:
     known = latency_ms[np.isfinite(latency_ms)]
     top = _top_ms(latency_ms, budget_ms)
     counts, edges = np.histogram(np.minimum(known, np.nextafter(top, 0.0)), bins=_BINS, range=(0.0, top))

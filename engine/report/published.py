@@ -43,6 +43,15 @@ PUBLISHED: dict[str, tuple[PublishedResult, ...]] = {
             "the authors' baseline", "all", "74.1 % within 5 m", "-", "https://arxiv.org/abs/2503.10692"
         ),
     ),
+    "OrthoLoC": (
+        PublishedResult(
+            "Mast3R on a demonstration sample",
+            "1",
+            "1 (100 %)",
+            "1.36 m, of the pose in the README",
+            "https://github.com/deepscenario/OrthoLoC",
+        ),
+    ),
 }
 """Published results by data set, as its reader names it."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,6 +30,7 @@ MEANINGS = {
 
 # Of honest fixes 1 % lie beyond three sigmas, and the mean NEES is 2.
 _BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
+_CAUTIOUS = 2.0  # sigmas so many times the errors are said to be
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,19 +82,27 @@ def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float 
         spread += f" ({summary['scored_fixes']} of {fixes} fixes have a truth)"
     if summary["false_fixes"]:
         false = _count(summary["false_fixes"], "fix is", "fixes are")
-        text = f"{false} false: more than {WRONG_M:g} m off and beyond three of their own sigmas"
+        text = f"{false} false: beyond three of their own sigmas and more than {WRONG_M:g} m off"
         return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
     beyond, nees = summary["beyond_3_sigma"], summary["nees_mean"]
-    if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or (nees is not None and nees > _MOST_NEES):
+    if nees is None:
+        return Verdict("mixed", f"{fixed}, without a covariance to judge them by; {spread}.", late)
+    if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or nees > _MOST_NEES:
         text = f"{beyond} of {summary['scored_fixes']} fixes are off by more than three of their own sigmas"
         text += f" (mean NEES {nees:.0f}, 2 is expected): something is off by more than it states"
         return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
-    if summary["wrong_over_10m"]:
-        wrong = _count(summary["wrong_over_10m"], "of them is", "of them are")
-        text = f"{fixed}; {wrong} more than {WRONG_M:g} m off, though within what the stated sigma allows"
-        return Verdict("mixed", f"{text}; {spread}.", late)
     grade = "good" if fixes >= 0.9 * frames and not summary["deadlines_missed"] else "mixed"
-    return Verdict(grade, f"{fixed}, none of them wrong; {spread}.", late)
+    within = "all" if not beyond else f"all but {beyond}"
+    text = f"{fixed}, {within} within three of their own sigmas; {spread}.{_caution(nees)}"
+    return Verdict(grade, text, late)
+
+
+def _caution(nees: float) -> str:
+    """A sentence on sigmas that are much larger than the errors; empty where they fit."""
+    factor = math.sqrt(2.0 / max(nees, 1e-6))
+    if factor < _CAUTIOUS:
+        return ""
+    return f" The stated sigmas are cautious: about {factor:.0f} times what the errors show."
 
 
 def _latency(summary: Mapping[str, Any], budget_ms: float | None) -> str:

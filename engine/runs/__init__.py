@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from engine.runs.mavlink_parameters import write_parameter_file
     from engine.runs.progress import Progress
+    from engine.runs.reporting import report
     from engine.runs.ros_bridge import RosSettings, run_ros_bridge
     from engine.runs.settings import TrackSettings, load_settings
     from engine.runs.simulation import WorldSettings, simulate
@@ -76,6 +77,7 @@ __all__ = [
     "load_settings",
     "locate_image",
     "parse_runs",
+    "report",
     "run_campaign",
     "run_demo",
     "run_mavlink_bridge",
@@ -103,6 +105,7 @@ _NAMES = {
     "engine.runs.mavlink_bridge": "BridgeFiles BridgeSettings MavlinkSettings run_mavlink_bridge",
     "engine.runs.mavlink_parameters": "write_parameter_file",
     "engine.runs.progress": "Progress",
+    "engine.runs.reporting": "report",
     "engine.runs.ros_bridge": "RosSettings run_ros_bridge",
     "engine.runs.settings": "TrackSettings load_settings",
     "engine.runs.simulation": "WorldSettings simulate",

@@ -12,22 +12,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from engine.camera import Camera
-from engine.errors import OptionError
+from engine.errors import OptionError, require
 from engine.formats.flight import write_flight_folder
-from engine.formats.track import TrackRow, read_track, track_row, write_track
-from engine.formats.truth import read_truth
+from engine.formats.notes import frame_note, write_notes
+from engine.formats.track import track_row, write_track
 from engine.matcher import SceneMatcher
 from engine.methods import CLASSICAL
+from engine.navigator_state import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
-from engine.report.figures import draw_figures
-from engine.report.metrics import Ground, summarise
 from engine.runs.arguments import check_choice, check_device
+from engine.runs.evaluation import redraw
 from engine.runs.folders import StrPath, check_folder, prepare_folder
 from engine.runs.inputs import FOLDER_LAYOUT
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
 from engine.runs.progress import SILENT, Progress
-from engine.runs.results import SUMMARY, TRACK
+from engine.runs.record import RunRecord
+from engine.runs.results import LOOP, NOTES, SUMMARY, TRACK
 from engine.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
 from engine.sim import FlightStyle, Town, picture_at
 from engine.sim.faults import FAULT_KINDS, Fault
@@ -103,7 +104,11 @@ def fly_closed_loop(
 
     Returns:
         The figures, as loop.json has them.
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the plots, is not installed.
     """
+    require("matplotlib", "desk")
     out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
     if world.camera_pitch_deg != NADIR_PITCH_DEG:
         raise OptionError(f"camera_pitch_deg: expected none in a closed loop, got {world.camera_pitch_deg:g}")
@@ -122,38 +127,32 @@ def fly_closed_loop(
         frames = progress.track(_fly(flight, seconds, view), count, "flying")
         _write_folder(out, frames, flight, town, camera, site)
     record = _record(out, world, loop, site, town, str(matcher.device))
-    return _write_results(out, flight, site, record)
+    return _write_results(out, flight, record, progress)
 
 
-def _write_results(out: Path, flight: ClosedLoop, site: OrthoMap, record: dict[str, Any]) -> dict[str, Any]:
-    """Track, record, figures of merit and plots of a flight that was flown."""
+def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
+    """Track, record, figures of merit, plots and report of a flight that was flown."""
     flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
-    rows = [
-        track_row(_name(k), answer.result, latency_ms=latency_ms, deadline_met=None)
-        for k, answer in enumerate(flown.answers)
-    ]
+    answers = [(_name(k), answer) for k, answer in enumerate(flown.answers)]
+    rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
     write_track(out / TRACK, rows)
-    rows = read_track(out / TRACK)  # as they stand in the file, so that evaluate gives the same figures
-    write_loop_csv(out / "loop.csv", flown)
+    states = [NavigatorState.LOST if answer.state is None else answer.state for _, answer in answers]
+    notes = [frame_note(name, a.result, state.value) for (name, a), state in zip(answers, states, strict=True)]
+    write_notes(out / NOTES, notes)
+    write_loop_csv(out / LOOP, flown)
+    (out / SUMMARY).write_text(json.dumps({"settings": record.facts()}), encoding="utf-8")
+    summary = redraw(out, progress=progress)  # as any finished track, so that evaluate gives the same
     figures = summarise_loop(flown)
-    summary = _summarise(out, rows, site, record)
     figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
-    (out / "loop.json").write_text(json.dumps(figures | {"settings": record}, indent=2) + "\n", encoding="utf-8")
-    scene, fault = record["scene"], flight.fault
+    (out / "loop.json").write_text(
+        json.dumps(figures | {"settings": record.facts()}, indent=2) + "\n", encoding="utf-8"
+    )
+    scene, fault = record.more["scene"], flight.fault
     day = scene["condition"] or "noon"
-    title = f"closed loop, seed {scene['seed']}, {day}, {record['method']}, fault: {fault.kind}"
+    title = f"closed loop, seed {scene['seed']}, {day}, {record.method}, fault: {fault.kind}"
     title += f"\ntrue track {figures['plan_rms_m']:.2f} m RMS from the plan"
     draw_loop(out, flown, title, fault)
     return figures | {"folder": str(out.resolve())}
-
-
-def _summarise(out: Path, rows: list[TrackRow], site: OrthoMap, record: dict[str, Any]) -> dict[str, Any]:
-    """Write summary.json and the figures of the track, as ``track`` does."""
-    truth, ground = read_truth(out / "truth.csv"), Ground(record["ground_m"], record["ground_amsl_m"])
-    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record}
-    (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    draw_figures(out, rows, truth, site=site, title=f"{record['method']}, closed loop", ground=ground)
-    return summary
 
 
 def plan_closed_loop(
@@ -235,16 +234,16 @@ def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Trut
 
 def _record(
     out: Path, world: WorldSettings, loop: ClosedLoopSettings, site: OrthoMap, town: Town, device: str
-) -> dict[str, Any]:
-    """What a run was made of, in the words of ``track``, so that ``evaluate`` reads it."""
-    files = {name: str((out / file).resolve()) for name, file in FOLDER_LAYOUT.items()}
-    return files | {
-        "method": loop.method,
-        "profile": "engine",
-        "device": device,
-        "origin": {"lat_deg": site.frame.lat_deg, "lon_deg": site.frame.lon_deg},
-        "ground_m": site.ground_m,
-        "ground_amsl_m": town.datum_amsl_m + site.ground_m,
-        "scene": world.facts(),
-        "closed_loop": {"minutes": loop.minutes, "fault": loop.fault},
-    }
+) -> RunRecord:
+    """What a run was made of, as ``track`` records it, so that ``evaluate`` reads it."""
+    files: dict[str, Any] = {name: str((out / file).resolve()) for name, file in FOLDER_LAYOUT.items()}
+    return RunRecord(
+        **files,
+        method=loop.method,
+        profile="engine",
+        device=device,
+        origin={"lat_deg": site.frame.lat_deg, "lon_deg": site.frame.lon_deg},
+        ground_m=site.ground_m,
+        ground_amsl_m=town.datum_amsl_m + site.ground_m,
+        more={"scene": world.facts(), "closed_loop": {"minutes": loop.minutes, "fault": loop.fault}},
+    )

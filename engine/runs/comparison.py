@@ -7,14 +7,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from engine.errors import OptionError
+from engine.errors import OptionError, require
 from engine.formats.logs.readers import open_truth
 from engine.formats.track import read_track
 from engine.methods import METHODS
 from engine.report.comparison import draw_comparison
+from engine.report.runs_page import MAX_RUNS
 from engine.runs.folders import StrPath, check_folder, prepare_folder
 from engine.runs.inputs import FlightFiles, open_inputs
 from engine.runs.progress import SILENT, Progress
+from engine.runs.reporting import COMPARISON, draw_together
 from engine.runs.results import TRACK
 from engine.runs.settings import TrackSettings, load_settings
 from engine.runs.tracking import track
@@ -53,7 +55,7 @@ def _parse_run(text: str, weights: Sequence[StrPath], overrides: Mapping[str, An
     method, slash, profile = text.partition("/")
     weights = weights if method == "learned" else ()
     if method in METHODS and not Path(text).is_file():
-        chosen = {"method": method, "profile": profile} if slash else {"method": method}
+        chosen: dict[str, Any] = {"method": method, "profile": profile} if slash else {"method": method}
         return text.replace("/", "-"), load_settings(None, weights=weights, **overrides, **chosen)
     if not Path(text).is_file():
         raise OptionError(
@@ -84,13 +86,17 @@ def compare(
 
     Returns:
         The summaries by name, which ``table.json`` holds too.
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the chart, is not installed.
     """
+    require("matplotlib", "desk")
     out, runs = Path(out), parse_runs() if runs is None else runs
     check_folder(out, force)
     for name in runs:
         check_folder(out / name, force)
     inputs = open_inputs(files, list(runs.values()), progress=progress)
-    prepare_folder(out, force, (TABLE, CHART))
+    prepare_folder(out, force, (TABLE, CHART, COMPARISON))
     results = {
         name: track(files, out / name, settings, force=force, inputs=inputs, diagnosis=False, progress=progress)
         for name, settings in runs.items()
@@ -101,4 +107,6 @@ def compare(
     first = next(iter(tracks.values()))
     truth = open_truth(path, first[0].timestamp_ns if first else None) if path is not None else None
     draw_comparison(out / CHART, tracks, truth)
+    if 2 <= len(runs) <= MAX_RUNS:
+        draw_together(out / COMPARISON, {name: out / name for name in runs}, progress=progress)
     return results

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from engine.errors import require
 from engine.runs.arguments import check_device
 from engine.runs.comparison import CHART, TABLE, compare, parse_runs
 from engine.runs.folders import StrPath, check_folder, prepare_folder
@@ -38,7 +39,11 @@ def run_demo(
 
     Returns:
         The summaries by the name of their run, such as "ncc-paper".
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the chart, is not installed.
     """
+    require("matplotlib", "desk")
     out = Path(out)
     check_device(device)
     check_folder(out, force)

@@ -37,20 +37,44 @@ def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progres
         TelemetryError: the folder holds no finished track, or no truth is known.
     """
     folder = Path(folder)
+    read_track(folder / TRACK)  # what is wrong with it is said first
+    if truth is None and read_record(folder / SUMMARY).truth is None:
+        raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
+    return redraw(folder, truth, progress=progress)
+
+
+def redraw(folder: Path, truth: StrPath | None = None, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Write the results of a finished run again, by its own record.
+
+    Args:
+        folder: of the run.
+        truth: in place of the one that the run had.
+        progress: is shown what the run does.
+
+    Returns:
+        The summary.
+
+    Raises:
+        TelemetryError: the folder holds no finished track.
+    """
     rows = read_track(folder / TRACK)
     record = read_record(folder / SUMMARY)
     path = record.truth if truth is None else truth
-    if path is None:
-        raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
-    truth_rows = open_truth(Path(path), rows[0].timestamp_ns if rows else None)
-    site = open_map(
+    truth_rows = None if path is None else open_truth(Path(path), rows[0].timestamp_ns if rows else None)
+    site = open_recorded_map(record, progress)
+    ground = Ground(record.ground_m, record.ground_amsl_m)
+    frames = _report_frames(record, rows, site)
+    if path is not None:
+        record = replace(record, truth=str(Path(path).resolve()))
+    return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
+
+
+def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:
+    """The map of a finished run."""
+    return open_map(
         record.map, record.surface, record.map_sigma_m, bounds=record.map_bounds, crs=record.map_crs,
         progress=progress,
     )  # fmt: skip
-    ground = Ground(record.ground_m, record.ground_amsl_m)
-    frames = _report_frames(record, rows, site)
-    record = replace(record, truth=str(Path(path).resolve()))
-    return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
 
 
 def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> ReportFrames:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from engine.device import set_threads
 from engine.errors import EngineError, TelemetryError
 from engine.report.campaign import are_valid_figures, are_valid_latencies
 from engine.runs.inputs import FlightFiles
@@ -20,6 +19,7 @@ from engine.runs.progress import Progress
 from engine.runs.settings import TrackSettings
 from engine.runs.simulation import WorldSettings, simulate
 from engine.runs.tracking import track
+from engine.threads import set_threads
 
 RESULT, LOG = "result.json", "log.txt"
 _TIMES = ("latency_ms", "deadlines_missed", "settings")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from engine.errors import BackendError, OptionError, require
 from engine.matcher import SceneMatcher
 from engine.navigator import Navigator
+from engine.navigator_options import NavigatorOptions
 from engine.runs.folders import StrPath
 from engine.values import Prior
 
@@ -102,16 +103,17 @@ def open_view(matcher: SceneMatcher, target: LiveViewTarget) -> Iterator[LiveVie
 
 @contextmanager
 def open_bridge_view(
-    matcher: SceneMatcher, target: LiveViewTarget
+    matcher: SceneMatcher, target: LiveViewTarget, options: NavigatorOptions | None = None
 ) -> Iterator[tuple[Callable[[Prior | None], Navigator], Watcher | None]]:
     """The live view of a bridge, whose answers do not wait for it: what creates its navigators, and the view."""
+    make = partial(Navigator, matcher, options=options)
     if not target:
-        yield partial(Navigator, matcher), None
+        yield make, None
         return
     from engine.report.live_view import Watcher
 
     watcher = Watcher(target.open(matcher))
     try:
-        yield lambda prior: watcher.follow(Navigator(matcher, prior)), watcher
+        yield lambda prior: watcher.follow(make(prior)), watcher
     finally:
         watcher.close()

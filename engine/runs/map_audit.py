@@ -14,7 +14,7 @@ from engine.audit.availability import Audit, RouteAvailability, gather, predict_
 from engine.audit.plan import AuditOptions, AuditPlan, MapPart, plan_audit
 from engine.audit.self_match import SelfMatchStatistics, measure_self_match
 from engine.camera import Camera
-from engine.errors import OptionError
+from engine.errors import OptionError, require
 from engine.formats.geotiff import write_geotiff
 from engine.formats.route import read_route
 from engine.orthomap import SEARCH_LIMIT_PX, OrthoMap
@@ -94,7 +94,9 @@ def audit_map(
     Raises:
         OptionError: an argument is out of its range, or beside the map.
         MapError, CalibrationError, TelemetryError: a file cannot be read.
+        MissingExtraError: matplotlib, which draws the picture, is not installed.
     """
+    require("matplotlib", "desk")
     out = Path(out)
     check_folder(out, force)
     plan, waypoints = _plan(files, prior_sigma_m, progress)

@@ -23,6 +23,7 @@ from engine.live import LiveOptions
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
 from engine.methods.options import MatcherOptions
+from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.realtime import Realtime, check_realtime, set_realtime
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
@@ -33,6 +34,7 @@ from engine.runs.inputs import open_map
 from engine.runs.last_fix import LastFix, last_fix_file
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
+from engine.runs.service import running_service
 from engine.runs.settings import with_weights
 from engine.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
@@ -215,6 +217,7 @@ class BridgeSettings:
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
         seconds: ends after this time; None ends with the pictures.
+        odometry: whether pictures are followed from one to the next where there is no velocity.
         realtime: how the threads that match are scheduled; None is as usual.
 
     Raises:
@@ -229,6 +232,7 @@ class BridgeSettings:
     start: str | None = None
     deadline_ms: float | None = None
     seconds: float | None = None
+    odometry: bool = False
     realtime: Realtime | None = None
 
     def __post_init__(self) -> None:
@@ -242,6 +246,10 @@ class BridgeSettings:
     def matcher_options(self) -> MatcherOptions:
         """What of it is the matcher's."""
         return MatcherOptions(learned=with_weights(self.method, self.weights))
+
+    def navigator_options(self) -> NavigatorOptions:
+        """What of it is the navigator's."""
+        return NavigatorOptions(odometry=self.odometry)
 
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, with the one that counts where none was set."""
@@ -305,8 +313,8 @@ def run_mavlink_bridge(
 
     end_on_sigterm()
     # Before the link: an autopilot on the bench takes off when the bridge listens.
-    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress))
-    with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
+    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
+    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
@@ -320,8 +328,8 @@ def run_mavlink_bridge(
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
             # Ctrl-C is the usual end beside a camera, and no reason to lose the counts.
-            with closing(pictures), suppress(KeyboardInterrupt):
-                _run(bridge, pictures, camera, settings.seconds, progress)
+            with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
+                _run(bridge, pictures, camera, settings.seconds, progress, beat)
             if files.camera_source is not None:
                 remember_delay(bridge.status.least_age_ms)
             return bridge.status
@@ -356,6 +364,7 @@ def _run(
     camera: Camera,
     seconds: float | None,
     progress: Progress,
+    beat: Callable[[], None],
 ) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
     begin = reported = time.monotonic()
@@ -364,6 +373,7 @@ def _run(
         if picture is not None:
             count += 1
             _submit(bridge, picture, camera, count)
+        beat()
         now = time.monotonic()
         if now - reported >= _MESSAGE_PERIOD_S:
             reported = now
@@ -384,12 +394,13 @@ def _submit(bridge: MavlinkBridge, picture: CapturedImage, camera: Camera, numbe
     bridge.submit(image, captured_ns)
 
 
-def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress) -> None:
+def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress, beat: Callable[[], None]) -> None:
     """A flight that is played begins with the autopilot's: where it was earlier is not known."""
     if not bridge.connected:
         progress.message(f"the pictures wait for the autopilot, {_AUTOPILOT_TIMEOUT_S:g} s at most")
     until = time.monotonic() + _AUTOPILOT_TIMEOUT_S
     while not bridge.connected and time.monotonic() < until:
+        beat()
         time.sleep(0.002)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.errors import EngineError
+from engine.errors import EngineError, MissingExtraError, require
 from engine.formats.flight import Flight
 from engine.formats.notes import read_notes
 from engine.formats.track import TrackRow
@@ -15,13 +15,18 @@ from engine.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.report.explain import choose_frames, explain_frames
 from engine.report.figures import draw_figures
-from engine.report.metrics import Ground, summarise
-from engine.report.page import FinishedTrack, write_page
+from engine.report.finished_track import FinishedTrack
+from engine.report.loop_record import read_loop_csv
+from engine.report.metrics import Ground, errors_en_m, summarise
+from engine.report.page import write_page
+from engine.report.segments import segment_errors
 from engine.runs.progress import SILENT, Progress
 from engine.runs.record import RunRecord
 from engine.values import Truth
 
 TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"
+LOOP = "loop.csv"
+"""Of a closed loop, beside its track."""
 FIGURES = ("path.png", "position.png", "height.png", "error.png")
 OWNED = (TRACK, SUMMARY, NOTES, PAGE, *FIGURES)
 """The files of an output folder."""
@@ -48,8 +53,13 @@ def write_results(
     report: bool = True,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones."""
-    summary = summarise(rows, truth, frame=site.frame, ground=ground) | {"settings": record.facts()}
+    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones.
+
+    The figures are left out where matplotlib is not installed, as on a vehicle: no track is lost for them.
+    """
+    summary = summarise(rows, truth, frame=site.frame, ground=ground)
+    segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
+    summary |= segments | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         progress.message(f"no fix is scored: {record.truth} says nothing of the times of this flight")
     (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -58,10 +68,29 @@ def write_results(
     for name in FIGURES:
         (out / name).unlink(missing_ok=True)
     title = f"{record.method} ({record.profile} profile)"
-    draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
-    notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
-    _write_page(out / PAGE, FinishedTrack(rows, truth, site, ground, summary, notes), frames)
+    try:
+        require("matplotlib", "desk")
+        draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
+    except MissingExtraError as error:
+        progress.message(f"no plots are drawn: {error}")
+    _write_page(out / PAGE, finished_track(out, rows, truth, site, ground, summary, frames), frames)
     return summary
+
+
+def finished_track(
+    out: Path,
+    rows: list[TrackRow],
+    truth: list[Truth] | None,
+    site: OrthoMap,
+    ground: Ground,
+    summary: dict[str, Any],
+    frames: ReportFrames,
+) -> FinishedTrack:
+    """A finished track with what its folder holds beside it."""
+    notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
+    loop = read_loop_csv(out / LOOP) if (out / LOOP).is_file() else None
+    telemetry = None if frames.flight is None else frames.flight.rows
+    return FinishedTrack(rows, truth, site, ground, summary, notes, telemetry, loop)
 
 
 def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:

@@ -21,6 +21,7 @@ from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.mavlink_bridge import BridgeSettings
 from engine.runs.progress import SILENT, Progress
+from engine.runs.service import running_service
 
 _CAMERA_INFO_TIMEOUT_S = 30.0
 
@@ -127,13 +128,19 @@ def run_ros_bridge(
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
-    with open_bridge_view(matcher, live_view) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
-            node.spin(bridge.handlers(ros.topics), bridge.check_input, settings.seconds)
+            with running_service() as beat:
+
+                def every_second() -> None:
+                    bridge.check_input()
+                    beat()
+
+                node.spin(bridge.handlers(ros.topics), every_second, settings.seconds)
         finally:
             bridge.close()
     return bridge.status

@@ -56,6 +56,8 @@ class TrackSettings:
         check_choice("profile", self.profile, PROFILES)
         if self.profile == "paper" and self.method not in ("ncc", "sift"):
             raise OptionError(f"method: expected ncc or sift with `profile` paper, got {self.method!r}")
+        if self.profile == "paper" and self.navigator.odometry:
+            raise OptionError("odometry: expected with `profile` engine, got profile 'paper'")
         self._check_columns()
         parse_position("start", self.start)
         parse_budget("budget_ms", self.budget_ms)
@@ -72,12 +74,15 @@ class TrackSettings:
         return MatcherOptions(profile=self.profile, ncc=self.ncc, sift=self.sift, learned=self.learned)
 
 
-def load_settings(path: StrPath | None, *, weights: Sequence[StrPath] = (), **overrides: Any) -> TrackSettings:
+def load_settings(
+    path: StrPath | None, *, weights: Sequence[StrPath] = (), odometry: bool = False, **overrides: Any
+) -> TrackSettings:
     """The settings of a file, or the defaults, with what overrides them.
 
     Args:
         path: a TOML file as ``scenematch init`` writes it; None is the defaults.
         weights: files of the learned method, in place of those of the settings file.
+        odometry: whether pictures are followed where there is no velocity, whatever the file says.
         overrides: settings by name that count more than the file; None is none.
 
     Raises:
@@ -85,6 +90,8 @@ def load_settings(path: StrPath | None, *, weights: Sequence[StrPath] = (), **ov
     """
     settings = TrackSettings() if path is None else read_settings(Path(path), TrackSettings)
     settings = replace(settings, **{name: value for name, value in overrides.items() if value is not None})
+    if odometry:
+        settings = replace(settings, navigator=replace(settings.navigator, odometry=True))
     if not weights:
         return settings
     return replace(settings, learned=with_weights(settings.method, weights, settings.learned))

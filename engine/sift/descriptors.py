@@ -11,13 +11,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from engine import device
+from engine import threads
 from engine.sift.keypoints import Points
 from engine.sift.scale_space import ScaleSpacePlan
+from engine.tensors import Tensor, torch
 
 AnyArray = NDArray[Any]
 
@@ -161,8 +160,8 @@ def _in_parts(work: Callable[..., AnyArray], points: Points, plan: ScaleSpacePla
     where = torch.stack([points.octave, points.image, points.level], dim=1).numpy()
     positions = torch.stack([points.x, points.y, points.growth * plan.first_sigma], dim=1).numpy()
     rows = [where, positions, *(column.numpy() for column in columns)]
-    parts = device.parts(len(where), len(where) // _POINTS_PER_THREAD)
-    done = device.in_parallel(lambda part: work(*(row[part[0] : part[1]] for row in rows)), parts)
+    parts = threads.parts(len(where), len(where) // _POINTS_PER_THREAD)
+    done = threads.in_parallel(lambda part: work(*(row[part[0] : part[1]] for row in rows)), parts)
     return torch.from_numpy(np.concatenate(done))
 
 

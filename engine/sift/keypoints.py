@@ -9,12 +9,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from engine import device
+from engine import threads
 from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan, gaussian_levels, reach_px
+from engine.tensors import Tensor, torch
 
 AnyArray = NDArray[Any]
 
@@ -129,8 +128,8 @@ def _voxels_compiled(
     def work(part: tuple[int, int]) -> Any:
         return find_extrema(source, across, down, buffer, layout, part, _BORDER, np.float32(threshold))
 
-    parts = device.parts(octave.height, octave.height * octave.width // _PART_PX)
-    return np.concatenate(device.in_parallel(work, parts))
+    parts = threads.parts(octave.height, octave.height * octave.width // _PART_PX)
+    return np.concatenate(threads.in_parallel(work, parts))
 
 
 _local = threading.local()

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import torch
-from torch import Tensor
+
+from engine.tensors import Tensor, torch
 
 SCALES = 3  # DoG levels searched per octave, Lowe's s
 _LEVELS = SCALES + 3  # Gaussian levels per octave

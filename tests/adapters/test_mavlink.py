@@ -41,7 +41,7 @@ from engine.adapters.mavlink_out import (
     withhold_reason,
 )
 from engine.adapters.mavlink_status import MIN_RATE_HZ
-from engine.adapters.packets import PacketDecoder, PacketEncoder, read_key, signing_time
+from engine.adapters.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder, read_key, signing_time
 from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import replay
 from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
@@ -305,6 +305,64 @@ def heard(*messages, start_ns=10_000_000_000):
     for i, message in enumerate(messages):
         telemetry.update(message, start_ns + i * 1_000_000)
     return telemetry.vehicle(start_ns)
+
+
+def from_camera(message, component=197):
+    """A message as it comes over the wire from another component of the vehicle."""
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=component)
+    return mavlink.MAVLink(None).parse_char(message.pack(sender))
+
+
+def speed_estimate(*ned_mps, variance=math.nan):
+    covariance = [variance, 0, 0, 0, variance, 0, 0, 0, variance]
+    return mavlink.MAVLink_vision_speed_estimate_message(1, *ned_mps, covariance)
+
+
+def odometry(*velocity_mps, frame=mavlink.MAV_FRAME_BODY_FRD, variance=0.04, by=mavlink.MAV_ESTIMATOR_TYPE_VIO,
+             quality=80):  # fmt: skip
+    covariance = [math.nan] * 21
+    covariance[0] = covariance[6] = covariance[11] = variance
+    local, whole = mavlink.MAV_FRAME_LOCAL_FRD, [1.0, 0.0, 0.0, 0.0]
+    return mavlink.MAVLink_odometry_message(
+        1, local, frame, 0, 0, 0, whole, *velocity_mps, 0, 0, 0, [math.nan] * 21, covariance, 0, by, quality
+    )
+
+
+TO_THE_WEST = mavlink.MAVLink_attitude_message(5000, 0, 0, -math.pi / 2, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "east_north_up", "sigma_mps"),
+    [
+        (speed_estimate(3.0, -4.0, 0.5), (-4.0, 3.0, -0.5), None),
+        (speed_estimate(3.0, -4.0, 0.5, variance=0.09), (-4.0, 3.0, -0.5), 0.3),
+        (odometry(2.0, 1.0, 0.0), (-2.0, 1.0, 0.0), 0.2),
+        (odometry(2.0, 1.0, -0.25, frame=mavlink.MAV_FRAME_LOCAL_NED, variance=math.nan), (1.0, 2.0, 0.25), None),
+    ],
+)
+def test_a_velocity_by_another_camera_counts_more_than_the_autopilots(message, east_north_up, sigma_mps):
+    own = mavlink.MAVLink_local_position_ned_message(5000, 1, 2, -118.0, 1.5, -2.5, 0.5)
+    vehicle = heard(TO_THE_WEST, own, from_camera(message))
+    velocity = (vehicle.east_velocity_mps, vehicle.north_velocity_mps, vehicle.up_velocity_mps)
+    assert velocity == pytest.approx(east_north_up, abs=1e-6)
+    assert vehicle.velocity_sigma_mps == (None if sigma_mps is None else pytest.approx(sigma_mps))
+    frame = vehicle.frame(np.zeros((2, 2), np.uint8), 0)
+    assert (frame.east_velocity_mps, frame.velocity_sigma_mps) == (velocity[0], vehicle.velocity_sigma_mps)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION), BRIDGE_COMPONENT),
+        from_camera(speed_estimate(math.nan, 2.0, 3.0)),
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT)),
+        from_camera(odometry(1.0, 2.0, 3.0, quality=-1)),
+        from_camera(odometry(1.0, 2.0, 3.0, frame=mavlink.MAV_FRAME_LOCAL_FRD)),
+    ],
+)
+def test_what_is_no_velocity_of_another_camera_is_left_out(message):
+    vehicle = heard(TO_THE_WEST, message)
+    assert (vehicle.east_velocity_mps, vehicle.velocity_sigma_mps) == (None, None)
 
 
 def test_units_end_at_the_door():

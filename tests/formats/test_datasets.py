@@ -16,8 +16,10 @@ from rasterio.warp import reproject
 
 from engine import Camera
 from engine.cli.app import run
+from engine.errors import TelemetryError
 from engine.formats.datasets.alto import EPSG
 from engine.formats.datasets.mosaic import Mosaic, MosaicTile, write_mosaic
+from engine.formats.datasets.ortholoc import find_ortholoc, read_ortholoc
 from engine.formats.geotiff import write_geotiff
 from engine.formats.telemetry import TelemetryRow, read_telemetry
 from engine.formats.truth import read_truth
@@ -233,6 +235,26 @@ def test_wildnav_is_followed_on_its_map_of_pictures(in_degrees, frames, truth, t
     assert "1 of 5 pictures are missing" in told
     assert "1 of 3 pictures of the map are missing" in told
     followed(flight, tmp_path, frames, truth)
+
+
+def test_wildnavs_own_map_builder_quotes_its_header_and_its_pictures_have_palettes(tmp_path):
+    """As a fork's repository has them: one cell as the header, lines that end in CR, PNG with a colour table."""
+    colours = np.random.default_rng(2).integers(0, 255, (16, 3), dtype=np.uint8)
+    indices = np.random.default_rng(3).integers(0, 16, (40, 40), dtype=np.uint8)
+    there, query = tmp_path / "assets" / "map", tmp_path / "assets" / "query"
+    there.mkdir(parents=True)
+    picture = Image.fromarray(indices, "P")
+    picture.putpalette(colours.tobytes())
+    picture.save(there / "sat_patch_0000.png")
+    save(query / "drone_image_1.jpg", np.zeros((30, 40, 3), np.uint8))
+    header = '"Filename, Top_left_lat,Top_left_lon,Bottom_right_lat,Bottom_right_long"'
+    (there / "map.csv").write_bytes(f"{header}\rsat_patch_0000.png,60.41,22.46,60.40,22.47\r".encode())
+    names = "Filename,Latitude,Longitude,Altitude,Gimball_Roll,Gimball_Yaw,Gimball_Pitch"
+    (query / "photo_metadata.csv").write_text(f"{names}\ndrone_image_1.jpg,60.405,22.465,+120,+0.00,-4.70,-90.30")
+    command = ["dataset", "import", "wildnav", str(tmp_path), f"--out={tmp_path / 'flight'}", "--hfov-deg=60"]
+    assert run([*command, "--height-is=agl", "--interval-s=1"]) == 0
+    with rasterio.open(tmp_path / "flight" / "map.tif") as file:
+        assert np.array_equal(np.moveaxis(file.read(), 0, 2), colours[indices])
 
 
 def test_vpair_is_followed_on_the_users_map(plan, frames, truth, tmp_path, capsys):
@@ -719,6 +741,30 @@ def test_anyvisloc_becomes_flights_of_one_frame_on_one_map(plan, truth, tmp_path
         assert run([*within, f"--out={place}"]) == 2
         assert "--out: expected a folder without DIR" in capsys.readouterr().err
     assert files_in(tmp_path / "limit7") == before
+
+
+def ortholoc_sample(path, **more):
+    """A sample of OrthoLoC with its heights unknown in a corner, as the arrays of some samples say."""
+    x, y = np.meshgrid(np.arange(24.0), np.arange(24.0))
+    world = np.stack([x, -y, np.full_like(x, 7.0)], axis=-1)
+    np.savez(
+        path, image_query=np.zeros((20, 30, 3), np.uint8), image_dop=np.zeros((24, 24, 3), np.uint8), dsm=world,
+        intrinsics=Camera.from_fov(30, 20, 60.0).matrix,
+        extrinsics=np.array([[1.0, 0, 0, -12], [0, -1, 0, -12], [0, 0, -1, 90]]), **more,
+    )  # fmt: skip
+    return path
+
+
+def test_ortholocs_mask_says_where_heights_are_known(tmp_path):
+    """Demonstration samples have names of their own."""
+    mask = np.ones((24, 24), bool)
+    mask[:5, :7] = False
+    path = ortholoc_sample(tmp_path / "urban_residential_xDOPDSM.npz", mask_dsm=mask)
+    assert find_ortholoc(tmp_path) == [path]
+    _, local_map = read_ortholoc(path)
+    assert np.array_equal(np.isfinite(local_map.surface_m), mask)
+    with pytest.raises(TelemetryError, match=r"expected mask_dsm as image_dop, got \(3, 3\)"):
+        read_ortholoc(ortholoc_sample(tmp_path / "other.npz", mask_dsm=np.ones((3, 3), bool)))
 
 
 def test_a_sample_that_would_run_code_is_refused(tmp_path, capsys):

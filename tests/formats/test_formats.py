@@ -436,6 +436,17 @@ def test_a_video_flight_names_frames_by_index(video, save):
     assert "line 2, frame: expected an index from 0 to 11 of the video, got '12'" in message
 
 
+@pytest.mark.parametrize("name", ["flight.ts", "flight.klv", "GX010001.MP4"])
+def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name):
+    """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""
+    path = tmp_path / name
+    path.write_bytes(b"\x47\x40\x11" + bytes.fromhex("060e2b34020b01010e01030101000000"))
+    with pytest.raises(TelemetryError) as caught:
+        open_flight(folder, path)
+    assert str(caught.value).startswith(f"{path}: expected a table or a flight log, got a video's metadata")
+    assert "convert it to a .SRT" in str(caught.value)
+
+
 def test_without_telemetry_frames_come_bare(folder, video):
     for source in (folder, video):
         items = list(open_flight(source))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from engine.kernels import by_opencv, eager, reference
 from engine.ncc_fft import ncc, prepare, surface
+from engine.threads import set_threads
 
 
 def scores_of(search, templates, zero_mean=True):
@@ -71,12 +72,12 @@ def test_blocks_are_the_window(seed, size, model, count, threads):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(by_opencv, "_CACHED_SIDE", 32)
         patch.setattr(by_opencv, "_division", by_opencv._division.__wrapped__)
-        before = torch.get_num_threads()
-        torch.set_num_threads(threads)
+        before = count()
+        set_threads(threads)
         try:
             got = scores_of(search, templates)
         finally:
-            torch.set_num_threads(before)
+            set_threads(before)
     np.testing.assert_allclose(got, expected_of(search, templates), rtol=0, atol=1e-5)
 
 

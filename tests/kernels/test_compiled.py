@@ -12,6 +12,7 @@ import torch
 from engine.features import sift
 from engine.kernels import jit, sift_descriptors
 from engine.sift import descriptors, keypoints, scale_space
+from engine.threads import count, set_threads
 
 CPU = torch.device("cpu")
 
@@ -97,14 +98,14 @@ def test_directions_are_the_arc_tangents():
 
 def test_more_threads_give_the_same():
     image = picture(260, 420)[None]
-    before = torch.get_num_threads()
+    before = count()
     try:
-        torch.set_num_threads(1)
+        set_threads(1)
         one, batch = sift(image), sift(image.expand(3, -1, -1, -1))
-        torch.set_num_threads(4)
+        set_threads(4)
         many, batch_by_many = sift(image), sift(image.expand(3, -1, -1, -1))
     finally:
-        torch.set_num_threads(before)
+        set_threads(before)
     for name in ("xy_px", "scale_px", "angle_deg", "descriptors", "valid"):
         torch.testing.assert_close(getattr(many, name), getattr(one, name), atol=1e-6, rtol=0)
         torch.testing.assert_close(getattr(batch_by_many, name), getattr(batch, name), atol=1e-6, rtol=0)

@@ -19,7 +19,7 @@ import torch
 from engine.errors import ShapeError
 from engine.kernels import eager
 from engine.kernels import ncc as kernels
-from engine.ncc_fft import _peaks_on_device, match_template, match_templates, prepare, surface
+from engine.ncc_fft import Search, match_template, match_templates, prepare, surface
 from engine.peaks import find_peak
 
 SHAPES = [
@@ -64,15 +64,17 @@ def poisoned(*args, **kwargs):
 
 def whole_surface(search, template):
     """The surface by tensor ops, as a device has it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "_by_opencv", lambda *tensors: False)
-        patch.setattr(kernels, "inverse_norm", eager.inverse_norm)
-        return surface(search, template[None])[0]
+    return surface(of_tensors(search), template[None])[0]
+
+
+def of_tensors(search):
+    """A map that is prepared as arrays, as the tensors that a device has."""
+    return Search(torch.as_tensor(search.image), torch.as_tensor(search.sums))
 
 
 def on_device(search, template, exclusion_px):
     """The peak as a device finds it, wherever the tensors are."""
-    return _peaks_on_device([search], [template], exclusion_px)[0]
+    return match_template(of_tensors(search), template, exclusion_px=exclusion_px)
 
 
 def fused(name, *args):

@@ -17,8 +17,9 @@ from engine.formats.track import TrackRow, read_track
 from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
 from engine.report.charts import ChartArea, ticks
 from engine.report.explain import choose_frames
+from engine.report.finished_track import FinishedTrack
 from engine.report.metrics import Ground, TrackErrors, summarise
-from engine.report.page import FinishedTrack, write_page
+from engine.report.page import write_page
 from engine.report.verdict import MEANINGS, verdict_of
 from engine.runs.evaluation import evaluate
 from engine.runs.settings import TrackSettings
@@ -58,10 +59,25 @@ def summary_of(**known):
 @pytest.mark.parametrize(
     ("known", "grade", "begins"),
     [
-        ({}, "good", "9 of 10 frames fixed, none of them wrong; half of the fixes within 0.12 m"),
-        ({"fixes": 5, "scored_fixes": 5}, "mixed", "5 of 10 frames fixed, none of them wrong"),
-        ({"deadlines_missed": 2}, "mixed", "9 of 10 frames fixed, none of them wrong"),
-        ({"wrong_over_10m": 1, "max_m": 12.0}, "mixed", "9 of 10 frames fixed; 1 of them is more than 10 m off"),
+        (
+            {},
+            "good",
+            "9 of 10 frames fixed, all within three of their own sigmas; half of the fixes within 0.12 m",
+        ),
+        ({"fixes": 5, "scored_fixes": 5}, "mixed", "5 of 10 frames fixed, all within three of their own sigmas"),
+        ({"deadlines_missed": 2}, "mixed", "9 of 10 frames fixed, all within three of their own sigmas"),
+        # By its own sigma, not by a number of metres: 12 m off and said so, 4 m off and not said so.
+        (
+            {"wrong_over_10m": 1, "max_m": 12.0},
+            "good",
+            "9 of 10 frames fixed, all within three of their own sigmas",
+        ),
+        ({"beyond_3_sigma": 1, "max_m": 4.0}, "good", "9 of 10 frames fixed, all but 1 within three of their own"),
+        (
+            {"beyond_3_sigma": 2, "max_m": 4.0},
+            "bad",
+            "2 of 9 fixes are off by more than three of their own sigmas",
+        ),
         ({"wrong_over_10m": 2, "false_fixes": 2}, "bad", "2 fixes are false"),
         (
             {"scored_fixes": 0},
@@ -86,7 +102,11 @@ def test_the_verdict_says_the_worst_first(known, grade, begins):
     verdict = verdict_of(summary_of(**known), 0.4, 40.0)
     assert verdict.grade == grade
     assert verdict.accuracy.startswith(begins)
-    assert ("none of them wrong" in verdict.accuracy) == (begins.find("none of them wrong") > 0)
+
+
+def test_sigmas_that_are_far_larger_than_the_errors_are_said_to_be():
+    assert "cautious: about 14 times" in verdict_of(summary_of(nees_mean=0.01), 3.0, None).accuracy
+    assert "cautious" not in verdict_of(summary_of(nees_mean=1.0), 0.4, None).accuracy
 
 
 def test_the_verdict_on_time():
@@ -128,21 +148,22 @@ def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
 
 
 def errors_of(distances_m):
+    """Errors to the east, each stated to be good to a metre."""
     east = np.array(distances_m, float)
     error = np.column_stack([east, np.where(np.isfinite(east), 0.0, np.nan)])
-    return TrackErrors(np.zeros_like(error), error, error, np.full((len(east), 2, 2), np.nan))
+    return TrackErrors(np.zeros_like(error), error, error, np.tile(np.eye(2), (len(east), 1, 1)))
 
 
-def test_wrong_frames_are_shown_before_refusals_before_others():
-    wrong, refused = {100, 777}, set(range(300, 400))
+def test_frames_beyond_their_sigmas_are_shown_before_refusals_before_others():
+    beyond, refused = {100, 777}, set(range(300, 400))
     rows = [
         TrackRow(timestamp_ns=i, frame=str(i), status="no_fix" if i in refused else "fix") for i in range(1000)
     ]
-    errors = errors_of([np.nan if i in refused else 50.0 if i in wrong else 0.1 for i in range(1000)])
+    errors = errors_of([np.nan if i in refused else 50.0 if i in beyond else 0.1 for i in range(1000)])
     chosen = choose_frames(rows, errors)
     assert chosen == sorted(set(chosen))
     assert len(chosen) == 60
-    assert wrong <= set(chosen)
+    assert beyond <= set(chosen)
     assert {300, 399, 0, 999} <= set(chosen)
     assert len(refused & set(chosen)) == 38
     assert choose_frames(rows[:50], errors_of([0.1] * 50)) == list(range(50))

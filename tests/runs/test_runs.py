@@ -6,10 +6,12 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import torch
 
 import engine.runs
 from engine import OptionError
 from engine.errors import BackendError, MissingExtraError, require
+from engine.features import sift
 from engine.formats.ros.bags import import_rosbags
 from engine.runs import (
     BridgeFiles,
@@ -22,6 +24,7 @@ from engine.runs import (
     WorldSettings,
     compare,
     export_track,
+    run_demo,
     run_mavlink_bridge,
     simulate,
     track,
@@ -173,6 +176,10 @@ def cluster():
         pass
 
 
+def local_affine_frames():
+    sift(torch.zeros(1, 1, 64, 64)).lafs()
+
+
 @pytest.mark.parametrize(
     ("module", "package", "extra", "use"),
     [
@@ -183,6 +190,8 @@ def cluster():
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
         ("pyulog", "pyulog", "logs", ulog),
         ("ray", "ray", "ray", cluster),
+        ("kornia.feature", "kornia", "learned", local_affine_frames),
+        ("matplotlib", "matplotlib", "desk", lambda: run_demo("demo")),
         ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),
     ],
 )

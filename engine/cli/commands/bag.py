@@ -33,3 +33,5 @@ def bag(
 
     facts = convert_to_bag(directory, out, kind, force=force, progress=console.PROGRESS)
     console.facts(facts, as_json, title=f"flight in {directory}")
+    flight = console.options(map=directory / "map.tif", frames=out)
+    console.next_step(f"track {flight} --out out", as_json=as_json)

@@ -30,6 +30,7 @@ from engine.cli.options import (
     MethodOption,
     MountOption,
     NiceOption,
+    OdometryOption,
     OptionalCameraOption,
     RealtimeOption,
     RerunConnectOption,
@@ -113,6 +114,7 @@ def mavlink(
     method: MethodOption = "auto",
     weights: WeightsOption = None,
     start: StartOption = None,
+    odometry: OdometryOption = False,
     device: DeviceOption = "auto",
     deadline_ms: BridgeDeadlineOption = None,
     seconds: SecondsOption = None,
@@ -150,13 +152,15 @@ def mavlink(
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
-        seconds=seconds, realtime=parse_realtime(realtime, nice, cores),
+        seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_mavlink_bridge(
         files, link, settings, supervise=supervise, live_view=live_view, progress=console.PROGRESS
     )
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
+    flown = console.options(map=map_path, surface=surface, camera=camera)
+    console.next_step(f"track {flown} --frames VIDEO --telemetry LOG --out out", as_json=as_json)
 
 
 def camera_delay(
@@ -192,6 +196,11 @@ def camera_delay(
     )  # fmt: skip
     values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
     console.facts(values, as_json, title=f"camera {camera_source}")
+    late = console.options(
+        connect=connect, camera=camera, camera_source=camera_source,
+        exposure_to_grab_ms=values["exposure_to_grab_ms"],
+    )  # fmt: skip
+    console.next_step(f"bridge mavlink --map MAP {late}", as_json=as_json)
 
 
 def mavlink_params(
@@ -234,6 +243,11 @@ def mavlink_params(
         console.print_json({"parameters": str(out)} | asdict(written))
     else:
         console.say(f"written to {out}, for a delay of {written.delay_ms} ms ({written.delay_source})")
+    console.next_step(
+        "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE",
+        as_json=as_json,
+        hint=f"load {out} into the autopilot",
+    )
 
 
 def ros(
@@ -284,6 +298,7 @@ def ros(
     method: MethodOption = "auto",
     weights: WeightsOption = None,
     start: StartOption = None,
+    odometry: OdometryOption = False,
     device: DeviceOption = "auto",
     deadline_ms: DeadlineOption = 121.0,
     seconds: SecondsOption = None,
@@ -313,7 +328,7 @@ def ros(
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
-        seconds=seconds, realtime=parse_realtime(realtime, nice, cores),
+        seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     ros_settings = RosSettings(
         map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
@@ -323,3 +338,6 @@ def ros(
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"ROS {version} on {image}")
+    console.next_step(
+        f"track {console.options(map=map_path, surface=surface)} --frames BAG --out out", as_json=as_json
+    )

@@ -45,4 +45,5 @@ def campaign(
         for group in dict.fromkeys(pool.group for pool in pools):
             console.print_table(group, POOL_COLUMNS, [pooled_cells(p) for p in pools if p.group == group])
         console.say(f"written to {out}")
+    console.next_step(f"report {console.quoted(out)}/RUN {console.quoted(out)}/RUN", as_json=as_json)
     raise typer.Exit(1 if any(line.failure for line in lines) else 0)

@@ -90,3 +90,8 @@ def check(
         console.print_json(asdict(found))
     else:
         console.print_pairs(f"check of {frames}", as_rows(found, corrected=not files.corrections.changes_nothing))
+    given = console.options(
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, mount=mount, map_bounds=map_bounds,
+        map_crs=map_crs, frames=frames, telemetry=telemetry, settings=settings_path, start=start,
+    )  # fmt: skip
+    console.next_step(f"track {given} --out out", as_json=as_json)

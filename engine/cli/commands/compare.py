@@ -92,3 +92,5 @@ def compare(
     else:
         tables.print_comparison(results, str(frames))
         console.say(f"written to {out}")
+    page = f"open {out / 'comparison.html'}"
+    console.next_step("init --out scenematch.toml", as_json=as_json, hint=page)

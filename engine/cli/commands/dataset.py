@@ -101,6 +101,10 @@ def import_dataset(
         facts["notes"] = [as_typed(note) for note in facts["notes"]]
     shown = {name: value for name, value in facts.items() if as_json or name not in ("notes", "findings")}
     console.facts(shown, as_json, title=f"{kind} from {root}")
+    if kind in PHOTOGRAPHS:
+        console.next_step(f"campaign {console.quoted(out / 'campaign.toml')} --out out", as_json=as_json)
+    else:
+        console.next_step(f"dataset check {console.quoted(out)}", as_json=as_json)
 
 
 def check(
@@ -121,4 +125,7 @@ def check(
         console.print_json([asdict(finding) for finding in findings])
     else:
         tables.print_findings(findings, f"truth of {directory}")
+    flight = console.options(map=directory / "map.tif", frames=directory / "frames")
+    more = console.options(camera=directory / "camera.yaml", telemetry=directory / "telemetry.csv")
+    console.next_step(f"track {flight} {more} --out out", as_json=as_json)
     raise typer.Exit(1 if findings else 0)

@@ -38,3 +38,6 @@ def demo(
     else:
         tables.print_paper_table(results, seed)
     console.say(f"report: {out.resolve()}")
+    console.next_step(
+        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-engine/report.html"
+    )

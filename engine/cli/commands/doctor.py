@@ -15,6 +15,7 @@ from engine.cli.options import JsonOption
 _DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
 """Extras that add nothing to the engine."""
+_INSTALL = f"pip install {_DISTRIBUTION}"
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra == ["']([^"']+)["']""")
 
@@ -23,12 +24,13 @@ def doctor(as_json: JsonOption = False) -> None:
     """Versions, devices, what is missing."""
     facts, healthy = examine()
     console.facts(facts, as_json, title="scenematch doctor")
+    console.next_step("demo" if healthy else "doctor", as_json=as_json, hint="" if healthy else _INSTALL)
     raise typer.Exit(0 if healthy else 1)
 
 
 def examine() -> tuple[dict[str, Any], bool]:
     """Facts by name, and whether nothing is missing."""
-    import torch
+    from engine.tensors import torch
 
     facts: dict[str, Any] = {
         "scenematch": _version(_DISTRIBUTION),
@@ -63,7 +65,7 @@ def requirements() -> tuple[list[str], dict[str, list[str]]]:
             continue
         if extra is None:
             needed.append(name[0])
-        elif extra[1] not in _DEVELOPERS:
+        elif extra[1] not in _DEVELOPERS and name[0] != _DISTRIBUTION:  # an extra may contain another
             extras.setdefault(extra[1], []).append(name[0])
     return needed, extras
 

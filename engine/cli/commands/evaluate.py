@@ -26,3 +26,5 @@ def evaluate(
 
     summary = evaluate_track(directory, truth, progress=console.PROGRESS)
     tables.print_summary(summary, as_json, title=f"track in {directory}", out=directory)
+    page = f"open {directory / 'report.html'}"
+    console.next_step(f"export {console.quoted(directory)} --format tum", as_json=as_json, hint=page)

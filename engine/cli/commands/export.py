@@ -32,3 +32,7 @@ def export(
 
     facts = export_track(directory, kind, out, truth=truth, force=force)
     console.facts(facts, as_json, title=f"track in {directory}")
+    if kind == "tum" and truth is None:
+        console.next_step(f"export {console.quoted(directory)} --format tum --truth TRUTH", as_json=as_json)
+    else:
+        console.next_step(f"report {console.quoted(directory)} OTHER_RUN", as_json=as_json)

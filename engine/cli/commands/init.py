@@ -36,3 +36,6 @@ def init(
         console.print_json({"settings": str(out)})
     else:
         console.say(f"settings: {out}")
+    console.next_step(
+        f"track {console.options(settings=out)} --map MAP --frames FRAMES --out out", as_json=as_json
+    )

@@ -82,6 +82,10 @@ def locate(
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms
     console.facts(facts, as_json, title=str(image))
+    if isinstance(result, Fix):
+        console.next_step(f"track {console.options(map=map_path)} --frames FRAMES --out out", as_json=as_json)
+    else:
+        console.next_step(f"map info {console.quoted(map_path)}", as_json=as_json)
     raise typer.Exit(0 if isinstance(result, Fix) else 1)
 
 

@@ -33,6 +33,8 @@ def info(
 
     site = open_map(map_path, surface, bounds=map_bounds, crs=map_crs, progress=console.PROGRESS)
     console.facts(site.info(), as_json, title=str(map_path))
+    place = f"{console.quoted(map_path)} --camera CAMERA --height-agl METRES"
+    console.next_step(f"map audit {place} --out audit", as_json=as_json)
 
 
 def audit(
@@ -90,6 +92,8 @@ def audit(
     else:
         tables.print_audit(result, str(map_path))
         console.say(f"written to {out}")
+    files_given = console.options(map=map_path, surface=surface, camera=camera)
+    console.next_step(f"track {files_given} --frames FRAMES --out out", as_json=as_json)
 
 
 def fetch(
@@ -163,3 +167,10 @@ def fetch(
     )  # fmt: skip
     facts = fetch_map(settings, out, console.PROGRESS)
     console.facts(facts, as_json, title=f"map around {around}")
+    if dry_run:
+        given = console.options(around=around, radius_m=radius_m)
+        console.next_step(
+            f"map fetch {given} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
+        )
+    else:
+        console.next_step(f"map info {console.quoted(out)}", as_json=as_json)

@@ -97,15 +97,20 @@ def simulate(
     if not closed_loop:
         check_unused(loop | {"recording": recording, "viewer": viewer}, "closed_loop")
         facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
-        console.say(
-            f"follow it: scenematch track --map {out}/map.tif --surface {out}/dsm.tif --camera {out}/camera.yaml "
-            f"--frames {out}/frames --telemetry {out}/telemetry.csv --out {out}-track"
-        )
     elif frames is not None:
         raise OptionError("frames: expected without `closed_loop`, which has `minutes`")
     else:
         facts = _fly_closed_loop(out, world, loop, LiveViewTarget(recording, viewer), force)
     console.facts(facts, as_json, title=f"simulated flight {seed}")
+    if closed_loop:
+        page = f"open {out / 'report.html'}"
+        console.next_step(f"export {console.quoted(out)} --format geojson", as_json=as_json, hint=page)
+        return
+    flight = console.options(
+        map=out / "map.tif", surface=out / "dsm.tif", camera=out / "camera.yaml", frames=out / "frames",
+        telemetry=out / "telemetry.csv", out=f"{out}-track",
+    )  # fmt: skip
+    console.next_step(f"track {flight}", as_json=as_json)
 
 
 def _fly_closed_loop(

@@ -27,6 +27,7 @@ from engine.cli.options import (
     MapOption,
     MapSigmaOption,
     MountOption,
+    OdometryOption,
     OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
@@ -86,6 +87,7 @@ def track(
     ] = None,
     weights: WeightsOption = None,
     start: StartOption = None,
+    odometry: OdometryOption = False,
     device: OptionalDeviceOption = None,
     budget_ms: BudgetOption = None,
     profile: Annotated[
@@ -120,9 +122,11 @@ def track(
     )  # fmt: skip
     settings = load_settings(
         settings_path, weights=weights or (), method=method, profile=profile, device=device, start=start,
-        budget_ms=budget_ms,
+        budget_ms=budget_ms, odometry=odometry,
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     summary = track_flight(files, out, settings, force=force, live_view=live_view, progress=console.PROGRESS)
     title = f"{settings.method} ({settings.profile} profile) on {frames}"
     tables.print_summary(summary, as_json, title=title, out=out)
+    page = f"open {out / 'report.html'}"
+    console.next_step(f"export {console.quoted(out)} --format geojson", as_json=as_json, hint=page)

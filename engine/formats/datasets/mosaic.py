@@ -14,6 +14,7 @@ import numpy as np
 
 from engine.errors import MapError, OptionError
 from engine.maps.raster_formats import driver_of
+from engine.maps.rasters import palette_of
 
 _STRIP_PX = 512
 
@@ -142,12 +143,14 @@ def _paste(file: Any, tile: MosaicTile, corner: tuple[int, int], size: tuple[int
 
     width, height = min(size[0], file.width - corner[0]), min(size[1], file.height - corner[1])
     with _open(tile.path) as source:
-        bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
+        bands, colours = [1, 2, 3] if source.count >= 3 else [1, 1, 1], palette_of(source)
+        how = Resampling.bilinear if colours is None else Resampling.nearest  # a mean of two indices is no colour
         scale_x, scale_y = source.width / size[0], source.height / size[1]
         for row in range(0, height, _STRIP_PX):
             rows = min(_STRIP_PX, height - row)
             window = Window(0, row * scale_y, width * scale_x, rows * scale_y)
-            data = source.read(bands, window=window, out_shape=(3, rows, width), resampling=Resampling.bilinear)
+            data = source.read(bands, window=window, out_shape=(3, rows, width), resampling=how)
+            data = data if colours is None else colours[:, data[0]]
             target = Window(corner[0], corner[1] + row, width, rows)
             file.write(data, window=target)
             file.write_mask(np.full((rows, width), 255, np.uint8), window=target)

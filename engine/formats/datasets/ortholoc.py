@@ -1,12 +1,13 @@
 """OrthoLoC: single photographs with an orthophoto, a surface model and an exact pose each, in local metres.
 
-Layout (https://github.com/deepscenario/OrthoLoC): one file ``L01_R0000.npz`` per sample, with
+Layout (https://github.com/deepscenario/OrthoLoC): one file per sample, ``L01_R0000.npz``, with
 
     image_query    (H, W, 3)    the photograph
     image_dop      (h, w, 3)    the orthophoto
     dsm            (h, w, 3)    easting, northing and height of each of its pixels, NaN where unknown
     intrinsics     (3, 3)       of the photograph
     extrinsics     (3, 4)       from the world to the camera
+    mask_dsm       (h, w)       in some samples: where the heights are known
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ from engine.geo import attitude_from_rotation
 from engine.values import Attitude
 
 _NAMES = ("image_query", "image_dop", "dsm", "intrinsics", "extrinsics")
+_MASK = "mask_dsm"
 _MAX_GRID_ERROR_PX = 0.05  # deviation of positions from a regular grid
 
 
 def find_ortholoc(root: Path) -> list[Path]:
     """The samples in a folder, in the order of their names."""
-    return sorted(root.glob("L*.npz"))
+    return sorted(root.glob("*.npz"))
 
 
 def read_ortholoc(path: Path) -> tuple[SinglePhoto, LocalMap]:
@@ -38,7 +40,7 @@ def read_ortholoc(path: Path) -> tuple[SinglePhoto, LocalMap]:
         TelemetryError: it is not of the layout.
         CalibrationError: its intrinsics are invalid.
     """
-    arrays = read_arrays(path, _NAMES)
+    arrays = read_arrays(path, _NAMES, (_MASK,))
     image = as_rgb_image(arrays["image_query"], path, "image_query")
     ortho = as_rgb_image(arrays["image_dop"], path, "image_dop")
     world, pose = (np.asarray(arrays[name], dtype=np.float64) for name in ("dsm", "extrinsics"))
@@ -59,6 +61,10 @@ def read_ortholoc(path: Path) -> tuple[SinglePhoto, LocalMap]:
         attitude=Attitude(*attitude),
     )
     heights_m = world[:, :, 2].astype(np.float32)
+    known = np.asarray(arrays.get(_MASK, np.ones(heights_m.shape)), dtype=np.bool_)
+    if known.shape != heights_m.shape:
+        raise TelemetryError(f"{path}: expected {_MASK} as image_dop, got {known.shape}")
+    heights_m[~known] = np.nan
     return single, LocalMap(picture=ortho, pixel_to_m=pixel_to_m, surface_m=heights_m, surface_to_m=pixel_to_m)
 
 

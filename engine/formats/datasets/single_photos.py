@@ -164,19 +164,20 @@ def campaign_text(names: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def read_arrays(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
+def read_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[np.generic]]:
     """Read arrays of an .npz file; pickled objects are refused.
 
     Args:
         path: the file.
         names: names of the arrays.
+        optional: names of arrays that it may lack.
 
     Raises:
         TelemetryError: the file is missing, is no .npz file, or lacks an array.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
+            return {name: file[name] for name in (*names, *(n for n in optional if n in file))}
     except FileNotFoundError:
         raise TelemetryError(f"{path}: no such file") from None
     except KeyError as error:

@@ -1,0 +1,34 @@
+"""The command `report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engine.cli import console
+from engine.cli.options import ForceOption, JsonOption
+
+
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Output folders of track.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Page on several runs; comparison.html unless given."),
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw the report on finished runs again.
+
+    Of one run its own report.html; of several one page: all tracks on one map and one time axis, and a table.
+    """
+    from engine.runs.reporting import report as draw_report
+
+    page = draw_report(runs, out, force=force, progress=console.PROGRESS)
+    if as_json:
+        console.print_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]})
+    else:
+        console.say(f"written to {page}")
+    console.next_step(f"export {console.quoted(runs[0])} --format geojson", as_json=as_json)

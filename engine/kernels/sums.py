@@ -1,0 +1,54 @@
+"""What is computed once of a picture on the CPU, by OpenCV: sums, and means of 2 x 2 pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import OptionError
+
+
+def integrals(image: NDArray[Any]) -> NDArray[np.float64]:
+    """Integral images of a picture and of its square.
+
+    Args:
+        image: (H, W) float32 or float64.
+
+    Returns:
+        (2, H+1, W+1) float64 running sums; the first row and column are 0.
+    """
+    both = np.empty((2, image.shape[0] + 1, image.shape[1] + 1))
+    cv2.integral2(np.ascontiguousarray(image), both[0], both[1], sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    return both
+
+
+def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of 2 x 2 pixels.
+
+    Args:
+        image: (H, W) float32; an odd last row or column is left out.
+
+    Returns:
+        (H // 2, W // 2) float32.
+    """
+    height, width = image.shape[0] & ~1, image.shape[1] & ~1
+    size = (width // 2, height // 2)
+    return np.asarray(cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def check_finite(**arrays: NDArray[Any]) -> None:
+    """Check that no value is NaN or infinity; a finite sum implies that.
+
+    Args:
+        arrays: by the name of the argument, of any shape.
+
+    Raises:
+        OptionError: one is.
+    """
+    for name, array in arrays.items():
+        if not (math.isfinite(array.sum(dtype=np.float64)) or np.isfinite(array).all()):
+            raise OptionError(f"{name}: expected finite values, got NaN or infinity")

@@ -1,0 +1,95 @@
+"""What an installation without extras does: all that a vehicle needs; the rest names the extra that it needs."""
+
+import json
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from engine.cli.app import run
+from engine.runs.simulation import write_flight
+from engine.sim import plan_flight
+from tests.support.paths import ROOT
+from tests.support.towns import drawn_town
+
+OF_DESKS = ("matplotlib", "kornia")
+"""The packages of the extras `desk` and `learned`."""
+PROGRAM = """
+import json, sys
+for name in {absent}:
+    sys.modules[name] = None
+from engine.cli.app import run
+print("CODES", json.dumps([run(line) for line in {lines}]))
+"""
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+    return folder
+
+
+@pytest.fixture
+def files(flight):
+    return [
+        f"--map={flight / 'map.tif'}", f"--surface={flight / 'dsm.tif'}", f"--camera={flight / 'camera.yaml'}",
+        f"--frames={flight / 'frames'}", f"--telemetry={flight / 'telemetry.csv'}",
+    ]  # fmt: skip
+
+
+def run_without(lines):
+    """Exit codes of commands in a new interpreter that has none of these packages, and what they said."""
+    program = PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines])
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True)
+    return json.loads(done.stdout.rpartition("CODES ")[2]), done.stderr
+
+
+def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
+    picture, out = sorted((flight / "frames").iterdir())[0], tmp_path / "out"
+    truth = (flight / "truth.csv").read_text(encoding="utf-8").splitlines()[1].split(",")
+    lines = [
+        ["doctor"],
+        ["init", f"--out={tmp_path / 's.toml'}"],
+        ["track", *files, f"--out={out}"],
+        ["evaluate", out],
+        ["export", out, "--format=geojson"],
+        ["locate", picture, *files[:3], "--height-agl=150", "--method=sift", f"--near={truth[1]},{truth[2]}"],
+        ["check", *files],
+        ["map", "info", flight / "map.tif"],
+        ["bridge", "mavlink", "--connect=udpout:127.0.0.1:9", *files, "--seconds=0.1"],
+    ]
+    codes, told = run_without(lines)
+    assert dict(zip([" ".join(map(str, line[:2])) for line in lines], codes, strict=True)) == {
+        " ".join(map(str, line[:2])): 0 for line in lines
+    }, told
+    assert "Traceback" not in told
+    assert (out / "report.html").is_file()
+    assert not list(out.glob("*.png"))
+    assert told.count("no plots are drawn: expected matplotlib to be installed, got none: pip install") == 2
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["demo"], ["simulate", "--closed-loop"], ["map", "audit", "MAP"], ["compare"]],
+    ids=lambda words: " ".join(words),
+)
+def test_what_draws_names_its_extra_before_it_begins(command, flight, files, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    words = [str(flight / "map.tif") if word == "MAP" else word for word in command]
+    out = tmp_path / "out"
+    assert run([*words, *(files if command == ["compare"] else []), f"--out={out}"]) == 1
+    assert capsys.readouterr().err == (
+        "scenematch: expected matplotlib to be installed, got none: pip install 'scenematch-engine[desk]'\n"
+    )
+    assert not out.exists()
+
+
+def test_the_extras_of_a_desk_are_all_that_is_missing_here():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    named = " ".join(extras["desk"] + extras["learned"])
+    assert all(name in named for name in OF_DESKS)
+    assert not [line for line in project["dependencies"] if line.startswith(OF_DESKS)]
+    assert "scenematch-engine[desk]" in extras["test"]

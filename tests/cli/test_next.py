@@ -1,0 +1,75 @@
+"""Every command ends with what to do next: one command that exists, for people only."""
+
+import inspect
+import json
+import re
+import shlex
+
+import pytest
+from typer.main import get_command
+
+from engine.cli import console
+from engine.cli.app import app, run
+from tests.cli.test_json import LEAVES
+
+
+@pytest.mark.parametrize("command", [pytest.param(command, id=" ".join(words)) for words, command in LEAVES])
+def test_every_command_says_what_is_next(command):
+    assert "console.next_step(" in inspect.getsource(inspect.unwrap(command.callback))
+
+
+def next_of(capsys, arguments, code=0):
+    """The words of the command that is named last on standard error."""
+    assert run(arguments) == code
+    last = capsys.readouterr().err.splitlines()[-1]
+    found = re.fullmatch(r"next: (?:.*; )?scenematch (.+)", last)
+    assert found, last
+    return shlex.split(found[1])
+
+
+def parsed(words):
+    """The command that these words call, with its options; fails where there is no such one."""
+    command = get_command(app)
+    while hasattr(command, "commands"):
+        command, words = command.commands[words[0]], words[1:]
+    known = {option for parameter in command.params for option in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= known
+    return command.name
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    out = tmp_path_factory.mktemp("a flight")
+    assert run(["simulate", f"--out={out / 'f'}", "--frames=2"]) == 0
+    return out / "f"
+
+
+def test_from_a_flight_to_its_export_by_what_is_said(flight, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = next_of(capsys, ["simulate", f"--out={tmp_path / 'again'}", "--frames=1"])
+    assert parsed(words) == "track"
+    words = next_of(capsys, [*words, "--device=cpu"])  # what simulate said, as it stands
+    assert parsed(words) == "export"
+    words = next_of(capsys, words)
+    assert parsed(words) == "report"
+    assert (tmp_path / "again-track" / "track.geojson").is_file()
+
+
+def test_others_name_commands_that_exist(flight, tmp_path, capsys):
+    assert parsed(next_of(capsys, ["init", f"--out={tmp_path / 's.toml'}"])) == "track"
+    assert parsed(next_of(capsys, ["map", "info", str(flight / "map.tif")])) == "audit"
+    assert parsed(next_of(capsys, ["doctor"])) == "demo"
+    assert parsed(next_of(capsys, ["dataset", "check", str(flight)])) == "track"
+
+
+def test_a_program_is_told_nothing(tmp_path, capsys):
+    assert run(["init", f"--out={tmp_path / 's.toml'}", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)
+    assert "next:" not in printed.err
+
+
+def test_names_with_spaces_stay_one_word(capsys):
+    console.next_step(f"track {console.options(map='a map.tif', truth=None, log_offset_s=2)}")
+    said = capsys.readouterr().err
+    assert shlex.split(said)[2:] == ["track", "--map", "a map.tif", "--log-offset-s", "2"]
