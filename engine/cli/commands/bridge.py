@@ -135,8 +135,9 @@ def mavlink(
     played at their own pace, until they end.
     """
     from engine.runs.arguments import parse_realtime
+    from engine.runs.bridge_files import BridgeFiles
     from engine.runs.live_viewing import LiveViewTarget
-    from engine.runs.mavlink_bridge import BridgeFiles, BridgeSettings, MavlinkSettings, run_mavlink_bridge
+    from engine.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
 
     use_threads(threads)
     files = BridgeFiles(
@@ -159,8 +160,11 @@ def mavlink(
         files, link, settings, supervise=supervise, live_view=live_view, progress=console.PROGRESS
     )
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
-    flown = console.options(map=map_path, surface=surface, camera=camera)
-    console.next_step(f"track {flown} --frames VIDEO --telemetry LOG --out out", as_json=as_json)
+    flown = console.options(
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry
+    )
+    recorded = "" if frames else " --frames VIDEO --telemetry LOG"
+    console.next_step(f"track {flown}{recorded} --out out", as_json=as_json)
 
 
 def camera_delay(
