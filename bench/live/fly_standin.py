@@ -1,8 +1,9 @@
 """A stand-in autopilot that flies a flight folder in real time, for a bridge beside it on the bench.
 
 ``python -m bench.live.fly_standin FLIGHT [--port N] [--firmware ardupilot|px4] [--seconds S]``, before or after
-the bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT holds a ``telemetry.csv``
-and a ``truth.csv`` with heights and attitude, as ``scenematch simulate`` writes them.
+the bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT is a folder with a
+``telemetry.csv`` and a ``truth.csv`` with heights and attitude, as ``scenematch simulate`` writes them, or a video
+with DJI's ``.SRT`` beside it: it then flies the positions, the heights and the gimbal's angles of the subtitles.
 """
 
 from __future__ import annotations
@@ -11,14 +12,17 @@ import argparse
 import math
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
+from engine.errors import EngineError, TelemetryError
+from engine.formats.flight import open_flight
 from engine.formats.telemetry import read_telemetry
 from engine.formats.truth import read_truth
 from engine.geo import LocalFrame
@@ -28,21 +32,41 @@ _REPORT_S = 5.0
 
 
 def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]:
-    """The truth of a flight folder: where it was so long after its first picture, about where, how long."""
-    rows = read_truth(flight / "truth.csv")
-    first_ns = read_telemetry(flight / "telemetry.csv")[0].timestamp_ns
+    """Where the vehicle of a flight was so long after its first picture, about where, how long.
+
+    Raises:
+        TelemetryError: a file cannot be read, or it does not say where the vehicle was.
+    """
+    rows, first_ns = _states(flight)
     place = LocalFrame(rows[0].lat_deg, rows[0].lon_deg)
-    enu = np.array([place.enu_from_geodetic(row.lat_deg, row.lon_deg) for row in rows])
+    east_north = np.array([place.enu_from_geodetic(row.lat_deg, row.lon_deg)[:2] for row in rows])
     time_s = np.array([(row.timestamp_ns - first_ns) * 1e-9 for row in rows])
-    velocity = np.gradient(enu, time_s, axis=0)
     headings = np.rad2deg(np.unwrap(np.deg2rad([row.heading_deg for row in rows])))
-    attitude = [[row.height_agl_m, row.roll_deg, row.pitch_deg] for row in rows]
-    columns = np.column_stack([enu[:, :2], attitude, headings, velocity[:, :2]]).astype(float)
+    attitude = [[row.height_agl_m, row.roll_deg or 0.0, row.pitch_deg or 0.0] for row in rows]
+    columns = np.column_stack([east_north, attitude, headings, _velocity(time_s, east_north)]).astype(float)
 
     def motion(seconds: float) -> State:
         return State(*(float(np.interp(seconds, time_s, column)) for column in columns.T))
 
     return motion, place, float(time_s[-1])
+
+
+def _states(flight: Path) -> tuple[Sequence[Any], int]:
+    """The states of a folder's truth or a video's subtitles, and the stamp of the first picture."""
+    if flight.is_dir():
+        return read_truth(flight / "truth.csv"), read_telemetry(flight / "telemetry.csv")[0].timestamp_ns
+    rows = open_flight(flight).rows
+    known = [row for row in rows if None not in (row.lat_deg, row.height_agl_m, row.heading_deg)]
+    if not known:
+        raise TelemetryError(f"{flight}: expected subtitles beside it with position, rel_alt and gimbal, got none")
+    return known, rows[0].timestamp_ns
+
+
+def _velocity(time_s: NDArray[np.float64], east_north: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean over a second: subtitles have positions to 0.1 m, thirty a second."""
+    before_s, after_s = (np.clip(time_s + by_s, time_s[0], time_s[-1]) for by_s in (-0.5, 0.5))
+    moved = [np.interp(after_s, time_s, axis) - np.interp(before_s, time_s, axis) for axis in east_north.T]
+    return np.column_stack(moved) / (after_s - before_s)[:, None]
 
 
 def wait_for_bridge(port: int) -> None:
@@ -111,7 +135,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float)
     arguments = parser.parse_args()
     print(f"waits for a bridge on UDP port {arguments.port} of this machine", flush=True)
-    came = fly(arguments.flight, arguments.port, arguments.firmware, arguments.seconds)
+    try:
+        came = fly(arguments.flight, arguments.port, arguments.firmware, arguments.seconds)
+    except EngineError as error:
+        parser.error(str(error))
     print(f"landed; {came['fixes']} fixes" + (f", half within {came['median_m']:.2f} m" if came["fixes"] else ""))
 
 

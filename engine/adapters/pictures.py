@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.adapters.camera_stream import capture
-from engine.formats.flight import open_flight
+from engine.formats.flight import Flight, open_flight
 
 __all__ = ["CapturedImage", "capture", "replay"]
 
@@ -23,20 +23,27 @@ def replay(
 ) -> Generator[CapturedImage, None, None]:
     """Replay a folder of images or a video in real time.
 
+    The flight is opened by this call: a video's times take seconds to read, and the autopilot flies meanwhile.
+
     Args:
         frames: folder of images, or video.
-        telemetry: telemetry.csv, whose stamps set the pace; None uses ``rate_hz``.
+        telemetry: telemetry.csv or a log, whose stamps set the pace; None uses the subtitles beside a video, the
+            EXIF of photographs, else ``rate_hz``.
         rate_hz: images per second where there are no stamps.
         wait: called when the first image has been read; the replay starts when it returns.
 
-    Yields:
-        :data:`CapturedImage`, each at its time.
+    Returns:
+        Of :data:`CapturedImage`, each at its time.
 
     Raises:
         TelemetryError: an image or the telemetry cannot be read.
     """
+    return _play(open_flight(frames, telemetry), rate_hz, wait)
+
+
+def _play(flight: Flight, rate_hz: float, wait: Callable[[], None] | None) -> Generator[CapturedImage, None, None]:
     begin_ns, first_ns = 0, 0
-    for index, item in enumerate(open_flight(frames, telemetry)):
+    for index, item in enumerate(flight):
         stamp_ns = item.frame.timestamp_ns
         if stamp_ns is None:
             stamp_ns = round(index * 1e9 / rate_hz)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from engine.formats.corrections import Corrections
     from engine.formats.datasets.sequence import ImportOptions
     from engine.runs.bag_conversion import convert_to_bag
+    from engine.runs.bridge_files import BridgeFiles
     from engine.runs.campaign import run_campaign
     from engine.runs.checking import diagnose_flight
     from engine.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from engine.runs.map_audit import AuditFiles, MapAudit, audit_map
     from engine.runs.map_fetch import FetchSettings, fetch_map
     from engine.runs.mavlink_bridge import (
-        BridgeFiles,
         BridgeSettings,
         MavlinkSettings,
         run_mavlink_bridge,
@@ -102,7 +102,8 @@ _NAMES = {
     "engine.runs.live_viewing": "LiveViewTarget",
     "engine.runs.map_audit": "AuditFiles MapAudit audit_map",
     "engine.runs.map_fetch": "FetchSettings fetch_map",
-    "engine.runs.mavlink_bridge": "BridgeFiles BridgeSettings MavlinkSettings run_mavlink_bridge",
+    "engine.runs.bridge_files": "BridgeFiles",
+    "engine.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
     "engine.runs.mavlink_parameters": "write_parameter_file",
     "engine.runs.progress": "Progress",
     "engine.runs.reporting": "report",

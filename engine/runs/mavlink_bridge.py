@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from engine.adapters.delay_memory import remember_delay
 from engine.adapters.links import parse_connection
-from engine.adapters.pictures import CapturedImage, capture, replay
+from engine.adapters.pictures import CapturedImage
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
@@ -25,7 +24,7 @@ from engine.navigator_options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.realtime import Realtime, check_realtime, set_realtime
 from engine.runs.arguments import check_choice, check_device, check_unused, parse_position
-from engine.runs.cameras import CameraFiles
+from engine.runs.bridge_files import BridgeFiles
 from engine.runs.checks import check_position
 from engine.runs.folders import StrPath
 from engine.runs.inputs import open_map
@@ -45,77 +44,6 @@ if TYPE_CHECKING:
 _MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
 _MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
-_MAX_GRAB_MS = 10_000.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BridgeFiles:
-    """The map, the camera, and where pictures come from: files or a camera, one of the two.
-
-    Attributes:
-        map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration.
-        surface: surface model, a GeoTIFF of heights.
-        frames: pictures that are played at their own pace, a folder or a video.
-        telemetry: telemetry.csv, whose stamps set that pace.
-        camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
-        rate_hz: pace of pictures without stamps; None is 10.
-        exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
-        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
-        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
-        map_crs: of a map that names none.
-        mount: how the camera is mounted, by name; None is the calibration's.
-        camera_pitch_deg: of the camera, -90 looks straight down.
-        gimbal: whether a gimbal, whose attitude the autopilot reports, turns it from there.
-
-    Raises:
-        OptionError: a number is out of its range, or an argument does not go with another.
-    """
-
-    map: StrPath
-    camera: StrPath
-    surface: StrPath | None = None
-    frames: StrPath | None = None
-    telemetry: StrPath | None = None
-    camera_source: str | None = None
-    rate_hz: float | None = None
-    exposure_to_grab_ms: float | None = None
-    map_sigma_m: float | None = None
-    map_bounds: str | None = None
-    map_crs: str | None = None
-    mount: str | None = None
-    camera_pitch_deg: float | None = None
-    gimbal: bool = False
-
-    def __post_init__(self) -> None:
-        self.camera_files()
-        if (self.frames is None) == (self.camera_source is None):
-            raise OptionError("frames: expected either `frames` or `camera_source`")
-        if self.frames is None:
-            check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz}, "frames")
-        else:
-            check_unused({"exposure_to_grab_ms": self.exposure_to_grab_ms}, "camera_source")
-        if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
-            raise OptionError(f"rate_hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
-        if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MAX_GRAB_MS:
-            raise OptionError(
-                f"exposure_to_grab_ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
-            )
-
-    def camera_files(self) -> CameraFiles:
-        """What is said of the camera."""
-        return CameraFiles(calibration=Path(self.camera), mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
-
-    def pictures(self, wait: Callable[[], None] | None = None) -> Generator[CapturedImage | None, None, None]:
-        """Pictures as they are captured, None where a camera gives none for a while.
-
-        Those of a flight that is played begin when ``wait`` returns.
-        """
-        if self.frames is not None:
-            telemetry = None if self.telemetry is None else Path(self.telemetry)
-            return replay(Path(self.frames), telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
-        assert self.camera_source is not None  # one of the two is given
-        return capture(self.camera_source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,7 +203,7 @@ def run_mavlink_bridge(
     site = open_map(
         files.map, files.surface, files.map_sigma_m, bounds=files.map_bounds, crs=files.map_crs, progress=progress
     )
-    camera = files.camera_files().load(None)
+    camera = files.load_camera(progress)
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
@@ -290,6 +218,8 @@ def run_mavlink_bridge(
     start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
 
     end_on_sigterm()
+    # Before the link: an autopilot on the bench takes off when the bridge listens.
+    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
     with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
@@ -303,11 +233,8 @@ def run_mavlink_bridge(
         with bridge:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
-            with (
-                running_service() as beat,
-                closing(files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))) as pictures,
-                suppress(KeyboardInterrupt),
-            ):  # the usual end beside a camera, and no reason to lose the counts
+            # Ctrl-C is the usual end beside a camera, and no reason to lose the counts.
+            with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress, beat)
             if files.camera_source is not None:
                 remember_delay(bridge.status.least_age_ms)

@@ -47,7 +47,7 @@ from engine.adapters.pictures import replay
 from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
 from engine.camera import mount_rotation
 from engine.cli.app import run as main
-from engine.errors import OptionError
+from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
 from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.support.paths import ROOT
@@ -833,6 +833,11 @@ def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
     first, second = (captured_ns for _, captured_ns in replay(tmp_path, None, rate_hz=50.0, wait=wait))
     assert [first >= told for told in told_ns] == [True]
     assert second - first == 20_000_000
+
+
+def test_a_flight_that_is_played_is_read_before_its_first_picture_is_asked_for(tmp_path):
+    with pytest.raises(TelemetryError, match="no such"):
+        replay(tmp_path / "none", None, rate_hz=50.0)
 
 
 @pytest.fixture

@@ -143,7 +143,9 @@ def test_track_prints_a_table_and_keeps_the_rest_from_standard_output(flight, tm
     printed = capsys.readouterr()
     assert re.search(r"^RMS error +\d+\.\d\d m$", printed.out, re.MULTILINE)
     assert "\x1b" not in printed.out + printed.err
-    assert printed.err == f"written to {tmp_path / 'out'}\n"
+    written, following = printed.err.splitlines()
+    assert written == f"written to {tmp_path / 'out'}"
+    assert following.startswith("next: ")
 
 
 def test_json_is_all_there_is_on_standard_output(flight, tmp_path, capsys):
@@ -261,7 +263,7 @@ def test_locate_finds_a_picture_without_a_prior(flight, capsys):
     assert run([*base, "--method=ncc"]) == 1
     printed = capsys.readouterr()
     assert "no_height" in printed.out
-    assert printed.err == ""
+    assert printed.err == f"next: scenematch map info {flight / 'map.tif'}\n"
 
 
 def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):

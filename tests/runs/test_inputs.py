@@ -170,6 +170,29 @@ def test_pictures_without_exif_need_a_camera(tmp_path):
         BridgeFiles(map="m.tif", camera="c.yaml", camera_source="0", mount="side")
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "camera: expected a calibration of the camera that `camera_source` opens"),
+        ({"hfov_deg": 64.0}, "camera: expected a calibration of the camera that `camera_source` opens"),
+        ({"camera": "c.yaml"}, r"camera_source: expected a camera, got the video .*\.mp4; `frames` plays it"),
+    ],
+)
+def test_a_bridge_refuses_a_camera_without_a_calibration_and_a_video_as_one(tmp_path, options, words):
+    video = tmp_path / "DJI_0001.mp4"
+    video.touch()
+    with pytest.raises(OptionError, match=words):
+        BridgeFiles(map="m.tif", camera_source=str(video), **options)
+
+
+def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_path):
+    Image.fromarray(noise()).save(tmp_path / "1.png")
+    wide = BridgeFiles(map="m.tif", frames=tmp_path, hfov_deg=90.0).load_camera()
+    assert (wide.width_px, wide.height_px, wide.matrix[0, 0]) == (80, 60, pytest.approx(40.0))
+    with pytest.raises(CalibrationError, match=r"1\.png: expected a focal length"):
+        BridgeFiles(map="m.tif", frames=tmp_path).load_camera()
+
+
 def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
     path = tmp_path / "DJI_0001.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (64, 48))

@@ -16,7 +16,8 @@ import pytest
 from engine.errors import OptionError
 from engine.realtime import _FIFO_CURE, _MEMORY_CURE
 from engine.runs import mavlink_bridge
-from engine.runs.mavlink_bridge import BridgeFiles, BridgeSettings, MavlinkSettings, run_mavlink_bridge
+from engine.runs.bridge_files import BridgeFiles
+from engine.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
 from engine.runs.service import running_service
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight

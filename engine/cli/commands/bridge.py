@@ -17,6 +17,7 @@ from engine.cli.options import (
     DeadlineOption,
     DeviceOption,
     FirmwareOption,
+    HfovOption,
     JsonOption,
     KeyOption,
     ListenAnywhereOption,
@@ -30,6 +31,7 @@ from engine.cli.options import (
     MountOption,
     NiceOption,
     OdometryOption,
+    OptionalCameraOption,
     RealtimeOption,
     RerunConnectOption,
     RerunOption,
@@ -53,7 +55,8 @@ def mavlink(
         ),
     ],
     map_path: MapOption,
-    camera: CameraOption,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
     surface: SurfaceOption = None,
@@ -65,7 +68,10 @@ def mavlink(
         typer.Option("--frames", metavar="DIR|VIDEO", help="Pictures to play at their own pace."),
     ] = None,
     telemetry: Annotated[
-        Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace.")
+        Path | None,
+        typer.Option(
+            "--telemetry", metavar="FILE", help="telemetry.csv, whose stamps set that pace; else a video's own."
+        ),
     ] = None,
     rate_hz: Annotated[
         float | None,
@@ -129,12 +135,13 @@ def mavlink(
     played at their own pace, until they end.
     """
     from engine.runs.arguments import parse_realtime
+    from engine.runs.bridge_files import BridgeFiles
     from engine.runs.live_viewing import LiveViewTarget
-    from engine.runs.mavlink_bridge import BridgeFiles, BridgeSettings, MavlinkSettings, run_mavlink_bridge
+    from engine.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
 
     use_threads(threads)
     files = BridgeFiles(
-        map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry,
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry,
         camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
         map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
         camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
@@ -153,8 +160,11 @@ def mavlink(
         files, link, settings, supervise=supervise, live_view=live_view, progress=console.PROGRESS
     )
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {connect}")
-    flown = console.options(map=map_path, surface=surface, camera=camera)
-    console.next_step(f"track {flown} --frames VIDEO --telemetry LOG --out out", as_json=as_json)
+    flown = console.options(
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry
+    )
+    recorded = "" if frames else " --frames VIDEO --telemetry LOG"
+    console.next_step(f"track {flown}{recorded} --out out", as_json=as_json)
 
 
 def camera_delay(

@@ -1,0 +1,48 @@
+"""A stand-in autopilot that flies what a video's subtitles say."""
+
+import cv2
+import numpy as np
+import pytest
+
+from engine.errors import TelemetryError
+
+pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+
+RATE_HZ, NORTH_MPS = 25.0, 9.0
+CUE = (
+    "{n}\n00:00:0{s},{ms:03d} --> 00:00:0{s},{ms:03d}\nFrameCnt: {n}\n[latitude: {lat:.6f}] [longitude: 16.2] "
+    "[rel_alt: 80.0 abs_alt: 300.0] {gimbal}\n\n"
+)
+
+
+def video(folder, gimbal):
+    """Three seconds due north, with a cue a frame: positions to 0.1 m, as DJI writes them."""
+    path = folder / "DJI_0001.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE_HZ, (32, 32))
+    cues = []
+    for k in range(75):
+        writer.write(np.full((32, 32, 3), k, np.uint8))
+        lat_deg = 48.1 + NORTH_MPS * k / RATE_HZ / 111_200.0
+        cues.append(CUE.format(n=k + 1, s=k // 25, ms=k % 25 * 40, lat=lat_deg, gimbal=gimbal))
+    writer.release()
+    (folder / "DJI_0001.SRT").write_text("".join(cues))
+    return path
+
+
+def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
+    from bench.live.fly_standin import recorded
+
+    motion, place, duration_s = recorded(video(tmp_path, "[gb_yaw: 30.0 gb_pitch: -90.0 gb_roll: 0.0]"))
+    assert (place.lat_deg, duration_s) == (pytest.approx(48.1), pytest.approx(74 / RATE_HZ))
+    for time_s in (0.0, 1.0, 2.5):
+        state = motion(time_s)
+        assert (state.height_m, state.heading_deg) == pytest.approx((80.0, 30.0))
+        assert (state.east_m, state.north_m) == pytest.approx((0.0, NORTH_MPS * time_s), abs=0.2)
+        assert (state.east_mps, state.north_mps) == pytest.approx((0.0, NORTH_MPS), abs=0.3)
+
+
+def test_subtitles_without_a_heading_are_refused(tmp_path):
+    from bench.live.fly_standin import recorded
+
+    with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
+        recorded(video(tmp_path, ""))
