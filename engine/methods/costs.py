@@ -16,7 +16,6 @@ _SIGMAS = 3.0
 _MIN_MS = 0.05
 _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for its cost
 _COST_DECAY = 0.99  # of the cost itself, until the step is tried
-_MAX_WAIT_MS = 20.0  # a longer wait counts as this long: a scheduler's turns are shorter
 _ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
 
 
@@ -44,7 +43,8 @@ class _CostModel:
         rate = min(max(rate, 0.0), mean_ms / mean_work if mean_work > 0.0 else math.inf)
         return mean_ms + rate * (work - mean_work)
 
-    def learn(self, work: float, ms: float) -> None:
+    def learn(self, work: float, ms: float) -> float:
+        """Note a run, and return the milliseconds that count of it."""
         if self.weight > 0.0:
             if ms <= self.trust * self.expected_ms(work):  # it has become cheaper, as was tried
                 self.ms *= self.trust
@@ -58,6 +58,7 @@ class _CostModel:
         self.ms = _MEMORY * self.ms + ms
         self.work_work = _MEMORY * self.work_work + work * work
         self.work_ms = _MEMORY * self.work_ms + work * ms
+        return ms
 
 
 class Costs:
@@ -71,17 +72,17 @@ class Costs:
     def learn(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
         """Note that a step with this much work took so long, ``waited_ms`` of it waiting for a processor."""
         with self._lock:
-            ran_ms = self._note_wait(ms, waited_ms)
-            self._models.setdefault(step, _CostModel()).learn(work, ran_ms)
+            ran_ms = self._models.setdefault(step, _CostModel()).learn(work, max(_MIN_MS, ms - waited_ms))
+            self._note_wait(ran_ms, waited_ms)
 
     def note_abandoned(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
         """Note that a step was abandoned after so many milliseconds: it costs more than these."""
         with self._lock:
-            ran_ms = self._note_wait(ms, waited_ms)
-            known = self._models.setdefault(step, _CostModel())
+            ran_ms, known = max(_MIN_MS, ms - waited_ms), self._models.setdefault(step, _CostModel())
             known.trust = 1.0
             expected_ms = known.expected_ms(work) if known.weight > 0.0 else 0.0
             known.learn(work, max(_ABANDONED * ran_ms, expected_ms))
+            self._note_wait(ran_ms, waited_ms)
 
     def note_refusal(self, step: str, *, keeps_cost: bool = False, has_fix: bool = False) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
@@ -109,9 +110,7 @@ class Costs:
             ran_ms = model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
             return ran_ms * (1.0 + self._waited_ms / self._ran_ms) if self._ran_ms > 0.0 else ran_ms
 
-    def _note_wait(self, ms: float, waited_ms: float) -> float:
-        """Learn the share of waiting, and return what the step took without."""
-        ran_ms = ms - waited_ms
+    def _note_wait(self, ran_ms: float, waited_ms: float) -> None:
+        """Learn the share of waiting."""
         self._ran_ms = _MEMORY * self._ran_ms + ran_ms
-        self._waited_ms = _MEMORY * self._waited_ms + min(waited_ms, _MAX_WAIT_MS)
-        return ran_ms
+        self._waited_ms = _MEMORY * self._waited_ms + waited_ms

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 if sys.platform == "linux":
     from resource import RUSAGE_THREAD, getrusage
 
+_MAX_WAIT_MS = 20.0  # of one preemption
+
 
 @dataclass(frozen=True, slots=True)
 class ThreadUsage:
@@ -34,8 +36,7 @@ def waited_ms(before: ThreadUsage, after: ThreadUsage, took_ms: float) -> float:
     """What of the time between two readings the thread waited for a processor.
 
     A thread that was not preempted waited for none: what it spent off the processor, for a device or a file, is
-    part of its work.
+    part of its work. A wait counts as long as a scheduler lets one be: a machine that stood still tells nothing.
     """
-    if after.preemptions == before.preemptions:
-        return 0.0
-    return max(0.0, took_ms - (after.processor_ms - before.processor_ms))
+    off_processor_ms = took_ms - (after.processor_ms - before.processor_ms)
+    return min(max(0.0, off_processor_ms), _MAX_WAIT_MS * (after.preemptions - before.preemptions))

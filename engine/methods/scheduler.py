@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeVar
 
+from engine import threads
 from engine.budget import Deadline
 from engine.device import Device, synchronise
 from engine.methods.costs import Costs
@@ -109,12 +110,16 @@ class Scheduler:
             self._costs.learn(stage, work, took_ms, waiting_ms)
 
     def _stopwatch(self) -> Callable[[], tuple[float, float]]:
-        """Says how many milliseconds have passed since it was made, and how many of them this thread waited."""
+        """Says how many milliseconds have passed since it was made, and how many of them this thread waited.
+
+        Where other threads or a device do the work, its own time tells nothing of it, and all counts as work.
+        """
         start_ms, before = self.deadline.elapsed_ms, thread_usage()
+        works_alone = self._device.type == "cpu" and threads.count() == 1
 
         def taken() -> tuple[float, float]:
             took_ms = self.deadline.elapsed_ms - start_ms
-            return took_ms, waited_ms(before, thread_usage(), took_ms)
+            return took_ms, waited_ms(before, thread_usage(), took_ms) if works_alone else 0.0
 
         return taken
 

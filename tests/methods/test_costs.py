@@ -134,10 +134,28 @@ def test_the_share_of_waiting_is_common_to_all_steps():
     assert costs.upper_bound_ms("long", 1.0) == pytest.approx(alone, rel=0.05)  # the other process has ended
 
 
-def test_one_very_long_wait_counts_as_a_turn_of_the_scheduler():
-    costs = learned([1.0] * 50, lambda work: 2.0)
-    costs.learn("step", 1.0, 502.0, 500.0)
-    assert costs.upper_bound_ms("step", 1.0) < 4.0
+def test_a_long_step_beside_another_process_takes_what_it_took():
+    costs = Costs()
+    for _ in range(80):
+        costs.learn("long", 1.0, 400.0, 200.0)
+    assert costs.upper_bound_ms("long", 1.0) == pytest.approx(400.0, rel=0.05)
+
+
+def test_one_stall_that_was_no_preemption_leaves_the_share_of_waiting():
+    costs = Costs()
+    for _ in range(50):
+        costs.learn("step", 1.0, 2.0, 1.0)
+    costs.learn("step", 1.0, 10_000.0)
+    for _ in range(5):
+        costs.learn("step", 1.0, 2.0, 1.0)
+    assert costs.upper_bound_ms("step", 1.0) > 1.8
+
+
+def test_a_step_that_only_waited_is_not_free():
+    costs = Costs()
+    for _ in range(5):
+        costs.note_abandoned("step", 1.0, 8.0, 8.0)
+    assert costs.upper_bound_ms("step", 1.0) > 4.0
 
 
 def test_waiting_that_lets_no_step_run_decays():

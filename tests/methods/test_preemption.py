@@ -26,6 +26,11 @@ def test_clocks_that_disagree_by_a_little_give_no_negative_wait():
     assert waited_ms(ThreadUsage(100.0, 3), ThreadUsage(105.6, 4), 5.5) == 0.0
 
 
+def test_a_wait_counts_as_long_as_so_many_preemptions_take():
+    assert waited_ms(ThreadUsage(100.0, 3), ThreadUsage(102.0, 4), 502.0) == 20.0
+    assert waited_ms(ThreadUsage(100.0, 3), ThreadUsage(300.0, 33), 500.0) == pytest.approx(300.0)
+
+
 @linux
 def test_work_is_counted_and_sleep_is_not():
     before = thread_usage()

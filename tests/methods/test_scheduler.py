@@ -8,10 +8,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, MatcherOptions, Navigator, NccOptions, NoFix, OrthoMap, Prior, Reason, SceneMatcher
+from engine import (
+    Budget,
+    Fix,
+    MatcherOptions,
+    Navigator,
+    NccOptions,
+    NoFix,
+    OrthoMap,
+    Prior,
+    Reason,
+    SceneMatcher,
+    threads,
+)
+from engine.budget import Deadline
+from engine.device import Device
+from engine.methods import scheduler
+from engine.methods.costs import Costs
 from engine.methods.ncc import Ncc
+from engine.methods.preemption import ThreadUsage
 from engine.methods.refinement import Refinement
-from engine.methods.scheduler import OutOfTime
+from engine.methods.scheduler import OutOfTime, Scheduler
 from engine.methods.sift import Sift
 
 NADIR = np.array([315.0, 296.0])
@@ -239,3 +256,18 @@ def test_warmup_knows_the_cost_of_a_search(site, camera, searched):
     matcher = SceneMatcher(site, camera, "ncc", "cpu", options)
     matcher.warmup()
     assert matcher._costs.upper_bound_ms("ncc hypotheses", 1e5) > 0.0
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_only_where_one_thread_works_its_waiting_is_learned_apart(count, monkeypatch):
+    """A thread that lets others work is off the processor for as long as they work."""
+    monkeypatch.setattr(threads, "count", lambda: count)
+    usages = iter([ThreadUsage(0.0, 0), ThreadUsage(1.0, 1)])
+    monkeypatch.setattr(scheduler, "thread_usage", lambda: next(usages))
+    learned, clock_ns = [], iter([0, 0, 9_000_000])
+    costs = Costs()
+    monkeypatch.setattr(costs, "learn", lambda *run: learned.append(run))
+    one = Scheduler(Deadline(HURRY, lambda: next(clock_ns)), Device("cpu"), costs)
+    with one.costed("step", 5.0):
+        pass
+    assert learned == [("step", 5.0, 9.0, 8.0 if count == 1 else 0.0)]
