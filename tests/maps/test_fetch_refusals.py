@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from http.client import HTTPException
+from xml.etree import ElementTree as Xml
 
 import pytest
 from pyproj import CRS
@@ -13,7 +14,9 @@ from engine.errors import MapError, OptionError
 from engine.maps.fetching import client
 from engine.maps.fetching.client import Client, check_url, shown
 from engine.maps.fetching.heights import files_for, read_part
-from engine.maps.fetching.mosaic import Place
+from engine.maps.fetching.mosaic import Place, Wanted
+from engine.maps.fetching.services import chosen_crs
+from engine.maps.fetching.wmts import plan_wmts
 from engine.runs.map_fetch import FetchSettings, fetch_map
 
 TILES = "http://127.0.0.1:9/{z}/{x}/{y}.png"  # nobody listens there
@@ -74,7 +77,7 @@ def test_what_is_no_key_stays():
     ],
 )
 def test_refusals_do_not_repeat_keys(tmp_path, source):
-    with pytest.raises(OptionError, match="^source: expected") as error:
+    with pytest.raises(OptionError, match=r"^source: expected") as error:
         fetch_map(settings(source), tmp_path / "map.tif")
     assert "S3" not in str(error.value)
     assert "CRET" not in str(error.value)
@@ -95,7 +98,7 @@ def test_nor_do_those_of_heights():
      "http://h/a b/{z}/{x}/{y}.png", "http://h/{z}/{x}/{y}.png?a=\n"],
 )  # fmt: skip
 def test_an_address_that_cannot_be_is_refused_at_once(url):
-    with pytest.raises(OptionError, match="^source: expected a URL ") as error:
+    with pytest.raises(OptionError, match=r"^source: expected a URL ") as error:
         check_url("source", url)
     assert "\n" not in str(error.value)
 
@@ -132,6 +135,58 @@ def test_a_square_beside_it_is_not(tmp_path):
     facts = fetch_map(settings(around="0,179.99", dry_run=True), tmp_path / "map.tif")
     assert facts["tiles"] < 10
     assert Place(0.0, 179.99, 50.0).bounds(CRS.from_epsg(4326))[2] < 180.0
+
+
+# ------------------------------------------------------------ coordinate systems and addresses that servers state
+
+
+def test_only_a_coordinate_system_for_the_place_is_chosen():
+    vienna = Place(48.2, 16.4, 50.0)
+    assert chosen_crs(None, ["EPSG:2154", "EPSG:31256", "EPSG:4326"], vienna) == "EPSG:31256"
+    assert chosen_crs(None, ["EPSG:2154", "EPSG:999999", "EPSG:4326"], vienna) == "EPSG:4326"
+    assert chosen_crs("EPSG:2154", ["EPSG:2154"], vienna) == "EPSG:2154"  # as asked
+    with pytest.raises(OptionError, match=r"crs: expected one for 48.2,16.4 .*, got EPSG:2154"):
+        chosen_crs(None, ["EPSG:2154"], vienna)
+    assert (
+        chosen_crs(None, ["EPSG:3832"], Place(-17.0, 179.0, 50.0)) == "EPSG:3832"
+    )  # its area crosses 180 degrees
+    assert chosen_crs(None, ["EPSG:3832"], Place(-17.0, -179.0, 50.0)) == "EPSG:3832"
+
+
+WMTS = """<Capabilities xmlns="http://www.opengis.net/wmts/1.0" xmlns:ows="http://www.opengis.net/ows/1.1"
+ xmlns:xlink="http://www.w3.org/1999/xlink" version="1.0.0">{operations}<Contents>
+<Layer><ows:Identifier>o</ows:Identifier><Format>image/png</Format>
+<TileMatrixSetLink><TileMatrixSet>odd</TileMatrixSet></TileMatrixSetLink>
+<TileMatrixSetLink><TileMatrixSet>world</TileMatrixSet></TileMatrixSetLink></Layer>
+<TileMatrixSet><ows:Identifier>odd</ows:Identifier><ows:SupportedCRS>EPSG:999999</ows:SupportedCRS>{matrix}
+</TileMatrixSet><TileMatrixSet><ows:Identifier>world</ows:Identifier>
+<ows:SupportedCRS>urn:ogc:def:crs:EPSG::3857</ows:SupportedCRS>{matrix}</TileMatrixSet></Contents></Capabilities>"""
+MATRIX = """<TileMatrix><ows:Identifier>18</ows:Identifier><ScaleDenominator>2132.729583849784</ScaleDenominator>
+<TopLeftCorner>-20037508.342789244 20037508.342789244</TopLeftCorner><TileWidth>256</TileWidth>
+<TileHeight>256</TileHeight><MatrixWidth>262144</MatrixWidth><MatrixHeight>262144</MatrixHeight></TileMatrix>"""
+OPERATIONS = """<ows:OperationsMetadata><ows:Operation name="GetTile"><ows:DCP><ows:HTTP>
+<ows:Get xlink:href="/rest"><ows:Constraint name="GetEncoding"><ows:AllowedValues><ows:Value>RESTful</ows:Value>
+</ows:AllowedValues></ows:Constraint></ows:Get><ows:Get xlink:href="{href}"/></ows:HTTP></ows:DCP></ows:Operation>
+</ows:OperationsMetadata>"""
+
+
+@pytest.mark.parametrize(
+    ("href", "address"),
+    [
+        (None, "https://a.org/caps.xml?key=S3CRET&"),
+        ("https://a.org/tiles?map=m", "https://a.org/tiles?map=m&key=S3CRET&"),
+        ("kvp/", "https://a.org/kvp/?key=S3CRET&"),
+        ("https://b.org/tiles", "https://b.org/tiles?SERVICE="),  # the key is for the host that was named
+    ],
+)
+def test_wmts_tiles_are_asked_for_where_the_server_says_in_a_set_that_is_known(href, address):
+    operations = "" if href is None else OPERATIONS.format(href=href)
+    root = Xml.fromstring(WMTS.format(matrix=MATRIX, operations=operations))
+    wanted = Wanted(place=Place(48.2, 16.4, 50.0), gsd_m_per_px=0.5, max_tiles=9)
+    mosaic = plan_wmts(root, "https://a.org/caps.xml?key=S3CRET", wanted)
+    assert mosaic.crs == CRS.from_epsg(3857)
+    assert all(piece.url.startswith(address) for piece in mosaic.pieces), mosaic.pieces[0].url
+    assert "TILEMATRIXSET=world" in mosaic.pieces[0].url.upper().replace("WORLD", "world")
 
 
 # ------------------------------------------------------------ servers that fall silent

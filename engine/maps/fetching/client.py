@@ -65,9 +65,11 @@ def user_agent() -> str:
 
 
 def shown(url: str) -> str:
-    """A URL, or text with one, without what must not be printed or stored: a user's name and password, and values of
-    query parameters that look like keys. A key in the path cannot be told from the rest of it.
-    """  # by expressions: what is no URL is shown, too
+    """A URL, or text with one, without what must not be printed or stored.
+
+    That is a user's name and password, and values of query parameters that look like keys. A key in the path
+    cannot be distinguished from the rest of it, and stays.
+    """
 
     def hidden(pair: re.Match[str]) -> str:
         return f"{pair[1]}=..." if _SECRET.search(unquote(pair[1])) else pair[0]
