@@ -67,6 +67,18 @@ def test_evaluate_says_what_its_page_loses(moved, capsys):
     assert "report.html loses the frames that it showed: " in capsys.readouterr().err
 
 
+def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(finished, tmp_path):
+    other = Path(shutil.copytree(finished / "out", tmp_path / "other"))
+    rows = (other / "track.csv").read_text(encoding="utf-8").splitlines()
+    blank = [line if k == 0 else "," + line.partition(",")[2] for k, line in enumerate(rows)]
+    (other / "track.csv").write_text("\n".join(blank) + "\n", encoding="utf-8")
+    third, alike, mixed = shutil.copytree(other, tmp_path / "c"), tmp_path / "alike.html", tmp_path / "mixed.html"
+    assert run(["report", str(finished / "out"), str(third), f"--out={mixed}"]) == 0
+    assert run(["report", str(other), str(third), f"--out={alike}"]) == 0
+    assert "Stated sigma (m)" in alike.read_text(encoding="utf-8")
+    assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
+
+
 def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_drawn(
     finished, tmp_path, monkeypatch, capsys
 ):
