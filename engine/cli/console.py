@@ -28,7 +28,8 @@ _PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
 
 def say(text: str) -> None:
     """One line for a person, on standard error; never folded."""
-    print(" ".join(text.split()), file=sys.stderr, flush=True)
+    line = " ".join(part.strip() for part in text.splitlines())  # spaces stay: they may be those of a path
+    print(line.strip(), file=sys.stderr, flush=True)
 
 
 def next_step(command: str, *, as_json: bool = False, hint: str = "") -> None:

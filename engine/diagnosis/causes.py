@@ -23,6 +23,8 @@ _HEIGHT_SHARE, _HEIGHT_M = 0.02, 1.5  # of a height by features alone
 _LEAST = 3
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
+IN_CALIBRATION = " in the calibration"
+"""Ends a cure that is a line of a file, which not every flight has."""
 
 
 def findings(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
@@ -167,7 +169,7 @@ def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, 
 
 
 def _mount_line(mount: Array) -> str:
-    return f"mount: [{', '.join(f'{v:.5f}' for v in mount.ravel())}] in the calibration"
+    return f"mount: [{', '.join(f'{v:.5f}' for v in mount.ravel())}]{IN_CALIBRATION}"
 
 
 def _late(measured: Array, told: Told, index: NDArray[np.intp]) -> tuple[float, Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,11 @@ from engine.report.page_map import TrackMap
 from engine.report.plot_data import TrackPlotData
 from engine.report.verdict import metres
 from engine.values import Window
+
+
+def shows_frames(page: Path) -> bool:
+    """Whether a page that was written shows frames; a file that is not there does not."""
+    return page.is_file() and 'id="slider"' in page.read_text(encoding="utf-8", errors="replace")
 
 
 def draw_slider(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[SliderFrame], why_not: str) -> str:

@@ -118,8 +118,15 @@ def _run_legend(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, str]]:
 
 
 def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotData]) -> list[Chart]:
-    """Error, error in sigmas, and latency over time, and the share of frames by error; those with data."""
+    """Error, error in sigmas, and latency over time, and the share of frames by error; those with data.
+
+    Those over time are left out where the stamps of a run are missing and those of another are not.
+    """
     ends = [float(d.time[-1]) for d in data.values() if d.time.size]
+    labels = {d.time_label for d in data.values() if d.time.size}
+    if len(labels) > 1:  # seconds of some runs, and numbers of frames of others, have no common axis
+        found = _cumulative([d.errors.distance_m for d in data.values()])
+        return [] if found is None else [found]
     if not ends or not max(ends):
         return []
     time: Limits = (0.0, max(ends))
@@ -131,7 +138,7 @@ def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotDat
         "Stated sigma (m)": [np.sqrt(larger_variance_m2(d.errors.covariance_en_m2)) for d in data.values()],
         "Latency (ms)": [column(track.rows, "latency_ms") for track in tracks.values()],
     }
-    label = next(iter(data.values())).time_label
+    (label,) = labels
     times = [d.time for d in data.values()]
     charts = [_over_time(what, label, time, times, values) for what, values in series.items()]
     charts.append(_cumulative(next(iter(series.values()))))

@@ -147,6 +147,11 @@ def _execute(execute: Execute, jobs: Sequence[Job], description: str, progress: 
     return failures
 
 
+def run_folder(out: Path, line: CampaignRow) -> Path:
+    """The folder of a run in that of its campaign."""
+    return out / RUNS / line.flight / line.run
+
+
 def _line(job: Job, groups: dict[str, str], failures: dict[str, str]) -> CampaignRow:
     flight, _, run = job.name.partition("/")
     failure = failures.get(job.name) or failures.get(flight)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
-from engine.diagnosis import Diagnosis, diagnose
+from engine.diagnosis import Diagnosis, Finding, diagnose
+from engine.diagnosis.causes import IN_CALIBRATION
 from engine.errors import OptionError
 from engine.formats.truth import interpolate_truth
 from engine.runs.arguments import parse_position
@@ -50,7 +52,7 @@ def diagnose_flight(
     stamps = [row.timestamp_ns for row in flight.rows]
     reference = [_of_truth(stamp, inputs.truth) for stamp in stamps] if inputs.truth and stamps else positions
     with progress.task("placing pictures without the telemetry"):
-        return diagnose(
+        found = diagnose(
             flight.rows or [flight.read(0).frame] * len(flight),
             lambda index: flight.read(index).frame,
             inputs.site,
@@ -59,6 +61,29 @@ def diagnose_flight(
             start=begin,
             reference=reference,
         )
+    # A bag holds its calibration, which cannot be written to.
+    cures = [
+        _that_can_be_set(one, flight.has_gimbal, files.camera not in (None, files.frames))
+        for one in found.findings
+    ]
+    return replace(found, findings=cures)
+
+
+def _that_can_be_set(finding: Finding, has_gimbal: bool, has_calibration: bool) -> Finding:
+    """A finding whose cure is possible: not every flight has a mount that can be written somewhere."""
+    line, where, _ = finding.cure.partition(IN_CALIBRATION)
+    if finding.cause != "mount" or not (has_gimbal or where):
+        return finding
+    if has_gimbal:
+        return replace(
+            finding, cure="a mount cannot be set beside a gimbal's angles: correct these, by --column roll_deg=, "
+            "--column pitch_deg= or --heading-offset-deg",
+        )  # fmt: skip
+    return (
+        finding
+        if has_calibration
+        else replace(finding, cure=f"write a calibration file with {line}, for --camera")
+    )
 
 
 def _of_truth(stamp_ns: int, truth: list[Truth]) -> Prior | None:

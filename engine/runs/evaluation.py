@@ -6,18 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from engine.errors import EngineError, TelemetryError
+from engine.errors import EngineError, OptionError, TelemetryError
 from engine.formats.corrections import Corrections
 from engine.formats.settings import nested, options_from_mapping
 from engine.formats.track import TrackRow, read_track
 from engine.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.report.metrics import Ground
+from engine.report.page_frames import shows_frames
 from engine.runs.folders import StrPath
 from engine.runs.inputs import FlightFiles, open_map, open_run_truth
 from engine.runs.progress import SILENT, Progress
 from engine.runs.record import RunRecord, read_record
-from engine.runs.results import SUMMARY, TRACK, ReportFrames, write_results
+from engine.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, write_results
 from engine.runs.settings import TrackSettings
 
 
@@ -42,12 +43,15 @@ def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progres
     return redraw(folder, truth, progress=progress)
 
 
-def redraw(folder: Path, truth: StrPath | None = None, *, progress: Progress = SILENT) -> dict[str, Any]:
+def redraw(
+    folder: Path, truth: StrPath | None = None, *, keep_frames: bool = False, progress: Progress = SILENT
+) -> dict[str, Any]:
     """Write the results of a finished run again, by its own record.
 
     Args:
         folder: of the run.
         truth: in place of the one that the run had.
+        keep_frames: whether a page that shows frames is not to be replaced by one that cannot show them any more.
         progress: is shown what the run does.
 
     Returns:
@@ -55,6 +59,7 @@ def redraw(folder: Path, truth: StrPath | None = None, *, progress: Progress = S
 
     Raises:
         TelemetryError: the folder holds no finished track.
+        OptionError: the page would lose its frames.
     """
     rows = read_track(folder / TRACK)
     record = read_record(folder / SUMMARY)
@@ -64,6 +69,13 @@ def redraw(folder: Path, truth: StrPath | None = None, *, progress: Progress = S
     site = open_recorded_map(record, progress)
     ground = Ground(record.ground_m, record.ground_amsl_m)
     frames = _report_frames(record, rows, site)
+    if frames.flight is None and shows_frames(folder / PAGE):
+        if keep_frames:
+            raise OptionError(
+                f"runs: {folder / PAGE} shows frames, which are lost if it is drawn again; add `force` to do so; "
+                f"{frames.why_missing}"
+            )
+        progress.message(f"{folder / PAGE} loses the frames that it showed: {frames.why_missing}")
     if path is not None:
         record = replace(record, truth=str(Path(path).resolve()))
     return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +24,7 @@ from engine.maps.fetching.heights import (
     write_heights,
 )
 from engine.maps.fetching.mosaic import FINE_ENOUGH, Bounds, Mosaic, Place, Wanted
-from engine.maps.fetching.pictures import fetch_pieces, piece_file, remove_pieces, write_map
+from engine.maps.fetching.pictures import fetch_pieces, kept_pieces, piece_file, remove_pieces, write_map
 from engine.maps.fetching.services import capabilities, query_value, with_query
 from engine.maps.fetching.wms import plan_wms
 from engine.maps.fetching.wmts import plan_wmts
@@ -118,19 +119,20 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     progress.message(f"note: {NOTE}")
     client = Client(settings.pause_ms, settings.timeout_s, progress.message)
     mosaic = _planned(settings, wanted, client)
+    _check_surface_stays(_surface_files(settings, mosaic), (out, surface_out))
     _say_what_comes(mosaic, settings, wanted, progress)
     folder = out.with_name(f"{out.name}.tiles")
     facts = _plan_facts(settings, mosaic, folder)
     if settings.dry_run:
         return facts | {"surface_files": list(map(shown, _surface_files(settings, mosaic))), "dry_run": True}
-    folder.mkdir(parents=True, exist_ok=True)
     fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
-    surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
-    asked = sum(progress.track(fetch_pieces(mosaic, client, folder), len(mosaic.pieces), "fetching"))
-    written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc), progress)
-    if surface is not None:
-        os.replace(folder / SURFACE, surface_out)
-    remove_pieces(folder)
+    with kept_pieces(folder):
+        surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
+        asked = sum(progress.track(fetch_pieces(mosaic, client, folder), len(mosaic.pieces), "fetching"))
+        written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc), progress)
+        if surface is not None:
+            os.replace(folder / SURFACE, surface_out)
+        remove_pieces(folder)
     received = {"fetched": asked, "fetched_mb": client.bytes_received / 1e6}
     return {"file": str(out)} | facts | received | written | _surface_facts(surface, surface_out)
 
@@ -304,6 +306,18 @@ def _map_tags(settings: FetchSettings, mosaic: Mosaic, fetched_utc: str) -> dict
 
 def _surface_files(settings: FetchSettings, mosaic: Mosaic) -> list[str]:
     return [] if settings.surface is None else files_for(settings.surface, _bounds_deg(mosaic))
+
+
+def _check_surface_stays(files: Sequence[str], outputs: Sequence[Path]) -> None:
+    """Refuse to replace the heights that are read by a part of them, whatever may be replaced.
+
+    Raises:
+        OptionError: a file of heights is one that the fetch writes.
+    """
+    for file in map(Path, files):  # an address is no file that exists
+        for output in outputs:
+            if file.exists() and output.exists() and file.samefile(output):
+                raise OptionError(f"out: {output} is the `surface` that is read; choose another file")
 
 
 def _fetch_surface(

@@ -31,24 +31,28 @@ def report(
     Args:
         folders: of one run, whose own page is written again, or of several, drawn on the first one's map.
         out: the page on several runs; None is ``comparison.html`` in the working directory.
-        force: whether that may be there already.
+        force: whether that may be there already; of one run, whether its page may lose frames that are not there
+            any more.
         progress: is shown what the run does.
 
     Returns:
         The page.
 
     Raises:
-        OptionError: there are too many runs, one of them twice, or ``out`` is given with one run.
+        OptionError: there are too many runs, one of them twice, ``out`` is given with one run or is in no folder,
+            or a page would lose its frames.
         TelemetryError: a folder holds no finished track.
     """
     runs = [Path(folder) for folder in folders]
     if len(runs) == 1:
         if out is not None:
             raise OptionError(f"out: expected none with one run, whose page is {runs[0] / PAGE}")
-        redraw(runs[0], progress=progress)
+        redraw(runs[0], keep_frames=not force, progress=progress)
         return runs[0] / PAGE
     page = Path(COMPARISON if out is None else out)
     check_file(page, force)
+    if not page.parent.is_dir():  # before the runs are drawn
+        raise OptionError(f"out: expected a file in a folder that exists, got {page}")
     draw_together(page, run_names(runs), progress=progress)
     return page
 

@@ -55,7 +55,8 @@ def write_results(
 ) -> dict[str, Any]:
     """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones.
 
-    The figures are left out where matplotlib is not installed, as on a vehicle: no track is lost for them.
+    The figures are left out where matplotlib is not installed, as on a vehicle: no track is lost for them, and
+    older ones stay.
     """
     summary = summarise(rows, truth, frame=site.frame, ground=ground)
     segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
@@ -65,11 +66,11 @@ def write_results(
     (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not report:
         return summary
-    for name in FIGURES:
-        (out / name).unlink(missing_ok=True)
     title = f"{record.method} ({record.profile} profile)"
     try:
-        require("matplotlib", "desk")
+        require("matplotlib", "desk")  # first, or older figures would be lost for nothing
+        for name in FIGURES:
+            (out / name).unlink(missing_ok=True)
         draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
     except MissingExtraError as error:
         progress.message(f"no plots are drawn: {error}")
@@ -88,7 +89,8 @@ def finished_track(
 ) -> FinishedTrack:
     """A finished track with what its folder holds beside it."""
     notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
-    loop = read_loop_csv(out / LOOP) if (out / LOOP).is_file() else None
+    is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be that of another run
+    loop = read_loop_csv(out / LOOP) if is_loop and (out / LOOP).is_file() else None
     telemetry = None if frames.flight is None else frames.flight.rows
     return FinishedTrack(rows, truth, site, ground, summary, notes, telemetry, loop)
 

@@ -10,6 +10,7 @@ from typer.main import get_command
 
 from engine.cli import console
 from engine.cli.app import app, run
+from engine.report.campaign import CampaignRow
 from tests.cli.test_json import LEAVES
 
 
@@ -60,6 +61,41 @@ def test_others_name_commands_that_exist(flight, tmp_path, capsys):
     assert parsed(next_of(capsys, ["map", "info", str(flight / "map.tif")])) == "audit"
     assert parsed(next_of(capsys, ["doctor"])) == "demo"
     assert parsed(next_of(capsys, ["dataset", "check", str(flight)])) == "track"
+
+
+@pytest.mark.usefixtures("bare_runs")
+@pytest.mark.parametrize(("runs", "drawn"), [(["ncc"], "comparison.png"), (["ncc", "sift"], "comparison.html")])
+def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs, drawn):
+    out = tmp_path / "two  spaces"
+    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
+    files = [f"--{option}={flight / name}" for option, name in names.items()]
+    assert run(["compare", *files, f"--out={out}", *(f"--run={name}" for name in runs)]) == 0
+    last = capsys.readouterr().err.splitlines()[-1]
+    found = re.fullmatch(r"next: open (.+); scenematch (.+)", last)
+    assert shlex.split(found[1]) == [str(out / drawn)]
+    assert (out / drawn).is_file()
+    assert parsed(shlex.split(found[2])) == "init"
+
+
+def test_campaign_names_runs_that_it_finished(tmp_path, capsys, monkeypatch):
+    lines = [
+        CampaignRow("group", "bad", "ncc", None, None, "its camera does not fit"),
+        *(CampaignRow("group", "good", name, None, None, None) for name in ("ncc", "sift", "auto")),
+    ]
+    monkeypatch.setattr("engine.runs.campaign.run_campaign", lambda *_, **__: lines)
+    monkeypatch.setattr("engine.report.campaign.pool_runs", lambda _: [])
+    words = next_of(capsys, ["campaign", "c.toml", f"--out={tmp_path / 'o'}"], code=1)
+    assert words == ["report", *(str(tmp_path / "o" / "runs" / "good" / name) for name in ("ncc", "sift"))]
+    del lines[1:]
+    assert next_of(capsys, ["campaign", "c.toml", "--out=o"], code=1) == ["report", "RUN"]
+
+
+def test_a_path_with_two_spaces_stays_as_it_is(capsys):
+    console.next_step(f"track {console.options(map='two  spaces/a map.tif')}")
+    said = capsys.readouterr().err
+    assert shlex.split(said)[-1] == "two  spaces/a map.tif"
+    console.say("one\n  line ")
+    assert capsys.readouterr().err == "one line\n"
 
 
 def test_a_program_is_told_nothing(tmp_path, capsys):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,6 +126,18 @@ def test_evaluate_scores_it_again(loop):
     after = json.loads((loop / "summary.json").read_text())
     assert after["rms_m"] == pytest.approx(before["rms_m"], abs=1e-9)
     assert (loop / "loop.json").exists()
+
+
+@pytest.mark.usefixtures("bare_runs")
+def test_a_flight_that_was_tracked_into_a_loops_folder_was_steered_by_nothing(folder, loop, tmp_path):
+    assert "Closed loop: steered by" in (loop / "report.html").read_text(encoding="utf-8")
+    out = Path(shutil.copytree(loop, tmp_path / "loop"))
+    words = [f"--{name}={folder / file}" for name, file in
+             {"camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}.items()]  # fmt: skip
+    assert run(["track", *own_map(folder), *words, f"--out={out}", "--method=ncc", "--device=cpu", "--force"]) == 0
+    for again in ([], ["evaluate", str(out)]):
+        assert not again or run(again) == 0
+        assert "Closed loop" not in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, loop, capsys):

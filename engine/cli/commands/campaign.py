@@ -35,7 +35,7 @@ def campaign(
     earlier one ended, for whatever reason it did.
     """
     from engine.report.campaign import POOL_COLUMNS, pool_runs, pooled_cells
-    from engine.runs.campaign import run_campaign
+    from engine.runs.campaign import run_campaign, run_folder
 
     lines = run_campaign(file, out, workers=workers, ray=ray, force=force, progress=console.PROGRESS)
     if as_json:
@@ -45,5 +45,6 @@ def campaign(
         for group in dict.fromkeys(pool.group for pool in pools):
             console.print_table(group, POOL_COLUMNS, [pooled_cells(p) for p in pools if p.group == group])
         console.say(f"written to {out}")
-    console.next_step(f"report {console.quoted(out)}/RUN {console.quoted(out)}/RUN", as_json=as_json)
+    done = [console.quoted(run_folder(out, line)) for line in lines if not line.failure][:2]
+    console.next_step(f"report {' '.join(done) or 'RUN'}", as_json=as_json)
     raise typer.Exit(1 if any(line.failure for line in lines) else 0)

@@ -74,8 +74,8 @@ def compare(
     Follows the flight once a run, each into a folder of its own as track does, and compares them in one table
     and one chart.
     """
+    from engine.runs.comparison import CHART, COMPARISON, parse_runs
     from engine.runs.comparison import compare as compare_runs
-    from engine.runs.comparison import parse_runs
     from engine.runs.inputs import FlightFiles
 
     use_threads(threads)
@@ -92,5 +92,6 @@ def compare(
     else:
         tables.print_comparison(results, str(frames))
         console.say(f"written to {out}")
-    page = f"open {out / 'comparison.html'}"
-    console.next_step("init --out scenematch.toml", as_json=as_json, hint=page)
+    # There is a page on as many runs as it has colours for, and always a chart.
+    drawn = next((out / name for name in (COMPARISON, CHART) if (out / name).is_file()), out)
+    console.next_step("init --out scenematch.toml", as_json=as_json, hint=f"open {console.quoted(drawn)}")

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
-from http.client import HTTPException
+from http.client import HTTPException, InvalidURL
 from importlib.metadata import PackageNotFoundError, version
 from urllib.error import HTTPError, URLError
-from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
+from urllib.parse import unquote, urlsplit
 from urllib.request import Request, build_opener, getproxies, proxy_bypass
 
 from engine.errors import MapError, OptionError
@@ -26,7 +26,13 @@ MAX_WAIT_S = 300.0
 MAX_BYTES = 128 << 20
 _BUSY = (429, 500, 502, 503, 504)
 _NO_DATA = (404, 410)
-_SECRET = re.compile(r"key|token|secret|passw|signature|^sig$|auth|credential", re.IGNORECASE)
+_SECRET = re.compile(
+    r"key|token|secret|pass|pwd|signature|auth|credential|session|ticket|login|user"
+    r"|^(sig|tk|ak|sk|pw|code|gkt|jwt|sid|hmac|(app|client)[-_]?(id|code))$",
+    re.IGNORECASE,
+)
+_PARAMETER = re.compile(r"(?<=[?&#;])([^=?&#;]+)=([^&#;]*)")
+_USER = re.compile(r"(?<=://)[^/?#]*@")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,24 +65,35 @@ def user_agent() -> str:
 
 
 def shown(url: str) -> str:
-    """A URL without what must not be printed or stored: values of query parameters that look like keys."""
-    parts = urlsplit(url)
-    pairs = parse_qsl(parts.query, keep_blank_values=True)
-    if not any(_SECRET.search(name) for name, _ in pairs):
-        return url
-    hidden = [(name, "..." if _SECRET.search(name) else value) for name, value in pairs]
-    return urlunsplit(parts._replace(query=urlencode(hidden, safe="/:{},-.")))
+    """A URL, or text with one, without what must not be printed or stored.
+
+    That is a user's name and password, and values of query parameters that look like keys. A key in the path
+    cannot be distinguished from the rest of it, and stays.
+    """
+
+    def hidden(pair: re.Match[str]) -> str:
+        return f"{pair[1]}=..." if _SECRET.search(unquote(pair[1])) else pair[0]
+
+    return _PARAMETER.sub(hidden, _USER.sub("...@", url))
 
 
 def check_url(argument: str, url: str) -> None:
     """Refuse what is no web address.
 
     Raises:
-        OptionError: it is of another scheme, has no host, or a password in it.
+        OptionError: it is of another scheme, has no host, a password in it, or what no URL has.
     """
-    parts = urlsplit(url)
+    if any(character <= " " or character == "\x7f" for character in url):
+        raise OptionError(f"{argument}: expected a URL without spaces (%20 is one), got {shown(url)!r}")
+    try:
+        parts = urlsplit(url)
+        _ = parts.port
+    except ValueError as error:
+        raise OptionError(
+            f"{argument}: expected a URL with a host and port, got {shown(url)!r} ({error})"
+        ) from None
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise OptionError(f"{argument}: expected a URL that begins with https:// or http://, got {url!r}")
+        raise OptionError(f"{argument}: expected a URL that begins with https:// or http://, got {shown(url)!r}")
     if "@" in parts.netloc:
         raise OptionError(f"{argument}: expected a URL without user and password in it")
 
@@ -91,7 +108,7 @@ class Client:
     """
 
     def __init__(self, pause_ms: float, timeout_s: float, say: Callable[[str], None]) -> None:
-        self._pause_s, self._timeout_s, self._say = pause_ms / 1e3, timeout_s, say
+        self._pause_s, self.timeout_s, self._say = pause_ms / 1e3, timeout_s, say
         self._opener = build_opener()  # with the proxies of the environment
         self._ended_s = -math.inf
         self.bytes_received = 0
@@ -129,7 +146,7 @@ class Client:
         if first_bytes is not None:
             headers["Range"] = f"bytes=0-{first_bytes - 1}"
         try:
-            with self._opener.open(Request(url, headers=headers), timeout=self._timeout_s) as response:
+            with self._opener.open(Request(url, headers=headers), timeout=self.timeout_s) as response:
                 if response.status == 204:
                     return None
                 content = response.read(MAX_BYTES + 1 if first_bytes is None else first_bytes)
@@ -142,6 +159,8 @@ class Client:
                 raise self._refusal(url, error) from None
         except URLError as error:
             raise self._unreachable(url, error.reason) from None
+        except InvalidURL as error:  # such as one that a server sends to
+            raise MapError(f"{shown(url)}: cannot be asked for: {shown(_text(error))}") from None
         except (OSError, HTTPException) as error:
             raise _AgainError(f"the connection broke ({_text(error)})") from None
         except ValueError as error:
@@ -170,7 +189,7 @@ class Client:
         if isinstance(reason, socket.gaierror):
             return MapError(f"{shown(url)}: the host {host} is unknown, or there is no network{through}")
         if isinstance(reason, TimeoutError):
-            return _AgainError(f"no answer within {self._timeout_s:g} s{through}")
+            return _AgainError(f"no answer within {self.timeout_s:g} s{through}")
         if isinstance(reason, ConnectionRefusedError) or "Tunnel" in str(reason):
             return MapError(f"{shown(url)}: cannot connect to {host}{through} ({_text(reason)})")
         if "CERTIFICATE_VERIFY_FAILED" in str(reason):

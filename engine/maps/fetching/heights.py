@@ -69,8 +69,11 @@ def files_for(template: str, bounds_deg: Bounds) -> list[str]:
         OptionError: a placeholder is unknown or missing, or the URL is none.
     """
     names = set(_PLACEHOLDER.findall(template))
-    if names not in (set(), {"lat", "lon"}):
-        raise OptionError(f"surface: expected {{lat}} and {{lon}} as placeholders, or none, in {template!r}")
+    stray = set("{}") & set(_PLACEHOLDER.sub("", template))
+    if stray or names not in (set(), {"lat", "lon"}):
+        raise OptionError(
+            f"surface: expected {{lat}} and {{lon}} as placeholders, or none, in {shown(template)!r}"
+        )
     if "://" in template:
         check_url("surface", template)
     if not names:
@@ -107,6 +110,9 @@ def read_part(
         "GDAL_HTTP_USERAGENT": user_agent(),
         "GDAL_HTTP_MAX_RETRY": 3,
         "GDAL_HTTP_RETRY_DELAY": 2,
+        "GDAL_HTTP_CONNECTTIMEOUT": math.ceil(client.timeout_s),
+        "GDAL_HTTP_LOW_SPEED_TIME": math.ceil(client.timeout_s),  # without a byte; the whole may take longer
+        "GDAL_HTTP_LOW_SPEED_LIMIT": 1,
         "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # no requests for side files
     }
     with rasterio.Env(**settings), ExitStack() as opened:
@@ -136,8 +142,8 @@ def _opened(file: str, client: Client) -> Any:
     try:
         return rasterio.open(f"/vsicurl/{file}", driver="GTiff")
     except RasterioError as error:
-        reason = str(error.__cause__ or error).splitlines()[0].replace(file, shown(file))
-        raise MapError(f"{shown(file)}: cannot be read as a GeoTIFF by ranges of bytes: {reason}") from None
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise MapError(f"{shown(file)}: cannot be read as a GeoTIFF by ranges of bytes: {shown(reason)}") from None
 
 
 def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum: str | None) -> Heights:
@@ -157,7 +163,7 @@ def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum
             warnings.simplefilter("ignore", PendingDeprecationWarning)  # rasterio's own, of affine 3
             data, _ = merge(list(datasets.values()), bounds=box, res=step, **how)
     except (RasterioError, OSError, ValueError) as error:
-        raise MapError(f"surface: cannot read {name}: {str(error).splitlines()[0]}") from None
+        raise MapError(f"surface: cannot read {name}: {shown(str(error).splitlines()[0])}") from None
     heights = np.where(data[0] == NODATA, np.nan, data[0] * first.scales[0] + first.offsets[0]).astype(np.float32)
     if not np.isfinite(heights).any():
         raise MapError(f"surface: expected heights under the map, got none in {name}")

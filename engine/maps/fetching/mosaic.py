@@ -48,6 +48,13 @@ class Place:
 
         plane = CRS.from_proj4(f"+proj=aeqd +lat_0={self.lat_deg} +lon_0={self.lon_deg} +datum=WGS84 +units=m")
         half = self.radius_m
+        to_degrees = Transformer.from_crs(plane, 4326, always_xy=True)
+        west, _, east, _ = to_degrees.transform_bounds(-half, -half, half, half)
+        if not west < east < west + 180.0:  # in metres, its edges would be those of the whole Earth
+            raise OptionError(
+                f"around: expected a square that does not cross 180 degrees east, got {self.lat_deg:g},"
+                f"{self.lon_deg:g} with `radius_m` {half:g}"
+            )
         to_crs = Transformer.from_crs(plane, crs, always_xy=True)
         found: Bounds = to_crs.transform_bounds(-half, -half, half, half)
         if not (all(map(math.isfinite, found)) and found[0] < found[2] and found[1] < found[3]):

@@ -6,6 +6,7 @@ import hashlib
 import io
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -184,10 +185,19 @@ def _write_piece(file: Any, piece: Piece, mosaic: Mosaic, pixels: Pixels, *, mas
         file.write_mask(valid.astype(np.uint8) * np.uint8(255), window=window)
 
 
+@contextmanager
+def kept_pieces(folder: Path) -> Iterator[None]:
+    """A folder of pieces, which stays for a later fetch where anything is left in it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+
+
 def remove_pieces(folder: Path) -> None:
-    """Remove the pieces of a folder, and the folder if nothing else is in it."""
+    """Remove the pieces of a folder."""
     for pattern in ("*.piece", "*.part"):
         for file in folder.glob(pattern):
             file.unlink()
-    if not any(folder.iterdir()):
-        folder.rmdir()

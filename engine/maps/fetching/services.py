@@ -123,6 +123,28 @@ def crs_of(code: str) -> CRS:
         raise MapError(f"crs: expected a coordinate system that PROJ knows, got {code!r}") from None
 
 
+def is_known(code: str) -> bool:
+    """Whether PROJ knows the coordinate system of a code."""
+    try:
+        crs_of(code)
+    except MapError:
+        return False
+    return True
+
+
+def _reaches(code: str, place: Place) -> bool:
+    """Whether a coordinate system is one for a place, by the area that its authority states."""
+    if not is_known(code):
+        return False
+    area = crs_of(code).area_of_use
+    if area is None:
+        return True
+    west, east = area.west, area.east
+    across = place.lon_deg >= west or place.lon_deg <= east  # of an area over 180 degrees
+    inside = west <= place.lon_deg <= east if west <= east else across
+    return bool(inside and area.south <= place.lat_deg <= area.north)
+
+
 def is_north_first(crs: CRS) -> bool:
     """Whether the authority gives the first axis of a coordinate system northwards."""
     return bool(crs.axis_info) and crs.axis_info[0].direction.lower() == "north"
@@ -131,10 +153,11 @@ def is_north_first(crs: CRS) -> bool:
 def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
     """The code of a coordinate system that is offered: the one asked for, else one in metres at the place.
 
-    The UTM zone comes first, then Web Mercator, then any other but degrees.
+    The UTM zone comes first, then Web Mercator, then any other but degrees; only what PROJ knows, and what is made
+    for that part of the Earth.
 
     Raises:
-        OptionError: the one that was asked for is not offered, or none is.
+        OptionError: the one that was asked for is not offered, or none is that will do.
     """
     codes = [code_of(name) for name in offered]
     if asked is not None or not codes:
@@ -143,7 +166,15 @@ def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
     bases = (32600, 25800, 26900) if place.lat_deg >= 0.0 else (32700,)  # WGS84, ETRS89, NAD83
     utm = tuple(f"EPSG:{base + zone}" for base in bases)
     others = [code for code in codes if code not in _DEGREES]
-    return next(code for code in (*utm, *_MERCATOR, *others, *_DEGREES) if code in codes)
+    ordered = (code for code in (*utm, *_MERCATOR, *others, *_DEGREES) if code in codes)
+    chosen = next((code for code in ordered if _reaches(code, place)), None)
+    if chosen is None:
+        listed = ", ".join(codes[:20]) + (f" and {len(codes) - 20} more" if len(codes) > 20 else "")
+        raise OptionError(
+            f"crs: expected one for {place.lat_deg:g},{place.lon_deg:g} that PROJ knows, got {listed}; "
+            "one of them is used where it is asked for"
+        )
+    return chosen
 
 
 def chosen_format(asked: str | None, offered: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from urllib.parse import quote, urljoin
+from urllib.parse import parse_qsl, quote, urljoin, urlsplit
 from xml.etree import ElementTree as Xml
 
 from engine.errors import MapError, OptionError
@@ -27,6 +27,7 @@ from engine.maps.fetching.services import (
     chosen_name,
     code_of,
     crs_of,
+    is_known,
     is_north_first,
     names_of,
     numbers,
@@ -35,6 +36,7 @@ from engine.maps.fetching.services import (
     with_query,
 )
 
+_HREF = "{http://www.w3.org/1999/xlink}href"
 _PIXEL_M = 0.00028  # of the screen that scale denominators are stated for
 _PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
@@ -76,7 +78,7 @@ def plan_wmts(root: Xml.Element, url: str, wanted: Wanted) -> Mosaic:
     level = fine_enough(levels, wanted.gsd_m_per_px, wanted.place.metres_per_unit(crs_of(code)))
     part = tiles_over(level, wanted.place.bounds(crs_of(code)))
     check_count(part, wanted.max_tiles)
-    url_of = _address(url, _Chosen(element, name, matrix_set, kind), level)
+    url_of = _address(url, _query_address(root, url), _Chosen(element, name, matrix_set, kind), level)
     bytes_per_px = BYTES_PER_PX.get(kind.split(";")[0], 0.5)
     states = stated(root.find("{*}ServiceIdentification"))
     rest = {"kind": "WMTS", "gaps": True, "bytes_per_px": bytes_per_px, "states": states}
@@ -84,13 +86,13 @@ def plan_wmts(root: Xml.Element, url: str, wanted: Wanted) -> Mosaic:
 
 
 def _matrix_sets(root: Xml.Element, layer: Xml.Element) -> dict[str, tuple[str, list[Level]]]:
-    """The sets of levels that a layer has, by the code of their coordinate system; the first of each."""
+    """The sets of levels that a layer has, by the code of their coordinate system; of each known one the first."""
     linked = names_of(layer.iterfind("{*}TileMatrixSetLink"), "TileMatrixSet")
     found: dict[str, tuple[str, list[Level]]] = {}
     for element in root.iterfind("{*}Contents/{*}TileMatrixSet"):
         name = (element.findtext("{*}Identifier") or "").strip()
         code = code_of(element.findtext("{*}SupportedCRS") or "")
-        if name in linked and code not in found:
+        if name in linked and code not in found and is_known(code):
             found[code] = (name, [_level(matrix, code) for matrix in element.iterfind("{*}TileMatrix")])
     return {code: (name, levels) for code, (name, levels) in found.items() if levels}
 
@@ -116,8 +118,35 @@ def _metres_per_unit(code: str) -> float:
     return 6378137.0 * axis.unit_conversion_factor if "degree" in axis.unit_name else axis.unit_conversion_factor
 
 
-def _address(url: str, chosen: _Chosen, level: Level) -> Callable[[int, int], str]:
-    """The function from column and row to the address of a tile: by a template where there is one.
+def _query_address(root: Xml.Element, url: str) -> str:
+    """Where tiles are asked for by queries: as the server states it, else where its capabilities are.
+
+    What the user's address has in its query, such as a key, is kept at the same host and sent to no other.
+
+    Raises:
+        OptionError: it is no address.
+    """
+    path = "{*}OperationsMetadata/{*}Operation[@name='GetTile']/{*}DCP/{*}HTTP/{*}Get"
+    stated_at = (get.get(_HREF, "") for get in root.iterfind(path) if _takes_queries(get))
+    href = next((href for href in stated_at if href), None)
+    if href is None:
+        return url
+    href = urljoin(url, href)
+    check_url("source", href)
+    if urlsplit(href).netloc != urlsplit(url).netloc:
+        return href
+    own = dict(parse_qsl(urlsplit(url).query, keep_blank_values=True))
+    return with_query(href, {name: value for name, value in own.items() if query_value(href, name) is None})
+
+
+def _takes_queries(get: Xml.Element) -> bool:
+    """Whether an address takes queries: it says so, or says nothing."""
+    ways = [(value.text or "").strip() for value in get.iterfind("{*}Constraint/{*}AllowedValues/{*}Value")]
+    return not ways or "KVP" in ways
+
+
+def _address(url: str, query_url: str, chosen: _Chosen, level: Level) -> Callable[[int, int], str]:
+    """The function from column and row to the address of a tile: by a template if there is one, else by query.
 
     Raises:
         OptionError: the template needs a value that is not known.
@@ -144,7 +173,7 @@ def _address(url: str, chosen: _Chosen, level: Level) -> Callable[[int, int], st
     if template is None:
         fixed = {"SERVICE": "WMTS", "REQUEST": "GetTile", "VERSION": "1.0.0", "LAYER": chosen.name}
         fixed |= {name.upper(): value for name, value in values.items()} | {"FORMAT": chosen.kind}
-        return lambda column, row: with_query(url, fixed | {"TILEROW": str(row), "TILECOL": str(column)})
+        return lambda column, row: with_query(query_url, fixed | {"TILEROW": str(row), "TILECOL": str(column)})
     template = urljoin(url, template)
     check_url("source", template)
     known = {name.lower(): quote(value, safe=":") for name, value in values.items()}

@@ -6,6 +6,7 @@ import math
 import re
 
 from engine.errors import OptionError
+from engine.maps.fetching.client import shown
 from engine.maps.fetching.mosaic import (
     Level,
     Mosaic,
@@ -38,11 +39,11 @@ def check_template(url: str) -> None:
     if unknown:
         raise OptionError(
             f"source: expected {{z}}, {{x}} and {{y}} (or {{-y}}), or {{q}}, in a template of tiles, got "
-            f"{{{unknown[0]}}} in {url!r}"
+            f"{{{unknown[0]}}} in {shown(url)!r}"
         )
     if not ("q" in names or ({"z", "x"} <= set(names) and {"y", "-y"} & set(names))):
         raise OptionError(
-            f"source: expected {{z}}, {{x}} and {{y}}, or {{q}}, in a template of tiles, got {url!r}"
+            f"source: expected {{z}}, {{x}} and {{y}}, or {{q}}, in a template of tiles, got {shown(url)!r}"
         )
 
 

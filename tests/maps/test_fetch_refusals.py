@@ -1,0 +1,226 @@
+"""What a fetch of a map refuses or must not repeat: one clear line, and nothing of the user's is lost."""
+
+import re
+import socket
+import threading
+import time
+from http.client import HTTPException
+from xml.etree import ElementTree as Xml
+
+import pytest
+from pyproj import CRS
+
+from engine.errors import MapError, OptionError
+from engine.maps.fetching import client
+from engine.maps.fetching.client import Client, check_url, shown
+from engine.maps.fetching.heights import files_for, read_part
+from engine.maps.fetching.mosaic import Place, Wanted
+from engine.maps.fetching.services import chosen_crs
+from engine.maps.fetching.wmts import plan_wmts
+from engine.runs.map_fetch import FetchSettings, fetch_map
+
+TILES = "http://127.0.0.1:9/{z}/{x}/{y}.png"  # nobody listens there
+
+
+def settings(source=TILES, around="48.246,16.5245", **others):
+    return FetchSettings(around=around, source=source, radius_m=50.0, pause_ms=0.0, timeout_s=1.0, **others)
+
+
+@pytest.mark.parametrize(
+    "surface", ["s-surface.tif", "s.tif", "sub/../s-surface.tif", "link.tif", "{lat}_{lon}.tif"]
+)
+def test_the_users_own_surface_is_never_replaced_by_a_part_of_it(tmp_path, surface):
+    (tmp_path / "sub").mkdir()
+    for name in ("s.tif", "s-surface.tif"):
+        (tmp_path / name).write_bytes(b"the user's own")
+    (tmp_path / "link.tif").symlink_to(tmp_path / "s-surface.tif")
+    (tmp_path / "N48_E016.tif").hardlink_to(tmp_path / "s.tif")
+    with pytest.raises(OptionError, match=r"out: .* is the `surface` that is read; choose another file"):
+        fetch_map(settings(surface=str(tmp_path / surface), force=True), tmp_path / "s.tif")
+    assert all(path.read_bytes() == b"the user's own" for path in tmp_path.glob("*.tif"))
+
+
+def test_a_refusal_leaves_no_empty_folder(tmp_path):
+    with pytest.raises(MapError, match="cannot connect"):
+        fetch_map(settings(), tmp_path / "map.tif")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------ keys
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["key", "apikey", "X-Amz-Signature", "tk", "ak", "sk", "pwd", "appid", "app_id", "app_code", "ticket", "login",
+     "user", "pass", "sig", "access%5Ftoken", "client_id", "jwt"],
+)  # fmt: skip
+def test_what_looks_like_a_key_is_hidden(name):
+    url = f"https://a.org/wms?map=/x.map&{name}=S3CRET&layers=o"
+    assert shown(url) == f"https://a.org/wms?map=/x.map&{name}=...&layers=o"
+
+
+def test_what_is_no_key_stays():
+    url = "https://a.org/wms?map=/x.map&layers=o&styles=&format=image/png&bbox=1,2,3,4&time=2024&z={z}"
+    assert shown(url) == url
+    assert shown("https://me:word@a.org/x?y=1") == "https://...@a.org/x?y=1"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "ftp://me:S3CRET@example.org/{z}/{x}/{y}.png",
+        "ftp://example.org/wms?key=S3CRET",
+        "https://example.org/{z}/{x}.png?key=S3CRET",
+        "https://{s}.example.org/{z}/{x}/{y}.png?tk=S3CRET",
+        "https://example.org/{z}/{x}/{y}.png?tk=S3 CRET",
+        "http://[::1/{z}/{x}/{y}.png?tk=S3CRET",
+    ],
+)
+def test_refusals_do_not_repeat_keys(tmp_path, source):
+    with pytest.raises(OptionError, match=r"^source: expected") as error:
+        fetch_map(settings(source), tmp_path / "map.tif")
+    assert "S3" not in str(error.value)
+    assert "CRET" not in str(error.value)
+
+
+def test_nor_do_those_of_heights():
+    with pytest.raises(OptionError) as error:
+        files_for("https://example.org/{lat}.tif?key=S3CRET", (0.0, 0.0, 1.0, 1.0))
+    assert "S3CRET" not in str(error.value)
+
+
+# ------------------------------------------------------------ addresses that cannot be
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://[::1/{z}/{x}/{y}.png", "http://h:abc/{z}/{x}/{y}.png", "http://h:99999/{z}/{x}/{y}.png",
+     "http://h/a b/{z}/{x}/{y}.png", "http://h/{z}/{x}/{y}.png?a=\n"],
+)  # fmt: skip
+def test_an_address_that_cannot_be_is_refused_at_once(url):
+    with pytest.raises(OptionError, match=r"^source: expected a URL ") as error:
+        check_url("source", url)
+    assert "\n" not in str(error.value)
+
+
+def test_what_the_client_cannot_ask_for_is_asked_for_once(monkeypatch):
+    """An address that a server names: of its capabilities, or where it sends to."""
+    said = []
+    monkeypatch.setattr(client.time, "sleep", lambda _: None)
+    for url in ("http://127.0.0.1:9/a b?key=S3CRET", "http://127.0.0.1:abc/"):
+        with pytest.raises(MapError, match="cannot be asked for") as error:
+            Client(0.0, 1.0, said.append).get(url)
+        assert "S3CRET" not in str(error.value)
+        assert "\n" not in str(error.value)
+    assert said == []
+    assert issubclass(client.InvalidURL, HTTPException)  # which else is tried again
+
+
+@pytest.mark.parametrize("surface", ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif"])
+def test_stray_braces_are_refused(surface):
+    with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon} as placeholders, or none"):
+        files_for(surface, (0.0, 0.0, 1.0, 1.0))
+
+
+# ------------------------------------------------------------ where the Earth's grids end
+
+
+@pytest.mark.parametrize("around", ["0,180", "0,-180", "10,179.9999", "-60,-179.9999"])
+def test_a_square_across_the_antimeridian_is_refused(tmp_path, around):
+    with pytest.raises(OptionError, match="around: expected a square that does not cross 180 degrees east, got "):
+        fetch_map(settings(around=around, dry_run=True), tmp_path / "map.tif")
+
+
+def test_a_square_beside_it_is_not(tmp_path):
+    facts = fetch_map(settings(around="0,179.99", dry_run=True), tmp_path / "map.tif")
+    assert facts["tiles"] < 10
+    assert Place(0.0, 179.99, 50.0).bounds(CRS.from_epsg(4326))[2] < 180.0
+
+
+# ------------------------------------------------------------ coordinate systems and addresses that servers state
+
+
+def test_only_a_coordinate_system_for_the_place_is_chosen():
+    vienna = Place(48.2, 16.4, 50.0)
+    assert chosen_crs(None, ["EPSG:2154", "EPSG:31256", "EPSG:4326"], vienna) == "EPSG:31256"
+    assert chosen_crs(None, ["EPSG:2154", "EPSG:999999", "EPSG:4326"], vienna) == "EPSG:4326"
+    assert chosen_crs("EPSG:2154", ["EPSG:2154"], vienna) == "EPSG:2154"  # as asked
+    with pytest.raises(OptionError, match=r"crs: expected one for 48.2,16.4 .*, got EPSG:2154"):
+        chosen_crs(None, ["EPSG:2154"], vienna)
+    assert (
+        chosen_crs(None, ["EPSG:3832"], Place(-17.0, 179.0, 50.0)) == "EPSG:3832"
+    )  # its area crosses 180 degrees
+    assert chosen_crs(None, ["EPSG:3832"], Place(-17.0, -179.0, 50.0)) == "EPSG:3832"
+
+
+WMTS = """<Capabilities xmlns="http://www.opengis.net/wmts/1.0" xmlns:ows="http://www.opengis.net/ows/1.1"
+ xmlns:xlink="http://www.w3.org/1999/xlink" version="1.0.0">{operations}<Contents>
+<Layer><ows:Identifier>o</ows:Identifier><Format>image/png</Format>
+<TileMatrixSetLink><TileMatrixSet>odd</TileMatrixSet></TileMatrixSetLink>
+<TileMatrixSetLink><TileMatrixSet>world</TileMatrixSet></TileMatrixSetLink></Layer>
+<TileMatrixSet><ows:Identifier>odd</ows:Identifier><ows:SupportedCRS>EPSG:999999</ows:SupportedCRS>{matrix}
+</TileMatrixSet><TileMatrixSet><ows:Identifier>world</ows:Identifier>
+<ows:SupportedCRS>urn:ogc:def:crs:EPSG::3857</ows:SupportedCRS>{matrix}</TileMatrixSet></Contents></Capabilities>"""
+MATRIX = """<TileMatrix><ows:Identifier>18</ows:Identifier><ScaleDenominator>2132.729583849784</ScaleDenominator>
+<TopLeftCorner>-20037508.342789244 20037508.342789244</TopLeftCorner><TileWidth>256</TileWidth>
+<TileHeight>256</TileHeight><MatrixWidth>262144</MatrixWidth><MatrixHeight>262144</MatrixHeight></TileMatrix>"""
+OPERATIONS = """<ows:OperationsMetadata><ows:Operation name="GetTile"><ows:DCP><ows:HTTP>
+<ows:Get xlink:href="/rest"><ows:Constraint name="GetEncoding"><ows:AllowedValues><ows:Value>RESTful</ows:Value>
+</ows:AllowedValues></ows:Constraint></ows:Get><ows:Get xlink:href="{href}"/></ows:HTTP></ows:DCP></ows:Operation>
+</ows:OperationsMetadata>"""
+
+
+@pytest.mark.parametrize(
+    ("href", "address"),
+    [
+        (None, "https://a.org/caps.xml?key=S3CRET&"),
+        ("https://a.org/tiles?map=m", "https://a.org/tiles?map=m&key=S3CRET&"),
+        ("kvp/", "https://a.org/kvp/?key=S3CRET&"),
+        ("https://b.org/tiles", "https://b.org/tiles?SERVICE="),  # the key is for the host that was named
+    ],
+)
+def test_wmts_tiles_are_asked_for_where_the_server_says_in_a_set_that_is_known(href, address):
+    operations = "" if href is None else OPERATIONS.format(href=href)
+    root = Xml.fromstring(WMTS.format(matrix=MATRIX, operations=operations))
+    wanted = Wanted(place=Place(48.2, 16.4, 50.0), gsd_m_per_px=0.5, max_tiles=9)
+    mosaic = plan_wmts(root, "https://a.org/caps.xml?key=S3CRET", wanted)
+    assert mosaic.crs == CRS.from_epsg(3857)
+    assert all(piece.url.startswith(address) for piece in mosaic.pieces), mosaic.pieces[0].url
+    assert "TILEMATRIXSET=world" in mosaic.pieces[0].url.upper().replace("WORLD", "world")
+
+
+# ------------------------------------------------------------ servers that fall silent
+
+
+@pytest.fixture
+def falls_silent():
+    """The address of a server that answers the first request with four bytes, and no other at all."""
+    ear, open_lines = socket.create_server(("127.0.0.1", 0)), []
+    first = b"HTTP/1.1 206 Partial Content\r\nContent-Length: 4\r\nConnection: close\r\n\r\nII*\0"
+
+    def serve():
+        while True:
+            try:
+                line, _ = ear.accept()
+            except OSError:
+                return
+            line.recv(4096)
+            if not open_lines:
+                line.sendall(first)
+                line.close()
+            open_lines.append(line)
+
+    threading.Thread(target=serve, daemon=True).start()
+    yield f"http://127.0.0.1:{ear.getsockname()[1]}/heights.tif"
+    ear.shutdown(socket.SHUT_RDWR)
+    ear.close()
+    for line in open_lines:
+        line.close()
+
+
+def test_heights_are_waited_for_no_longer_than_agreed(falls_silent, monkeypatch):
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    begin_s = time.monotonic()
+    with pytest.raises(MapError, match=re.escape("heights.tif: cannot be read as a GeoTIFF by ranges of bytes")):
+        read_part([falls_silent], (0.0, 0.0, 1.0, 1.0), CRS.from_epsg(4326), None, Client(0.0, 1.0, print))
+    assert time.monotonic() - begin_s < 20.0  # GDAL asks again, some times

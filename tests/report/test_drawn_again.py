@@ -1,0 +1,89 @@
+"""Reports that are drawn again lose nothing of what they were, unless asked to."""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from engine.cli.app import run
+from engine.runs.inputs import FlightFiles
+from engine.runs.settings import TrackSettings
+from engine.runs.simulation import write_flight
+from engine.runs.tracking import track
+from engine.sim import plan_flight
+from tests.support.runs import bare_runs
+from tests.support.towns import drawn_town
+
+pytestmark = pytest.mark.usefixtures("bare_runs")
+PAGE = "report.html"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A flight of three frames, and a finished track of it."""
+    folder = tmp_path_factory.mktemp("again")
+    write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=3))
+    with bare_runs():
+        track(FlightFiles.in_folder(folder / "flight"), folder / "out", TrackSettings(method="ncc"))
+    return folder
+
+
+@pytest.fixture
+def moved(finished, tmp_path):
+    """A copy of the track whose frames are not where they were."""
+    out = Path(shutil.copytree(finished / "out", tmp_path / "out"))
+    frames = finished / "flight" / "frames"
+    frames.rename(frames.with_name("moved"))
+    yield out
+    frames.with_name("moved").rename(frames)
+
+
+def test_figures_stay_where_they_cannot_be_drawn_again(finished, tmp_path, monkeypatch):
+    out = Path(shutil.copytree(finished / "out", tmp_path / "out"))
+    before = {path.name for path in out.glob("*.png")}
+    assert len(before) == 4
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run(["report", str(out)]) == 0
+    assert {path.name for path in out.glob("*.png")} == before
+
+
+def test_a_page_loses_frames_that_were_moved_only_where_it_may(moved, capsys):
+    before = (moved / PAGE).read_text(encoding="utf-8")
+    assert 'id="slider"' in before
+    assert run(["report", str(moved)]) == 2
+    said = capsys.readouterr().err
+    assert re.search(r"RUN.*: .*report\.html shows frames, which are lost .* add --force to do so; .*frames", said)
+    assert (moved / PAGE).read_text(encoding="utf-8") == before
+    assert run(["report", str(moved), "--force"]) == 0
+    assert "report.html loses the frames that it showed: " in capsys.readouterr().err
+    assert 'id="slider"' not in (moved / PAGE).read_text(encoding="utf-8")
+    assert run(["report", str(moved)]) == 0  # there is nothing more to lose
+
+
+def test_evaluate_says_what_its_page_loses(moved, capsys):
+    assert run(["evaluate", str(moved)]) == 0
+    assert "report.html loses the frames that it showed: " in capsys.readouterr().err
+
+
+def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(finished, tmp_path):
+    other = Path(shutil.copytree(finished / "out", tmp_path / "other"))
+    rows = (other / "track.csv").read_text(encoding="utf-8").splitlines()
+    blank = [line if k == 0 else "," + line.partition(",")[2] for k, line in enumerate(rows)]
+    (other / "track.csv").write_text("\n".join(blank) + "\n", encoding="utf-8")
+    third, alike, mixed = shutil.copytree(other, tmp_path / "c"), tmp_path / "alike.html", tmp_path / "mixed.html"
+    assert run(["report", str(finished / "out"), str(third), f"--out={mixed}"]) == 0
+    assert run(["report", str(other), str(third), f"--out={alike}"]) == 0
+    assert "Stated sigma (m)" in alike.read_text(encoding="utf-8")
+    assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
+
+
+def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_drawn(
+    finished, tmp_path, monkeypatch, capsys
+):
+    other = shutil.copytree(finished / "out", tmp_path / "other")
+    monkeypatch.setattr("engine.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
+    page = tmp_path / "nofolder" / "x.html"
+    assert run(["report", str(finished / "out"), str(other), f"--out={page}"]) == 2
+    assert f"--out: expected a file in a folder that exists, got {page}" in capsys.readouterr().err
