@@ -74,9 +74,10 @@ def compare(
     Follows the flight once a run, each into a folder of its own as track does, and compares them in one table
     and one chart.
     """
-    from engine.runs.comparison import CHART, COMPARISON, parse_runs
+    from engine.runs.comparison import CHART, parse_runs
     from engine.runs.comparison import compare as compare_runs
     from engine.runs.inputs import FlightFiles
+    from engine.runs.reporting import COMPARISON
 
     use_threads(threads)
     settings = parse_runs(runs or [], weights=weights or (), start=start, device=device, budget_ms=budget_ms)
