@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from engine.errors import OptionError
 
+_SPENT_MS = 1e-6
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
@@ -31,6 +33,11 @@ class Budget:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise OptionError(f"{name}: expected more than 0 ms, got {value}")
+
+    def after(self, elapsed_ms: float) -> Budget:
+        """What is left after so many milliseconds; of a spent one too little for any answer."""
+        search_ms = None if self.search_ms is None else max(self.search_ms - elapsed_ms, _SPENT_MS)
+        return Budget(total_ms=max(self.total_ms - elapsed_ms, _SPENT_MS), search_ms=search_ms)
 
 
 class Deadline:

@@ -69,13 +69,13 @@ class GroundMotion:
         lasting_m2 = self.lasting_share**2 * float(self.moved_m @ self.moved_m)
         return np.asarray((self.noise_m2 + lasting_m2 * np.eye(2)) / self.interval_s**2)
 
-    def added_to(self, last: OdometrySample, interval_s: float) -> OdometrySample:
-        """The sample so long after the last one."""
+    def added_to(self, last: OdometrySample) -> OdometrySample:
+        """The sample at the later picture, where the last one is the earlier's."""
         return OdometrySample(
-            last.time_s + interval_s,
+            last.time_s + self.interval_s,
             last.moved_m + self.moved_m,
             last.blind_s,
-            last.stated_s + interval_s,
+            last.stated_s + self.interval_s,
             last.lasting_m + self.lasting_share * float(np.hypot(*self.moved_m)),
             last.noise_m2 + self.drift * float(np.linalg.eigvalsh(self.noise_m2)[-1]),
         )
@@ -157,8 +157,8 @@ class DeadReckoning:
                 stated_s=last.stated_s + stated_s,
                 lasting_m=last.lasting_m + lasting_m,
             )
-        if seen is not None:
-            return seen.added_to(last, interval_s)
+        if seen is not None and math.isclose(seen.interval_s, interval_s, abs_tol=1e-6):
+            return seen.added_to(last)  # else a frame between failed, whose way nobody knows
         step_m = np.zeros(2) if velocity is None else velocity.mps * interval_s
         return replace(
             last,

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from engine.anchors import Anchor, RecentAnchors
 from engine.attitude_bias import Bias
-from engine.budget import Budget
-from engine.camera import Camera
+from engine.budget import Budget, Deadline
 from engine.covariance import map_sigma_of
 from engine.evidence import (
     MAX_PROBABILITY,
@@ -28,7 +27,7 @@ from engine.map_offset import MapOffset, MapOffsetEstimator
 from engine.motion import DeadReckoning, DriftModel, GroundMotion, OdometrySample, PositionEstimate, en_m, is_valid
 from engine.navigator_options import NavigatorOptions
 from engine.navigator_state import NavigatorState
-from engine.odometry import VisualOdometry
+from engine.odometry import VisualOdometry, odometry_of
 from engine.orthomap import OrthoMap
 from engine.repeats import Repeats
 from engine.telemetry_errors import Calibration, TelemetryErrors
@@ -42,7 +41,6 @@ class Matcher(Protocol):
     """What a navigator needs of a matcher; :class:`engine.matcher.SceneMatcher` is one."""
 
     site: OrthoMap
-    camera: Camera
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """Where the camera was when the frame was taken."""
@@ -58,7 +56,7 @@ class Navigator:
         matcher: matches single frames.
         start: where the flight begins; None searches the whole map until a first fix.
         budget: of each frame; None does not hurry.
-        options: settings; the defaults serve.
+        options: settings; the defaults serve. Their ``odometry`` needs a matcher with a ``camera``.
     """
 
     def __init__(
@@ -74,7 +72,7 @@ class Navigator:
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
         self._errors = TelemetryErrors(o)
-        self._pictures = VisualOdometry(matcher.camera) if o.odometry else None
+        self._pictures = odometry_of(matcher) if o.odometry else None
         self._motion: GroundMotion | None = None  # up to the newest frame
         self._repeats = Repeats()
         self._velocity = VelocityCheck(o.measured_velocity_sigma_mps, o.acceleration_mps2)
@@ -123,9 +121,9 @@ class Navigator:
     def prediction(self) -> Prior | None:
         """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
         now = self._odometry.last
-        estimate = None if now is None else self._reckoned(now)
-        map_m = map_sigma_of(self._matcher.site) if estimate is not None and estimate.on_map else 0.0
-        return None if estimate is None else estimate.prior(map_sigma_m=map_m)
+        if now is None or (estimate := self._reckoned(now)) is None:
+            return None
+        return estimate.prior(map_sigma_m=map_sigma_of(self._matcher.site) if estimate.on_map else 0.0)
 
     @property
     def ground_motion(self) -> GroundMotion | None:
@@ -166,7 +164,8 @@ class Navigator:
             TelemetryError: the frame came before, or is older than ``late_s``.
             CalibrationError: the frame is not of the camera's resolution.
         """
-        late, told = self._odometry.is_late(frame), frame
+        clock, late, told = Deadline(Budget()), self._odometry.is_late(frame), frame
+        budget = budget or self._budget
         frame = self._velocity.shown(frame)
         self._motion = None if late or self._pictures is None else self._seen_motion(self._pictures, frame)
         now = self._odometry.sample(frame, self._recent.velocity, self._motion)
@@ -178,7 +177,9 @@ class Navigator:
             return repeated
         sources = self._sources(now, prior, late=late)
         shown = self._errors.corrected(frame, now.time_s, late=late, refusals=self._refusals)
-        result = self._matcher.locate(self._with_height(shown), sources.prior, budget or self._budget)
+        result = self._matcher.locate(
+            self._with_height(shown), sources.prior, budget and budget.after(clock.elapsed_ms)
+        )
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
@@ -201,7 +202,7 @@ class Navigator:
 
     def _seen_motion(self, pictures: VisualOdometry, frame: Frame) -> GroundMotion | None:
         """How far the vehicle moved since the last frame, where the pictures show it."""
-        motion = pictures.update(self._errors.without_bias(self._with_height(frame)))
+        motion = pictures.update(self._with_height(self._errors.without_errors(frame)))
         return motion if isinstance(motion, GroundMotion) else None
 
     def _reckoned(self, now: OdometrySample, anchor: Anchor | None = None) -> PositionEstimate | None:

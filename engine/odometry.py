@@ -125,9 +125,8 @@ class VisualOdometry:
             CalibrationError: the frame is not of the camera's resolution.
         """
         self._camera.check_size(frame.image.shape)
-        gray = to_gray(frame)
-        # A buffer may be filled again.
-        last, self._last = self._last, _Picture(frame, gray.copy() if gray is frame.image else gray)
+        gray = to_gray(frame).copy()  # a buffer may be filled again
+        last, self._last = self._last, _Picture(frame, gray)
         if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
             motion: GroundMotion | NoMotion = NoMotion("the velocity is known")
         elif last is None:
@@ -149,6 +148,9 @@ class VisualOdometry:
         if height_m is None or begin is None or end is None:
             return NoMotion("height or heading is unknown")
         if np.array_equal(last.gray, now.gray):
+            self._last = (
+                None  # it was not taken when its stamp says, so that the next way would be of another time
+            )
             return NoMotion("the picture is the last one again")
         view = _View(self._camera, begin, end, height_m)
         moved_m = np.zeros(3) if self._velocity_mps is None else self._velocity_mps * interval_s
@@ -209,6 +211,18 @@ class VisualOdometry:
         points = track_corners(first, second, expected, self._options.max_points)
         begin, end = ((xy_px + 0.5) * size / small - 0.5 for xy_px in points)
         return begin, end
+
+
+def odometry_of(matcher: object) -> VisualOdometry:
+    """Odometry by the camera of a matcher.
+
+    Raises:
+        OptionError: it has none.
+    """
+    camera = getattr(matcher, "camera", None)
+    if not isinstance(camera, Camera):
+        raise OptionError(f"odometry: expected a matcher with a `camera`, got {type(matcher).__name__} without")
+    return VisualOdometry(camera)
 
 
 def track_corners(earlier: Gray, later: Gray, expected: Array, max_points: int = 200) -> tuple[Array, Array]:

@@ -114,9 +114,9 @@ class TelemetryErrors:
             self._next_search = _FIRST_SEARCH
         return replace(shown, is_doubted=True) if self._settling else shown
 
-    def without_bias(self, frame: Frame) -> Frame:
-        """The newest frame with what is known of its attitude's bias taken off, before :meth:`corrected`."""
-        return self._bias.corrected(frame)
+    def without_errors(self, frame: Frame) -> Frame:
+        """The newest frame without what is known of its attitude's bias and height, before :meth:`corrected`."""
+        return self._at_its_height(self._bias.corrected(frame))
 
     def _at_its_height(self, frame: Frame) -> Frame:
         """The frame at the height that pictures showed, where that differs by more than a match bears."""

@@ -87,8 +87,14 @@ class TrackGuard:
         if east is None or north is None or elapsed_s > _MAX_GAP_S:
             self._now = replace(now, time_s=now.time_s + elapsed_s, blind_s=now.blind_s + elapsed_s)
             return
-        moved_m = now.moved_m + np.array([east, north]) * elapsed_s
-        self._now = OdometrySample(now.time_s + elapsed_s, moved_m, now.blind_s)
+        sigma_mps = frame.velocity_sigma_mps
+        self._now = replace(
+            now,
+            time_s=now.time_s + elapsed_s,
+            moved_m=now.moved_m + np.array([east, north]) * elapsed_s,
+            stated_s=now.stated_s + (0.0 if sigma_mps is None else elapsed_s),
+            lasting_m=now.lasting_m + (sigma_mps or 0.0) * elapsed_s,
+        )
 
     def trusts(self, result: Fix | NoFix) -> bool:
         """Whether a fix may be sent; refused matches count for and against the track, too."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Attitude, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
+from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
 from engine.motion import DeadReckoning, DriftModel, GroundMotion
 from engine.odometry import NoMotion, OdometryOptions, VisualOdometry
 from engine.runs.settings import TrackSettings, load_settings
@@ -181,8 +183,10 @@ def test_telemetry_that_does_not_support_a_motion_is_refused():
     refused(replace(first, timestamp_ns=None), second, "no stamp")
     refused(first, replace(second, timestamp_ns=9_000_000_000), "9.0 s apart")
     refused(first, replace(second, east_velocity_mps=1.0, north_velocity_mps=1.0), "velocity is known")
-    oblique = Attitude(0.0, 65.0, 0.0)
-    refused(replace(first, pitch_deg=65.0), frame(picture((5, 0), oblique), INTERVAL_S, oblique), "")
+    refused(replace(first, pitch_deg=55.0), replace(second, pitch_deg=55.0), "too obliquely")  # 78 at an edge
+    assert isinstance(
+        motion_between(replace(first, pitch_deg=40.0), replace(second, pitch_deg=40.0)), GroundMotion
+    )
 
 
 def test_a_velocity_that_is_too_uncertain_is_refused():
@@ -196,6 +200,21 @@ def test_a_buffer_that_is_filled_again_is_no_picture_that_repeats():
     odometry.update(frame(buffer))
     buffer[:] = picture((5, 0), LEVEL)
     assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
+
+
+def test_the_same_holds_of_a_tensors_memory():
+    odometry, buffer = VisualOdometry(CAMERA), torch.from_numpy(picture((0, 0), LEVEL))
+    odometry.update(frame(buffer))
+    buffer[:] = torch.from_numpy(picture((5, 0), LEVEL))
+    assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
+
+
+def test_the_way_after_a_picture_that_repeats_is_unknown():
+    odometry = VisualOdometry(CAMERA)
+    shown = [picture((3.0 * k, 0.0), LEVEL) for k in (0, 0, 2, 3)]
+    motions = [odometry.update(frame(image, k * INTERVAL_S)) for k, image in enumerate(shown)]
+    assert [isinstance(motion, GroundMotion) for motion in motions] == [False, False, False, True]
+    assert motions[3].moved_m == pytest.approx([3.0, 0.0], abs=0.2)
 
 
 @pytest.mark.parametrize("name", OdometryOptions.__dataclass_fields__)
@@ -226,6 +245,14 @@ def test_motions_add_up_and_so_do_their_errors():
     assert drift.sigma_m(begin, sample) == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
 
 
+def test_a_motion_counts_over_its_own_interval_only():
+    reckoning = DeadReckoning(2.0, 0.2)
+    reckoning.append(still(0.0), reckoning.sample(still(0.0), None))
+    step = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+    after = reckoning.sample(still(2.0), None, step)  # the frame at 1 s failed
+    assert (after.time_s, after.blind_s, list(after.moved_m)) == (2.0, 2.0, [0.0, 0.0])
+
+
 def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word():
     drift = DriftModel(0.5, 3.0, 15.0)
     for sigma_mps, expected_m in ((None, 0.5), (0.1, 0.1), (2.0, 2.0)):
@@ -246,6 +273,7 @@ class Blind:
         )
 
     def locate(self, frame, prior=None, budget=None):
+        self.budget = budget
         return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
 
 
@@ -264,6 +292,42 @@ def test_a_navigator_follows_the_ground_where_it_is_asked_to(odometry):
     else:
         assert (predicted.east_m, predicted.north_m) == (0.0, 0.0)
         assert predicted.sigma_m > 15.0
+
+
+START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
+
+
+def test_only_odometry_needs_a_camera_of_the_matcher():
+    matcher = Blind()
+    del matcher.camera
+    assert isinstance(Navigator(matcher, START).update(frame(picture((0, 0), LEVEL))), NoFix)
+    with pytest.raises(OptionError, match="^odometry: expected a matcher with a `camera`, got Blind without"):
+        Navigator(matcher, START, options=NavigatorOptions(odometry=True))
+
+
+@pytest.mark.parametrize(("total_ms", "search_ms"), [(1000.0, 2000.0), (1000.0, None), (50.0, None)])
+def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, search_ms):
+    def slow(*_):
+        time.sleep(0.1)
+        return NoMotion("slow")
+
+    matcher, limit = Blind(), Budget(total_ms=total_ms, search_ms=search_ms)
+    navigator = Navigator(matcher, START, limit, NavigatorOptions(odometry=True))
+    monkeypatch.setattr(VisualOdometry, "update", slow)
+    navigator.update(frame(picture((0, 0), LEVEL)))
+    assert 0.0 < matcher.budget.total_ms <= max(total_ms - 100.0, 1e-6)
+    assert matcher.budget.search_ms is None if search_ms is None else matcher.budget.search_ms <= 1900.0
+
+
+def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
+    navigator = Navigator(Blind(), START, options=NavigatorOptions(odometry=True))
+    errors = navigator._errors
+    errors._height_m = HEIGHT_M
+    for _ in range(5):
+        errors._note_height(0.2 * HEIGHT_M, HEIGHT_M)
+    for k in range(2):
+        navigator.update(frame(picture((5.0 * k, 0.0), LEVEL), k * INTERVAL_S))
+    assert navigator.ground_motion.moved_m[0] == pytest.approx(5.0 * 1.2, rel=0.05)
 
 
 def test_it_is_asked_for_by_a_setting_and_not_with_the_papers_recipe():

@@ -140,3 +140,13 @@ def test_one_wrong_fix_is_no_track():
         replace(flight.guard._track[-1], estimate=PositionEstimate(np.array([0.0, 99.0]), 0.3))
     )
     assert all(flight.fly(5.0, true))
+
+
+@pytest.mark.parametrize(("sigma_mps", "contradicts"), [(None, True), (0.1, True), (5.0, False)])
+def test_a_velocity_counts_with_the_accuracy_that_it_states(sigma_mps, contradicts):
+    """10 s without a fix, then matches 40 m aside: too far for 0.5 m/s, not for 5."""
+    guard = TrackGuard(PositionEstimate(np.zeros(2), 1.0))
+    frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, SPEED_MPS, 0.0)
+    for k in range(101):
+        guard.advance(replace(frame, velocity_sigma_mps=sigma_mps), round(k * STEP_S * 1e9))
+    assert guard.trusts(fix(SPEED_MPS * 10.0, 40.0)) != contradicts

@@ -150,7 +150,9 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
             gaps.off_m.append(np.array([predicted.east_m, predicted.north_m]) + middle_m - place)
             gaps.sigma_m.append(math.sqrt(max(predicted.sigma_m**2 - map_sigma_of(flight.site) ** 2, 0.0)))
             gaps.way_m.append(way_m)
-            ended_ns, way_m = frames[index + 1].timestamp_ns, 0.0
+            ended_ns = frames[index + 1].timestamp_ns
+        if not withheld or ends:  # a gap without an end that can be judged is no way of the next
+            way_m = 0.0
     return gaps
 
 
@@ -293,7 +295,7 @@ def gap_rows(flight: Recorded) -> Iterator[str]:
             f"| {flight.name} | {velocity} | {100.0 * off_m.sum() / way_m:.1f} | {np.median(off_m):.1f} "
             f"| {off_m.max():.1f} | {np.median(gaps.sigma_m):.1f} | {np.mean(off_m**2 / variance):.2f} "
             f"| {gaps.known / gaps.frames:.1%} | {gaps.fixed / gaps.matched:.1%} | {gaps.wrong} "
-            f"| {np.median(gaps.back_s):.1f} | {max(gaps.back_s):.1f} |"
+            f"| {np.median(gaps.back_s or [math.nan]):.1f} | {max(gaps.back_s, default=math.nan):.1f} |"
         )
 
 

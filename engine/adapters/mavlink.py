@@ -180,9 +180,7 @@ class MavlinkBridge:
         Raises:
             StateError: the bridge has been closed.
         """
-        vehicle = self.telemetry.vehicle(captured_ns)
-        if not self._use_velocity:
-            vehicle = replace(vehicle, east_velocity_mps=None, north_velocity_mps=None, velocity_sigma_mps=None)
+        vehicle = self.telemetry.vehicle(captured_ns, own_velocity=self._use_velocity)
         frame = vehicle.frame(image, captured_ns)
         self._live.submit(frame, captured_ns=captured_ns)
 

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.gimbal import body_behind, from_device, from_mount
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
-from engine.adapters.vision_in import vision_velocity
+from engine.adapters.vision_in import has_failed, vision_velocity
 from engine.values import Attitude
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
@@ -187,15 +187,21 @@ class MavlinkTelemetry:
         offset_ns = self._unix_offset_ns
         return time_ns + (time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns)
 
-    def vehicle(self, time_ns: int) -> VehicleState:
-        """The vehicle state at a local time; what is not known is None."""
+    def vehicle(self, time_ns: int, *, own_velocity: bool = True) -> VehicleState:
+        """The vehicle state at a local time; what is not known is None.
+
+        Args:
+            time_ns: on ``time.monotonic_ns``.
+            own_velocity: whether the autopilot's velocity counts where no other camera's odometry states one.
+        """
         with self._lock:
             attitude = self._attitude.at(time_ns)
-            told = self._velocity.at(time_ns) if self._has_velocity else None
+            told = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
             velocity = told or (None, None, None)
             roll, pitch, heading = attitude or (None, None, None)
             # By another camera's odometry, where there is one: it does not depend on the fixes.
-            east, north, up, sigma = self._vision.at(time_ns) or (*velocity, 0.0)
+            east, north, up, _ = self._vision.at(time_ns) or (*velocity, 0.0)
+            *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 is not stated: nothing to interpolate
             return VehicleState(
                 roll_deg=roll,
                 pitch_deg=pitch,
@@ -245,6 +251,8 @@ class MavlinkTelemetry:
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
         elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that nobody else has
+            if has_failed(message):
+                self._vision.clear()
             seen = vision_velocity(message, self._attitude.at(arrival_ns))
             if seen is not None:
                 self._vision.add(arrival_ns, *seen)

@@ -16,6 +16,8 @@ V1, V2 = 0xFE, 0xFD
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 BRIDGE_COMPONENT = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 
+# A companion computer is another component; `vision_in` leaves out the autopilot's and the bridge's own.
+_FROM_ANY_COMPONENT = (mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE)
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
 _MAX_BUFFER_BYTES = 65536  # of a stream that never completes a packet
 _MAX_FAILED = 64  # false start bytes in a datagram after which the rest is discarded: a flood must stay cheap
@@ -71,7 +73,7 @@ class PacketEncoder:
 
 
 class PacketDecoder:
-    """Extracts the messages of one autopilot from bytes.
+    """Extracts the messages of one autopilot, and the velocities of its companion computers, from bytes.
 
     Args:
         system_id: MAVLink system id whose messages are kept.
@@ -144,9 +146,10 @@ class PacketDecoder:
             system, component, number = packet[3], packet[4], packet[5]
         else:
             system, component, number = packet[5], packet[6], int.from_bytes(packet[7:10], "little")
-        from_autopilot = (system, component) == (self._system_id, AUTOPILOT_COMPONENT)
+        from_vehicle = component == AUTOPILOT_COMPONENT or number in _FROM_ANY_COMPONENT
+        from_vehicle = from_vehicle and system == self._system_id
         # An operator's command comes from the ground station, on the autopilot's link.
-        return number in self._message_ids and (from_autopilot or number == mavlink.MAVLINK_MSG_ID_COMMAND_LONG)
+        return number in self._message_ids and (from_vehicle or number == mavlink.MAVLINK_MSG_ID_COMMAND_LONG)
 
     def _decode(self, packet: bytes) -> Any:
         """The message, or None where the packet is invalid or its type unknown."""

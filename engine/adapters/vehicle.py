@@ -108,6 +108,11 @@ class RecentValues:
         """Discard all samples."""
         self._samples.clear()
 
+    def nearest(self, time_ns: int) -> tuple[float, ...] | None:
+        """Values of the sample nearest to a time; None beyond 0.5 s."""
+        near = min(self._samples, key=lambda s: abs(s[0] - time_ns), default=None)
+        return near[1] if near is not None and abs(near[0] - time_ns) <= _STALE_NS else None
+
     def at(self, time_ns: int) -> tuple[float, ...] | None:
         """Values interpolated at a time; the nearest sample where one side is missing, None beyond 0.5 s."""
         before = next((s for s in reversed(self._samples) if s[0] <= time_ns), None)

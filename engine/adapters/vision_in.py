@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.packets import BRIDGE_COMPONENT
+from engine.adapters.packets import AUTOPILOT_COMPONENT, BRIDGE_COMPONENT
+from engine.covariance import AssumedErrors
 from engine.geo import enu_from_body
 
 Array = NDArray[np.float64]
@@ -18,6 +19,8 @@ _OVER_GROUND = (mavlink.MAV_FRAME_LOCAL_NED,)
 _OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter was its name before
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FAILED = -1  # quality
+_MIN_SIGMA_MPS, _MAX_SIGMA_MPS = 0.1, 5.0  # covariances of odometry are often too small; beyond this it is lost
+_MAX_SPEED_MPS = 150.0
 
 
 def vision_velocity(
@@ -30,28 +33,43 @@ def vision_velocity(
         attitude_deg: roll, pitch and heading of the vehicle, by which a velocity along its body is turned.
 
     Returns:
-        None where the message has no such velocity: of another estimator than a camera's or the bridge's own, in
-        another frame, failed, or not finite.
+        None where the message has no such velocity: of another estimator than a camera's, the autopilot's or the
+        bridge's own, in another frame, failed, of an absurd size, or of an unbounded variance.
     """
+    if not _is_by_camera(message) or has_failed(message):
+        return None
     if message.get_type() == "VISION_SPEED_ESTIMATE":
         velocity, variances = np.array([message.x, message.y, message.z]), message.covariance[0::4]
         turn: Array | None = _ENU_FROM_NED
     else:
-        if not _is_by_camera(message) or message.quality == _FAILED:
-            return None
         velocity = np.array([message.vx, message.vy, message.vz])
         variances = [message.velocity_covariance[i] for i in (0, 6, 11)]  # of a 6 x 6 upper triangle
         turn = _turn(message.child_frame_id, attitude_deg)
-    if turn is None or not np.isfinite(velocity).all():
+    speed_mps = float(np.hypot.reduce(velocity))
+    # What is not finite compares as false.
+    if turn is None or not speed_mps <= _MAX_SPEED_MPS or any(v > _MAX_SIGMA_MPS**2 for v in variances):
         return None
     east, north, up = (float(v) for v in turn @ velocity)
-    largest = max(variances)
-    known = all(math.isfinite(v) for v in variances) and largest > 0.0
-    return east, north, up, math.sqrt(largest) if known else 0.0
+    if not all(math.isfinite(v) for v in variances) or max(variances) <= 0.0:
+        return east, north, up, 0.0
+    turned_mps = 0.0 if turn is _ENU_FROM_NED else math.radians(AssumedErrors().heading_deg) * speed_mps
+    return east, north, up, max(math.hypot(math.sqrt(max(variances)), turned_mps), _MIN_SIGMA_MPS)
+
+
+def has_failed(message: Any) -> bool:
+    """Whether another camera's ODOMETRY says that it has failed, so that what it said last holds no more."""
+    return message.get_type() == "ODOMETRY" and _is_by_camera(message) and message.quality == _FAILED
 
 
 def _is_by_camera(message: Any) -> bool:
-    """Whether an ODOMETRY is of another camera's odometry: not the autopilot's, nor the bridge's own."""
+    """Whether it is of another camera's odometry: not the autopilot's, nor the bridge's own.
+
+    An autopilot also passes on what it was sent, the bridge's fixes included, as a component of its own.
+    """
+    if message.get_srcComponent() == AUTOPILOT_COMPONENT:
+        return False
+    if message.get_type() == "VISION_SPEED_ESTIMATE":
+        return True
     if message.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_VISION:
         return bool(message.get_srcComponent() != BRIDGE_COMPONENT)
     return bool(message.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_VIO)

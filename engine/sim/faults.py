@@ -63,7 +63,7 @@ class ShiftedMap:
 
     def __init__(self, matcher: Matcher) -> None:
         self._matcher = matcher
-        self.site, self.camera = matcher.site, matcher.camera
+        self.site, self.camera = matcher.site, getattr(matcher, "camera", None)
         self.shift_m = 0.0
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:

@@ -41,7 +41,14 @@ from engine.adapters.mavlink_out import (
     withhold_reason,
 )
 from engine.adapters.mavlink_status import MIN_RATE_HZ
-from engine.adapters.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder, read_key, signing_time
+from engine.adapters.packets import (
+    AUTOPILOT_COMPONENT,
+    BRIDGE_COMPONENT,
+    PacketDecoder,
+    PacketEncoder,
+    read_key,
+    signing_time,
+)
 from engine.adapters.parameters import ParameterOptions, parameter_file
 from engine.adapters.pictures import replay
 from engine.adapters.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
@@ -336,7 +343,9 @@ TO_THE_WEST = mavlink.MAVLink_attitude_message(5000, 0, 0, -math.pi / 2, 0, 0, 0
     [
         (speed_estimate(3.0, -4.0, 0.5), (-4.0, 3.0, -0.5), None),
         (speed_estimate(3.0, -4.0, 0.5, variance=0.09), (-4.0, 3.0, -0.5), 0.3),
-        (odometry(2.0, 1.0, 0.0), (-2.0, 1.0, 0.0), 0.2),
+        (odometry(2.0, 1.0, 0.0), (-2.0, 1.0, 0.0), math.hypot(0.2, math.radians(1.0) * math.hypot(2.0, 1.0))),
+        (odometry(2.0, 1.0, 0.0, variance=1e-9), (-2.0, 1.0, 0.0), 0.1),
+        (odometry(30.0, 0.0, 0.0, variance=1e-9), (-30.0, 0.0, 0.0), math.radians(1.0) * 30.0),
         (odometry(2.0, 1.0, -0.25, frame=mavlink.MAV_FRAME_LOCAL_NED, variance=math.nan), (1.0, 2.0, 0.25), None),
     ],
 )
@@ -354,7 +363,14 @@ def test_a_velocity_by_another_camera_counts_more_than_the_autopilots(message, e
     "message",
     [
         from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION), BRIDGE_COMPONENT),
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION), AUTOPILOT_COMPONENT),
+        from_camera(odometry(1.0, 2.0, 3.0), AUTOPILOT_COMPONENT),
+        from_camera(speed_estimate(1.0, 2.0, 3.0), AUTOPILOT_COMPONENT),
         from_camera(speed_estimate(math.nan, 2.0, 3.0)),
+        from_camera(speed_estimate(1e30, 2.0, 3.0)),
+        from_camera(speed_estimate(1.0, 2.0, 3.0, variance=math.inf)),
+        from_camera(odometry(1.0, 2.0, 3.0, variance=3.4e38)),
+        from_camera(odometry(1.0, 2.0, 3.0, variance=100.0)),
         from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT)),
         from_camera(odometry(1.0, 2.0, 3.0, quality=-1)),
         from_camera(odometry(1.0, 2.0, 3.0, frame=mavlink.MAV_FRAME_LOCAL_FRD)),
@@ -363,6 +379,32 @@ def test_a_velocity_by_another_camera_counts_more_than_the_autopilots(message, e
 def test_what_is_no_velocity_of_another_camera_is_left_out(message):
     vehicle = heard(TO_THE_WEST, message)
     assert (vehicle.east_velocity_mps, vehicle.velocity_sigma_mps) == (None, None)
+
+
+def test_a_camera_that_failed_takes_its_last_velocity_back():
+    good, failed = (from_camera(odometry(1.0, 2.0, 3.0, quality=quality)) for quality in (80, -1))
+    assert heard(TO_THE_WEST, good, failed).east_velocity_mps is None
+
+
+def test_an_accuracy_that_is_not_stated_is_not_mixed_with_one_that_is():
+    telemetry = MavlinkTelemetry()
+    for time_ns, variance in ((0, math.nan), (100_000_000, 4.0)):
+        telemetry.update(from_camera(speed_estimate(1.0, 2.0, 3.0, variance=variance)), time_ns)
+    sigmas = [telemetry.vehicle(ms * 1_000_000).velocity_sigma_mps for ms in (0, 1, 99, 100)]
+    assert sigmas == [None, None, 2.0, 2.0]
+
+
+@pytest.mark.parametrize("component", [191, 197, 158, 100])
+def test_velocities_arrive_from_every_component_of_the_vehicle(component):
+    decoder, telemetry = PacketDecoder(1, HANDLED_MESSAGES, is_stream=False), MavlinkTelemetry()
+    for system, message in ((2, speed_estimate(9.0, 9.0, 9.0)), (1, speed_estimate(3.0, -4.0, 0.5)),
+                            (1, TO_THE_WEST)):  # fmt: skip
+        sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        for one in decoder.feed(bytes(message.pack(sender))):
+            telemetry.update(one, 1)
+    vehicle = telemetry.vehicle(1)
+    assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-4.0, 3.0))
+    assert vehicle.heading_deg is None  # of anything else the autopilot alone is heard
 
 
 def test_units_end_at_the_door():
@@ -1059,6 +1101,25 @@ def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(brid
         pilot.socket.send(word.pack(station))
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
         assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+@pytest.mark.parametrize("by_camera", [True, False])
+def test_a_cameras_velocity_arrives_without_the_autopilots(bridge_to, by_camera):
+    made = bridge_to(use_velocity=False)
+    with Standin(made.port) as pilot:
+        sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
+
+        def seen():
+            if by_camera:
+                pilot.socket.send(speed_estimate(3.0, -4.0, 0.5).pack(sender))
+            frames = made.navigator.frames
+            heard = bool(frames) and frames[-1].heading_deg is not None and len(frames) > 10
+            return heard and (not by_camera or frames[-1].east_velocity_mps is not None)
+
+        fly(made.bridge, seen)
+    frame = made.navigator.frames[-1]
+    told = (frame.east_velocity_mps, frame.north_velocity_mps)
+    assert told == (pytest.approx((-4.0, 3.0)) if by_camera else (None, None))
 
 
 def test_the_first_fixes_are_held_against_the_receiver(bridge_to):
