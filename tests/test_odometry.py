@@ -301,7 +301,7 @@ def test_only_odometry_needs_a_camera_of_the_matcher():
     matcher = Blind()
     del matcher.camera
     assert isinstance(Navigator(matcher, START).update(frame(picture((0, 0), LEVEL))), NoFix)
-    with pytest.raises(OptionError, match="^odometry: expected a matcher with a `camera`, got Blind without"):
+    with pytest.raises(OptionError, match=r"^odometry: expected a matcher with a `camera`, got Blind without"):
         Navigator(matcher, START, options=NavigatorOptions(odometry=True))
 
 
