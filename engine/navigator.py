@@ -164,8 +164,8 @@ class Navigator:
             TelemetryError: the frame came before, or is older than ``late_s``.
             CalibrationError: the frame is not of the camera's resolution.
         """
-        clock, late, told = Deadline(Budget()), self._odometry.is_late(frame), frame
-        budget = budget or self._budget
+        clock, budget = Deadline(Budget()), budget or self._budget
+        late, told = self._odometry.is_late(frame), frame
         frame = self._velocity.shown(frame)
         self._motion = None if late or self._pictures is None else self._seen_motion(self._pictures, frame)
         now = self._odometry.sample(frame, self._recent.velocity, self._motion)
@@ -177,9 +177,8 @@ class Navigator:
             return repeated
         sources = self._sources(now, prior, late=late)
         shown = self._errors.corrected(frame, now.time_s, late=late, refusals=self._refusals)
-        result = self._matcher.locate(
-            self._with_height(shown), sources.prior, budget and budget.after(clock.elapsed_ms)
-        )
+        left = budget and budget.after(clock.elapsed_ms if self._pictures else 0.0)
+        result = self._matcher.locate(self._with_height(shown), sources.prior, left)
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
