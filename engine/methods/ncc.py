@@ -65,7 +65,11 @@ class Ncc(Method):
             return
         for coarser in expected_window_px(query, self.options):
             self.refine(query, self.correlate(query, coarser))
+        untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
+        self.refine(untilted, self.correlate(untilted))
         found = self.find(query)
+        if isinstance(found, PeakCandidate):
+            self._candidates(query, found)  # as of a refused frame
         if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
             self._costed_second_look(query, found, found.fix.window)
 

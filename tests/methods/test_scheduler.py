@@ -237,6 +237,16 @@ def test_after_warmup_nothing_is_created_in_flight(ground, site, camera):
     assert matcher.cache_counters == before
 
 
+def test_after_warmup_no_loop_is_compiled_for_a_refused_frame_or_one_without_tilt(site, camera, frame, prior):
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    matcher.warmup()
+    before = matcher.cache_counters
+    assert isinstance(matcher.locate(replace(frame, roll_deg=None, pitch_deg=None), prior), Fix)
+    noise = np.random.default_rng(0).integers(0, 255, frame.image.shape, np.uint8)
+    assert isinstance(matcher.locate(replace(frame, image=noise), prior), NoFix)
+    assert matcher.cache_counters == before
+
+
 def test_a_late_frame_is_no_sign_of_being_lost(ground, make, frame, prior):
     matcher = make("ncc", ncc=1e9)
     priors = []
