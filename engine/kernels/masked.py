@@ -7,11 +7,8 @@ their differences cancel, so all of it is in float64.
 
 from __future__ import annotations
 
-from engine.kernels.transform_sizes import fast_length
+from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
 from engine.tensors import Tensor, torch
-
-# Sums of squares below this share of their own terms are rounding.
-_FLAT_SHARE = 1e-10
 
 
 def ncc_surface(
@@ -44,7 +41,7 @@ def ncc_surface(
     energy_i, energy_t = sums(ii, n), sums(m, tt)
     numerator = sums(i, t) - sum_i * sum_t / safe
     spread_i, spread_t = energy_i - sum_i.square() / safe, energy_t - sum_t.square() / safe
-    textured = (spread_i > _FLAT_SHARE * ii[..., :1, :1].real) & (spread_t > _FLAT_SHARE * tt[..., :1, :1].real)
+    textured = (spread_i > FLAT_SHARE * ii[..., :1, :1].real) & (spread_t > FLAT_SHARE * tt[..., :1, :1].real)
     scores = numerator / (spread_i.clamp_min(0.0) * spread_t.clamp_min(0.0)).sqrt().clamp_min(1e-300)
     scores = torch.where(textured, scores, 0.0).clamp_(-1.0, 1.0)
     enough = common >= min_overlap * templates_valid.sum(dim=(-2, -1))[..., None, None].clamp_min(1)

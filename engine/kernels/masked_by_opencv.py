@@ -8,13 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.transform_sizes import fast_length
+from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-# Sums of squares below this share of their own terms are rounding.
-_FLAT_SHARE = 1e-10
 
 
 def ncc_surface(
@@ -56,7 +53,7 @@ def _scores(of_window: list[Array], of_template: list[Array], shape: tuple[int, 
     safe = np.maximum(common, 1.0)
     sum_i, sum_t = sums(i, n), sums(m, t)
     spread_i, spread_t = sums(ii, n) - sum_i * sum_i / safe, sums(m, tt) - sum_t * sum_t / safe
-    textured = (spread_i > _FLAT_SHARE * ii[0, 0]) & (spread_t > _FLAT_SHARE * tt[0, 0])
+    textured = (spread_i > FLAT_SHARE * ii[0, 0]) & (spread_t > FLAT_SHARE * tt[0, 0])
     norms = np.sqrt(spread_i * spread_t, out=np.ones_like(common), where=textured)
     scores = np.clip((sums(i, t) - sum_i * sum_t / safe) / norms, -1.0, 1.0)
     scores[~textured] = 0.0

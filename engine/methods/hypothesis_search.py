@@ -58,10 +58,10 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
 def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
     """One level above, with its fewer hypotheses, which costs a sixteenth; None where too little is left there."""
     above = level + 1
-    h, w = (n >> (above - first.level) for n in first.template.shape)
-    if above == correlator.query.site.levels or min(h, w) < _MIN_QUICK_TEMPLATE_PX:
+    side_px, turns, shares = _grid_on(correlator, first, above)
+    if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:
         return None
-    return above, _hypotheses(correlator.query.telemetry, *_grid(correlator.options, math.hypot(h, w) / 2.0))
+    return above, _hypotheses(correlator.query.telemetry, turns, shares)
 
 
 def _is_beyond_doubt(peak: Peak) -> bool:
@@ -97,13 +97,18 @@ def _coarse_level(correlator: Correlator, first: Aligned, window: Window) -> tup
     """The level on which all hypotheses are scored, and the hypotheses, whose number falls with the resolution."""
     level, levels = first.level, correlator.query.site.levels
     while True:
-        h, w = (n >> (level - first.level) for n in first.template.shape)
-        turns, shares = _grid(correlator.options, math.hypot(h, w) / 2.0)
+        side_px, turns, shares = _grid_on(correlator, first, level)
         area_px = window.area_px / 4**level
         few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= _MAX_COARSE_PLACES
-        if few or level + 1 == levels or min(h, w) >> 1 < _MIN_TEMPLATE_PX:
+        if few or level + 1 == levels or side_px >> 1 < _MIN_TEMPLATE_PX:
             return level, _hypotheses(correlator.query.telemetry, turns, shares)
         level += 1
+
+
+def _grid_on(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[float], list[float]]:
+    """The template's shorter side on a level, in its pixels, with the turns and shares to be tried there."""
+    h, w = (n >> (level - first.level) for n in first.template.shape)
+    return min(h, w), *_grid(correlator.options, math.hypot(h, w) / 2.0)
 
 
 def _grid(options: NccOptions, reach_px: float) -> tuple[list[float], list[float]]:

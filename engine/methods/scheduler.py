@@ -114,12 +114,12 @@ class Scheduler:
 
         Where other threads or a device do the work, its own time tells nothing of it, and all counts as work.
         """
-        start_ms, before = self.deadline.elapsed_ms, thread_usage()
-        works_alone = self._device.type == "cpu" and threads.count() == 1
+        start_ms, works_alone = self.deadline.elapsed_ms, self._device.type == "cpu" and threads.count() == 1
+        before = thread_usage() if works_alone else None
 
         def taken() -> tuple[float, float]:
             took_ms = self.deadline.elapsed_ms - start_ms
-            return took_ms, waited_ms(before, thread_usage(), took_ms) if works_alone else 0.0
+            return took_ms, 0.0 if before is None else waited_ms(before, thread_usage(), took_ms)
 
         return taken
 

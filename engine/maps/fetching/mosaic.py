@@ -117,6 +117,11 @@ class Level:
     columns: int
     rows: int
 
+    def corner_of(self, column: int, row: int) -> tuple[float, float]:
+        """X and y of the north-western corner of a tile."""
+        (x, y), (width, height) = self.corner, self.tile_px
+        return x + column * width * self.step[0], y - row * height * self.step[1]
+
 
 @dataclass(frozen=True, slots=True)
 class Piece:
@@ -244,16 +249,15 @@ def mosaic_of(
         url_of: address of a tile by its column and row on the level.
         **rest: the other attributes of :class:`Mosaic`.
     """
-    (x, y), (width, height), step = level.corner, level.tile_px, level.step
     return Mosaic(
         level=level.name,
         crs=crs,
-        corner=(x + part.column * width * step[0], y - part.row * height * step[1]),
-        step=step,
+        corner=level.corner_of(part.column, part.row),
+        step=level.step,
         piece_px=level.tile_px,
         columns=part.columns,
         rows=part.rows,
-        gsd_m_per_px=gsd_of(step, place.metres_per_unit(crs)),
+        gsd_m_per_px=gsd_of(level.step, place.metres_per_unit(crs)),
         pieces=tuple(
             Piece(url_of(part.column + column, part.row + row), column, row)
             for row in range(part.rows)

@@ -64,10 +64,7 @@ def plan_wms(root: Xml.Element, url: str, wanted: Wanted) -> Mosaic:
     north_first = "CRS" in request and code.startswith("EPSG:") and is_north_first(crs_of(code))
 
     def url_of(column: int, row: int) -> str:
-        west, north = (
-            level.corner[0] + column * level.tile_px[0] * level.step[0],
-            level.corner[1] - row * level.tile_px[1] * level.step[1],
-        )
+        west, north = level.corner_of(column, row)
         east, south = west + level.tile_px[0] * level.step[0], north - level.tile_px[1] * level.step[1]
         box = (south, west, north, east) if north_first else (west, south, east, north)
         return with_query(url, request | {"BBOX": ",".join(map(repr, box))}, without=("srs", "crs"))
