@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -208,13 +207,14 @@ MAX_FIELD_DEG = 70.0
 """Of an oblique frame the ground is used up to this angle off the vertical; beyond it is far and foreshortened."""
 MIN_PICTURE_PX = 32
 """Least extent of an orthorectified frame."""
-SIDE_STEP_PX = 32
-"""One is square, its side a multiple of this, so that a flight meets few sizes and plans none in the air."""
+SIDE_STEP_PX = 16
+"""Its sides are multiples of this, so that a flight meets few lengths and lays out none in the air."""
 MAX_PICTURE_PX = 8 << 20
 """Most pixels of one: where it would cover more, its height is out of proportion to the map."""
 _NODES = 17  # along each side of the lattice on which the projection is computed; bilinear between
 RIM_PX = 5
 """What an orthorectified frame shows ends so far within its edge, whose gradients are none of the ground."""
+_RIM = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
 
 Relief = Callable[[Array], Array]
 """Heights (...,) in metres above the ground below the camera, at offsets (..., 2) from the nadir in map pixels."""
@@ -301,20 +301,19 @@ def orthorectify(
     bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)
     if bounds is None or (bounds[1] - bounds[0]).min() < MIN_PICTURE_PX:
         return None
-    side = math.ceil(((bounds[1] - bounds[0]).max() + 1.0) / SIDE_STEP_PX) * SIDE_STEP_PX
-    if side * side > MAX_PICTURE_PX:
+    sides = np.ceil((bounds[1] - bounds[0] + 1.0) / SIDE_STEP_PX) * SIDE_STEP_PX
+    if sides.prod() > MAX_PICTURE_PX:
         return None
-    corner = np.floor(bounds.mean(axis=0) - (side - 1) / 2.0)
+    corner = np.floor(bounds.mean(axis=0) - (sides - 1.0) / 2.0)
     enu_from_camera = camera.enu_from_camera(attitude)
-    nodes = np.stack(np.meshgrid(*np.linspace(corner, corner + side - 1.0, _NODES, axis=1)), axis=-1)
+    nodes = np.stack(np.meshgrid(*np.linspace(corner, corner + sides - 1.0, _NODES).T), axis=-1)
     up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
     ground_m = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1)
-    x_px, y_px, seen = cv2.split(_between_nodes(_projected(ground_m, camera, enu_from_camera), side))
+    size = (int(sides[1]), int(sides[0]))
+    x_px, y_px, inside = _between_nodes(_projected(ground_m, camera, enu_from_camera), gray.shape, size)
     slant_m = height_m / max(-enu_from_camera[2, 2], 1e-3)
     scale = slant_m / camera.focal_px / math.sqrt(abs(float(np.linalg.det(enu_jacobian))))
-    inside = (x_px >= 0) & (x_px <= gray.shape[1] - 1) & (y_px >= 0) & (y_px <= gray.shape[0] - 1) & (seen > 0.999)
-    rim = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    valid = cv2.erode(inside.astype(np.uint8), rim, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    valid = cv2.erode(inside, _RIM, borderType=cv2.BORDER_CONSTANT, borderValue=0).view(np.bool_)
     return Orthophoto(_drawn(gray, scale, x_px, y_px), valid, corner, (x_px, y_px))
 
 
@@ -339,13 +338,13 @@ def _drawn(
     return np.asarray(cv2.remap(picture, x_px, y_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _between_nodes(values: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
-    """A lattice (n, n, C) from corner to corner, bilinear at every pixel of a square."""
-    return np.asarray(cv2.remap(values, *_places_between_nodes(side_px), cv2.INTER_LINEAR), np.float32)
+def _between_nodes(
+    nodes: NDArray[np.float32], shape: tuple[int, ...], size: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Places x and y (h, w) in a frame of some shape, by those (n, n, 3) of a lattice; 1 where it shows them."""
+    from engine.kernels.lattice import places_between_nodes  # numba takes a while to import
 
-
-@lru_cache(maxsize=4)  # a flight meets few sizes
-def _places_between_nodes(side_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    at = np.linspace(0.0, _NODES - 1.0, side_px, dtype=np.float32)
-    across, down = np.meshgrid(at, at)
-    return across, down
+    x_px, y_px, inside = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.uint8)
+    last_x, last_y = np.float32(shape[1] - 1), np.float32(shape[0] - 1)
+    places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside)
+    return x_px, y_px, inside

@@ -2,8 +2,8 @@
 
 The detector is Lowe's: extrema of differences of Gaussians over position and scale, refined by a quadratic.
 The descriptor is Lowe's 4 x 4 cells of 8 orientations. Where the usual loops run over levels and keypoints, the
-work here is a fixed number of tensor ops, in three modules: :mod:`engine.sift.scale_space`,
-:mod:`engine.sift.keypoints`, :mod:`engine.sift.descriptors`.
+work on a GPU is a fixed number of tensor ops, in three modules: :mod:`engine.sift.scale_space`,
+:mod:`engine.sift.keypoints`, :mod:`engine.sift.descriptors`. On a CPU :mod:`engine.sift.loops` finds the same.
 
 Convention:
     Points are (x, y) with pixel centres at integers and the origin at the centre of the top-left pixel.
@@ -24,12 +24,18 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from engine.errors import DtypeError, OptionError, ShapeError, require
+from engine.sift import loops
 from engine.sift.descriptors import describe, dominant_angle
-from engine.sift.keypoints import Points, detect, strongest
-from engine.sift.scale_space import make_plan
+from engine.sift.keypoints import Points, find_points, strongest
+from engine.sift.scale_space import band, gaussian_levels, make_plan
 from engine.tensors import Tensor, torch
 from engine.threads import in_parallel
+
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,17 +119,8 @@ def sift(
     _check_options(max_keypoints, upsample, contrast_threshold, spread)
     up_rad = math.radians(up_deg) if upright else None
     options = _SiftOptions(max_keypoints, up_rad, int(upsample), contrast_threshold, root, spread)
-    return _sift_batch(images[:, 0].float().nan_to_num(0.0, 1.0, 0.0), mask, options)
-
-
-def _sift_batch(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Features:
-    """Features of images (B, H, W) float32 without NaN."""
-    if images.device.type != "cpu":
-        return _sift(images, mask, options)
-    # One image at a time: its scale space fits into the CPU's cache.
-    masks = [None] * len(images) if mask is None else mask.split(1)
-    done = in_parallel(lambda one: _sift(*one, options), list(zip(images.split(1), masks, strict=True)))
-    return done[0] if len(done) == 1 else Features(*(torch.cat(f) for f in zip(*map(_fields, done), strict=True)))
+    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0)
+    return (_by_loops if images.device.type == "cpu" else _by_tensors)(pictures, mask, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,16 +135,48 @@ class _SiftOptions:
     spread: int
 
 
-def _sift(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Features:
-    """The same in one scale space."""
+def _by_loops(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Features:
+    """Features of images (B, H, W) on the CPU, one at a time: its scale space fits into the CPU's cache."""
+    slots = [
+        np.zeros((len(images), options.max_keypoints, *shape), np.float32) for shape in ((2,), (), (), (128,))
+    ]
+    valid = np.zeros((len(images), options.max_keypoints), np.bool_)
+    pictures, allowed = images.contiguous().numpy(), None if mask is None else mask.numpy()
+
+    def work(image: int) -> None:
+        found = _of_picture(pictures[image], None if allowed is None else allowed[image, 0], options)
+        valid[image, : len(found[0])] = True
+        for slot, values in zip(slots, found, strict=True):
+            slot[image, : len(values)] = values
+
+    in_parallel(work, range(len(images)))
+    return Features(*map(torch.from_numpy, (*slots, valid)))
+
+
+def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, options: _SiftOptions) -> tuple[Floats, ...]:
+    """Positions, scales, angles in degrees and descriptors of the keypoints of one picture (H, W)."""
+    plan = loops.plan_loops(*image.shape, options.upsample)
+    gaussians, keypoints = loops.detect(image, plan, options.contrast_threshold)
+    keypoints = loops.strongest(keypoints, plan, mask, options.max_keypoints, options.spread)
+    if options.up_rad is None:
+        angle_rad = loops.dominant_angle(gaussians, keypoints, plan)
+    else:
+        angle_rad = np.full(len(keypoints), options.up_rad, np.float32)
+    descriptors = loops.describe(gaussians, keypoints, angle_rad, plan, root=options.root)
+    angle_deg = np.remainder(np.rad2deg(angle_rad), np.float32(360))
+    return loops.xy_px(keypoints, plan), loops.scale_px(keypoints), angle_deg, descriptors
+
+
+def _by_tensors(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Features:
+    """Features of images (B, H, W) in one scale space, in tensor ops whose number and shapes are fixed."""
     plan = make_plan(images.shape[1], images.shape[2], len(images), options.upsample, images.device)
     with torch.inference_mode():
-        gaussians, points = detect(images, plan, options.contrast_threshold)
+        gaussians = gaussian_levels(images, plan)
+        points = find_points(gaussians, plan, options.contrast_threshold)
         if mask is not None:
             points = points.within(mask)
         index, filled = strongest(points, plan, len(images), options.max_keypoints, options.spread)
-        # On a GPU empty slots are described too: how many there are is not known to the host.
-        points = points.take(index[filled] if images.device.type == "cpu" else index)
+        points = points.take(index)  # empty slots are described too: how many there are is not known to the host
         if options.up_rad is None:
             angle = dominant_angle(gaussians, points, plan)
         else:
@@ -157,19 +186,22 @@ def _sift(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Feature
 
 
 def prepare_plans(sides_px: Iterable[int], device: torch.device) -> None:
-    """Lay out the scale spaces of square pictures, so that none is planned in flight.
+    """Compute the filters of pictures whose sides are among these, so that none is computed in flight.
 
     Args:
         sides_px: of the pictures.
         device: where they will be.
     """
     for side_px, upsample in itertools.product(sides_px, (1, 2)):
-        make_plan(side_px, side_px, 1, upsample, device)
+        if device.type == "cpu":
+            loops.plan_loops(side_px, side_px, upsample)
+        else:
+            make_plan(side_px, side_px, 1, upsample, device).prepare()
 
 
 def plans_created() -> int:
-    """Number of scale-space layouts created so far, one per size of image; a flight of one camera needs a few."""
-    return make_plan.cache_info().misses
+    """Number of filters computed so far, by length of a picture's side; a flight of one camera needs a few."""
+    return loops.filters.cache_info().misses + band.cache_info().misses
 
 
 def _fields(features: Features) -> tuple[Tensor, ...]:
@@ -361,14 +393,10 @@ def _check_options(max_keypoints: int, upsample: int, contrast_threshold: float,
 
 
 def _to_slots(points: Points, angle: Tensor, descriptors: Tensor, filled: Tensor, batch: int) -> Features:
-    """Columns of all slots, or of the filled ones, as (B, N) slots that are zero where they are empty."""
+    """Columns of all slots as (B, N), zero where they are empty."""
 
     def slots(values: Tensor) -> Tensor:
-        if len(values) == len(filled):
-            out = torch.where(filled.view(-1, *[1] * (values.ndim - 1)), values, 0)
-        else:
-            out = values.new_zeros(len(filled), *values.shape[1:])
-            out[filled] = values
+        out = torch.where(filled.view(-1, *[1] * (values.ndim - 1)), values, 0)
         return out.view(batch, -1, *values.shape[1:])
 
     degrees = torch.rad2deg(angle).remainder(360)

@@ -1,7 +1,8 @@
 """SIFT's dominant angles and descriptors for the CPU, compiled by numba.
 
 ``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`, ``table`` its layout: for every octave
-height, width, offset, and the strides of level, row and image.
+height, width, offset, and the strides of level and row. ``keypoints`` are rows of x, y, growth of sigma, contrast,
+level, octave, in pixels of the octave.
 """
 
 from __future__ import annotations
@@ -11,6 +12,9 @@ import math
 import numpy as np
 
 from engine.kernels.jit import compiled
+
+_BOUND = 0.2  # of an entry before the last normalisation
+_LEAST = 1e-24  # which keeps an empty descriptor zero
 
 
 @compiled
@@ -37,9 +41,34 @@ def _sample(buffer, layout, x, y, cos, sin, patch):
 
 
 @compiled
-def _layout(table, octave, image, level):
-    height, width, offset, per_level, per_row, per_image = table[octave]
-    return height, width, offset + level * per_level + image * per_image, per_row
+def _sample_upright(buffer, layout, x, y, spacing, line, patch):
+    """The same on a grid that is not rotated, whose columns and rows are found once each: half the time."""
+    height, width, base, per_row = layout
+    left, share = line
+    side = len(patch)
+    half = np.float32(0.5 * (side - 1))
+    max_x, max_y = np.float32(width - 1.001), np.float32(height - 1.001)
+    zero = np.float32(0)
+    for column in range(side):
+        px = min(max(np.float32(x + spacing * (column - half)), zero), max_x)
+        left[column] = np.int32(px)
+        share[column] = px - np.float32(left[column])
+    for row in range(side):
+        py = min(max(np.float32(y + spacing * (row - half)), zero), max_y)
+        top = int(py)
+        fy, start = py - np.float32(top), base + top * per_row
+        for column in range(side):
+            at, fx = start + left[column], share[column]
+            upper = buffer[at] + fx * (buffer[at + 1] - buffer[at])
+            at += per_row
+            lower = buffer[at] + fx * (buffer[at + 1] - buffer[at])
+            patch[row, column] = upper + fy * (lower - upper)
+
+
+@compiled
+def _layout(table, octave, level):
+    height, width, offset, per_level, per_row = table[octave]
+    return height, width, offset + level * per_level, per_row
 
 
 @compiled
@@ -57,15 +86,14 @@ def _turn(x, y):
 
 
 @compiled
-def angles(buffer, table, where, positions, step, window, smooth):
+def angles(buffer, table, keypoints, step, window, smooth):
     """Direction of the highest peak in the histogram of gradient directions.
 
     Args:
         buffer: (N,) float32 scale space.
-        table: (octaves, 6) int64 layout.
-        where: (M, 3) int64 octave, image, level.
-        positions: (M, 3) float32 x, y and sigma, in pixels of the octave.
-        step: spacing of the samples in sigmas.
+        table: (octaves, 5) int64 layout.
+        keypoints: (M, 6) float32.
+        step: spacing of the samples where the growth is 1, in pixels of the octave.
         window: (S, S) float32 weights of the samples.
         smooth: (bins, bins) float32 circular smoothing of the histogram.
 
@@ -76,10 +104,11 @@ def angles(buffer, table, where, positions, step, window, smooth):
     patch = np.empty((side + 2, side + 2), np.float32)
     histogram, raw = np.empty(bins, np.float32), np.empty(bins + 1, np.float32)
     turns, sizes = np.empty(side, np.int32), np.empty(side, np.float32)
-    out = np.empty(len(where), np.float32)
-    for i in range(len(where)):
-        layout = _layout(table, where[i, 0], where[i, 1], where[i, 2])
-        _sample(buffer, layout, positions[i, 0], positions[i, 1], positions[i, 2] * step, np.float32(0), patch)
+    line = np.empty(side + 2, np.int32), np.empty(side + 2, np.float32)
+    out = np.empty(len(keypoints), np.float32)
+    for i in range(len(keypoints)):
+        u, v, growth, _, level, octave = keypoints[i]
+        _sample_upright(buffer, _layout(table, int(octave), int(level)), u, v, growth * step, line, patch)
         raw[:] = 0
         for row in range(side):
             for x in range(side):
@@ -110,31 +139,35 @@ def _highest_bin(raw, smooth, histogram):
 
 
 @compiled
-def descriptors(buffer, table, where, positions, angle, step, tent):
-    """Lowe's cells of 8 orientations, not normalised.
+def descriptors(buffer, table, keypoints, angle, step, tent, root):
+    """Lowe's cells of 8 orientations, of unit L2 norm.
 
     Args:
         buffer: (N,) float32 scale space.
-        table: (octaves, 6) int64 layout.
-        where: (M, 3) int64 octave, image, level.
-        positions: (M, 3) float32 x, y and sigma, in pixels of the octave.
-        angle: (M,) radians.
-        step: spacing of the samples in sigmas.
+        table: (octaves, 5) int64 layout.
+        keypoints: (M, 6) float32.
+        angle: (M,) float32 radians.
+        step: spacing of the samples where the growth is 1, in pixels of the octave.
         tent: (cells, S) float32 weights of a row's samples in the cells.
+        root: whether RootSIFT is asked for.
 
     Returns:
         (M, cells^2 * 8) float32, cells row by row.
     """
     cells, side = tent.shape
     patch = np.empty((side + 2, side + 2), np.float32)
+    line = np.empty(side + 2, np.int32), np.empty(side + 2, np.float32)
     p = np.empty((8, side), np.float32)
     columns = np.empty((cells, 8, side), np.float32)
-    out = np.empty((len(where), cells * cells * 8), np.float32)
-    for i in range(len(where)):
-        layout = _layout(table, where[i, 0], where[i, 1], where[i, 2])
-        reach = positions[i, 2] * step
-        cos, sin = reach * np.float32(math.cos(angle[i])), reach * np.float32(math.sin(angle[i]))
-        _sample(buffer, layout, positions[i, 0], positions[i, 1], cos, sin, patch)
+    out = np.empty((len(keypoints), cells * cells * 8), np.float32)
+    for i in range(len(keypoints)):
+        u, v, growth, _, level, octave = keypoints[i]
+        layout, spacing = _layout(table, int(octave), int(level)), growth * step
+        if angle[i] == 0:
+            _sample_upright(buffer, layout, u, v, spacing, line, patch)
+        else:
+            cos, sin = spacing * np.float32(math.cos(angle[i])), spacing * np.float32(math.sin(angle[i]))
+            _sample(buffer, layout, u, v, cos, sin, patch)
         columns[:] = 0
         for row in range(side):
             _orient_row(patch, row, p)
@@ -145,7 +178,26 @@ def descriptors(buffer, table, where, positions, angle, step, tent):
                         for x in range(side):
                             columns[r, k, x] += weight * p[k, x]
         _pool(columns, tent, out[i])
+        _normalise(out[i], root)
     return out
+
+
+@compiled
+def _normalise(values, root):
+    """Unit L2 norm with entries bounded before (Lowe), and then the roots of shares for RootSIFT."""
+    bound, total = np.float32(_BOUND), np.float32(_LEAST)
+    for k in range(values.size):
+        total += values[k] * values[k]
+    gain = np.float32(1) / np.float32(math.sqrt(total))
+    total, squares = np.float32(_LEAST), np.float32(_LEAST)
+    for k in range(values.size):
+        value = min(values[k] * gain, bound)
+        values[k] = value
+        total += value
+        squares += value * value
+    gain = np.float32(1) / np.float32(total if root else math.sqrt(squares))
+    for k in range(values.size):
+        values[k] = math.sqrt(values[k] * gain) if root else values[k] * gain
 
 
 @compiled

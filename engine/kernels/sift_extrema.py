@@ -6,45 +6,12 @@ while they are cached. ``buffer`` is the flat scale space of :mod:`engine.sift.s
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.kernels.jit import compiled
 
-Filters = tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]
-
 TAPS = 4
 """Taps of a filter that one pass over a row applies; filters are padded with zeros to a multiple of it."""
-
-
-@lru_cache(maxsize=128)
-def filters(inputs: int, outputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> Filters:
-    """Gaussian filters of all levels along one axis.
-
-    Args:
-        inputs: pixels along the axis.
-        outputs: pixels of the result.
-        sigmas: of the levels, in pixels of the input; 0 copies.
-        reach: of each filter to either side, in pixels of the input.
-        up: outputs per input, 1 or 2.
-
-    Returns:
-        Weights (levels, up, taps), reach (levels,) and gains (levels, outputs) that make up for the edges.
-    """
-    near = np.array(reach)
-    offsets = np.arange(-(-(2 * near.max() + up) // TAPS) * TAPS) - near[:, None, None]  # (levels, 1, taps)
-    phase = np.arange(up).reshape(1, -1, 1) / up
-    weights = np.exp(-0.5 * ((offsets - phase) / np.maximum(np.array(sigmas), 1e-3).reshape(-1, 1, 1)) ** 2)
-    weights *= offsets < near[:, None, None] + up
-    weights /= weights.sum(-1, keepdims=True)
-    index = np.arange(outputs)
-    source = index[:, None] // up + offsets
-    inside = (source >= 0) & (source < inputs)
-    used = weights[:, index % up]
-    gains = np.where((inside | (used == 0)).all(-1), 1.0, 1.0 / (used * inside).sum(-1))
-    return weights.astype(np.float32), near, gains.astype(np.float32)
 
 
 @compiled
@@ -53,8 +20,8 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
 
     Args:
         source: (H, W) float32.
-        across: filters of the rows from :func:`filters`: output ``up m + p`` of level l is its gain times the sum
-            over k of ``weights[l, p, k] source[m + k - reach[l]]``, zero beyond the edges.
+        across: filters of the rows from :func:`engine.sift.loops.filters`: output ``up m + p`` of level l is its
+            gain times the sum over k of ``weights[l, p, k] source[m + k - reach[l]]``, zero beyond the edges.
         down: filters of the columns.
         buffer: (N,) float32 that the levels are written to.
         layout: (offset, stride of a level, stride of a row).

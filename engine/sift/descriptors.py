@@ -6,27 +6,23 @@ tangent (:func:`_orient`).
 """
 
 import math
-from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engine import threads
 from engine.sift.keypoints import Points
 from engine.sift.scale_space import ScaleSpacePlan
 from engine.tensors import Tensor, torch
 
-AnyArray = NDArray[Any]
+Floats = NDArray[np.float32]
 
-_POINTS_PER_THREAD = 64
 _ANGLE_BINS = 36
 _ORIENT_SAMPLES = 13  # per side, 0.75 sigma apart: Lowe's window of 4.5 sigma
-_ORIENT_STEP = 0.75
+ORIENT_STEP = 0.75
 _CELLS = 4
-_CELL_SIGMAS = 3.0
-_CELL_SAMPLES = 3
+CELL_SIGMAS = 3.0
+CELL_SAMPLES = 3
 _DESC_SAMPLES = 12
 
 
@@ -78,34 +74,7 @@ def dominant_angle(gaussians: Tensor, points: Points, plan: ScaleSpacePlan) -> T
     Returns:
         (M,) radians from +x towards +y.
     """
-    if gaussians.device.type != "cpu":
-        return angle_by_tensors(gaussians, points, plan)
-    from engine.kernels import sift_descriptors
-
-    window, smooth = (weights.numpy() for weights in _orientation_weights(gaussians.device))
-    window = window.reshape(_ORIENT_SAMPLES, _ORIENT_SAMPLES)
-
-    def work(where: AnyArray, positions: AnyArray) -> Any:
-        step = np.float32(_ORIENT_STEP)
-        return sift_descriptors.angles(
-            gaussians.numpy(), plan.table.numpy(), where, positions, step, window, smooth
-        )
-
-    return _in_parts(work, points, plan)
-
-
-def angle_by_tensors(gaussians: Tensor, points: Points, plan: ScaleSpacePlan) -> Tensor:
-    """Return the same as :func:`dominant_angle`, as tensor ops on any device.
-
-    Args:
-        gaussians: (N,) float32 levels.
-        points: M keypoints.
-        plan: of the levels.
-
-    Returns:
-        (M,) radians from +x towards +y.
-    """
-    gx, gy = _gradients(gaussians, points, plan, None, _ORIENT_SAMPLES, _ORIENT_STEP)
+    gx, gy = _gradients(gaussians, points, plan, None, _ORIENT_SAMPLES, ORIENT_STEP)
     window, smooth = _orientation_weights(gaussians.device)
     bins = (torch.atan2(gy, gx) * (_ANGLE_BINS / math.tau)).round_().long()
     bins = torch.where(bins < 0, bins + _ANGLE_BINS, bins)
@@ -116,14 +85,20 @@ def angle_by_tensors(gaussians: Tensor, points: Points, plan: ScaleSpacePlan) ->
     return ((peak + offset) * (math.tau / _ANGLE_BINS))[:, 0]
 
 
-@lru_cache(maxsize=8)
-def _orientation_weights(where: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the window (S,) of sigma 1.5 keypoint sigmas, and the (36, 36) circular smoothing 1 4 6 4 1."""
-    ramp = (np.arange(_ORIENT_SAMPLES) - (_ORIENT_SAMPLES - 1) / 2) * _ORIENT_STEP
-    window = np.exp(-0.5 * (ramp[:, None] ** 2 + ramp**2) / 1.5**2).ravel()
+@lru_cache(maxsize=1)
+def orientation_weights() -> tuple[Floats, Floats]:
+    """Return the window (S, S) of sigma 1.5 keypoint sigmas, and the (36, 36) circular smoothing 1 4 6 4 1."""
+    ramp = (np.arange(_ORIENT_SAMPLES) - (_ORIENT_SAMPLES - 1) / 2) * ORIENT_STEP
+    window = np.exp(-0.5 * (ramp[:, None] ** 2 + ramp**2) / 1.5**2)
     taps = zip((-2, -1, 0, 1, 2), (1, 4, 6, 4, 1), strict=True)
     smooth = sum(weight / 16 * np.roll(np.eye(_ANGLE_BINS), shift, 1) for shift, weight in taps)
-    return torch.from_numpy(window.astype(np.float32)).to(where), torch.from_numpy(smooth).float().to(where)
+    return window.astype(np.float32), np.asarray(smooth, np.float32)
+
+
+@lru_cache(maxsize=8)
+def _orientation_weights(where: torch.device) -> tuple[Tensor, Tensor]:
+    window, smooth = (torch.from_numpy(weights).to(where) for weights in orientation_weights())
+    return window.flatten(), smooth
 
 
 def describe(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpacePlan, *, root: bool) -> Tensor:
@@ -139,48 +114,10 @@ def describe(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpaceP
     Returns:
         (M, 128) of unit L2 norm.
     """
-    if gaussians.device.type != "cpu":
-        return normalise(cells_by_tensors(gaussians, points, angle, plan), root=root)
-    from engine.kernels import sift_descriptors
-
-    def work(where: AnyArray, positions: AnyArray, turn: AnyArray) -> Any:
-        step = np.float32(_CELL_SIGMAS / _CELL_SAMPLES)
-        return sift_descriptors.descriptors(
-            gaussians.numpy(), plan.table.numpy(), where, positions, turn, step, _tents()
-        )
-
-    return normalise(_in_parts(work, points, plan, angle), root=root)
-
-
-def _in_parts(work: Callable[..., AnyArray], points: Points, plan: ScaleSpacePlan, *columns: Tensor) -> Tensor:
-    """Return work(where, positions, *columns) of all points, in parallel parts.
-
-    ``where`` is octave, image, level; ``positions`` x, y, sigma in octave pixels.
-    """
-    where = torch.stack([points.octave, points.image, points.level], dim=1).numpy()
-    positions = torch.stack([points.x, points.y, points.growth * plan.first_sigma], dim=1).numpy()
-    rows = [where, positions, *(column.numpy() for column in columns)]
-    parts = threads.parts(len(where), len(where) // _POINTS_PER_THREAD)
-    done = threads.in_parallel(lambda part: work(*(row[part[0] : part[1]] for row in rows)), parts)
-    return torch.from_numpy(np.concatenate(done))
-
-
-def cells_by_tensors(gaussians: Tensor, points: Points, angle: Tensor, plan: ScaleSpacePlan) -> Tensor:
-    """Return the descriptors of :func:`describe` before normalisation, as tensor ops on any device.
-
-    Args:
-        gaussians: (N,) float32 levels.
-        points: M keypoints.
-        angle: (M,) radians from +x towards +y.
-        plan: of the levels.
-
-    Returns:
-        (M, 128), cells row by row, 8 orientations each.
-    """
-    step = _CELL_SIGMAS / _CELL_SAMPLES
+    step = CELL_SIGMAS / CELL_SAMPLES
     gx, gy = _gradients(gaussians, points, plan, angle, _DESC_SAMPLES, step)
     pooled = _orient(gx, gy) @ _pooling(gaussians.device)  # (8, P, 16)
-    return pooled.permute(1, 2, 0).flatten(1)
+    return normalise(pooled.permute(1, 2, 0).flatten(1), root=root)
 
 
 def _orient(gx: Tensor, gy: Tensor) -> Tensor:
@@ -200,19 +137,17 @@ def _orient(gx: Tensor, gy: Tensor) -> Tensor:
 @lru_cache(maxsize=8)
 def _pooling(where: torch.device) -> Tensor:
     """Return (S, 16): bilinear weights of the samples in the cells, times a Gaussian of half the width."""
-    weights = np.einsum("ry,cx->yxrc", _tents(), _tents()).reshape(_DESC_SAMPLES**2, _CELLS**2)
+    weights = np.einsum("ry,cx->yxrc", tents(), tents()).reshape(_DESC_SAMPLES**2, _CELLS**2)
     return torch.from_numpy(weights).to(where)
 
 
 @lru_cache(maxsize=1)
-def _tents() -> AnyArray:
+def tents() -> Floats:
     """Return (cells, samples) float32: the weights of :func:`_pooling` along one axis."""
-    ramp = (np.arange(_DESC_SAMPLES) - (_DESC_SAMPLES - 1) / 2) / _CELL_SAMPLES
+    ramp = (np.arange(_DESC_SAMPLES) - (_DESC_SAMPLES - 1) / 2) / CELL_SAMPLES
     centres = np.arange(_CELLS) - (_CELLS - 1) / 2
-    tents: AnyArray = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(
-        -0.5 * (ramp / (_CELLS / 2)) ** 2
-    )
-    return tents.astype(np.float32)
+    weights = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(-0.5 * (ramp / (_CELLS / 2)) ** 2)
+    return np.asarray(weights, np.float32)
 
 
 def normalise(descriptors: Tensor, *, root: bool) -> Tensor:

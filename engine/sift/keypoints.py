@@ -3,30 +3,23 @@
 An extremum is refined by a quadratic; those of low contrast or along an edge are dropped (Lowe's tests).
 """
 
-import threading
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine import threads
-from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan, gaussian_levels, reach_px
+from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan
 from engine.tensors import Tensor, torch
 
-AnyArray = NDArray[Any]
-
-_BORDER = 4  # octave pixels along the edge without keypoints
-_EDGE_RATIO = 10.0
-_EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
-_PART_PX = 200_000  # pixels of an octave per thread, below which another thread does not pay
-_MOVES = 2  # times that a keypoint may move to a neighbouring voxel
+BORDER = 4  # octave pixels along the edge without keypoints
+EDGE_RATIO = 10.0
+EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
+MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 # Extrema that tensor ops have room for in an octave: one to so many of its pixels, to four times as many where the
 # picture is doubled, and at least so many. Photographs have half as many or fewer; else the coarsest are left out.
 _PX_PER_EXTREMUM = 16
 _MIN_EXTREMA = 256
-_MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
+MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,70 +72,6 @@ class Points:
         return FIRST_SIGMA_PX * self.growth * torch.exp2(self.octave.float())
 
 
-def detect(images: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> tuple[Tensor, Points]:
-    """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges.
-
-    Args:
-        images: (B, H, W) float32; on a CPU one at a time.
-        plan: of these images.
-        contrast_threshold: Lowe's.
-
-    Returns:
-        The Gaussian levels (N,) float32, which on a CPU the thread's next call overwrites; and the points.
-    """
-    if images.device.type == "cpu":
-        return _detect_compiled(images[0], plan, contrast_threshold)
-    gaussians = gaussian_levels(images, plan)
-    return gaussians, find_points(gaussians, plan, contrast_threshold)
-
-
-def _detect_compiled(image: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> tuple[Tensor, Points]:
-    """Do :func:`detect` for one image, (H, W), on the CPU."""
-    from engine.kernels.sift_refinement import refine_extrema
-
-    gaussians = _buffer(plan.gaussian_size)
-    threshold = contrast_threshold / SCALES
-    limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, _EDGE_RATIO)
-    found, source = [], image.contiguous()
-    for number, octave in enumerate(plan.octaves):
-        height, width, *layout, _ = plan.table[number].tolist()
-        voxels = _voxels_compiled(source.numpy(), octave, gaussians.numpy(), tuple(layout), _EARLY * threshold)
-        found.append(refine_extrema(gaussians.numpy(), (height, width, *layout), voxels, limits, number))
-        source = octave.levels(gaussians)[SCALES, :height:2, 0, :width:2].contiguous()
-    x, y, growth, contrast, level, of = torch.from_numpy(np.concatenate(found)).unbind(1)
-    pixel, which, valid = torch.exp2(of) / plan.upsample, of.long(), torch.ones_like(of, dtype=torch.bool)
-    image = torch.zeros_like(which)
-    return gaussians, Points(which, image, level.long(), x, y, growth, contrast, pixel, valid)
-
-
-def _voxels_compiled(
-    source: AnyArray, octave: Octave, buffer: AnyArray, layout: tuple[int, ...], threshold: float
-) -> AnyArray:
-    """Write an octave's levels and return its extrema (M, 3), by a number of threads that suits its size."""
-    from engine.kernels.sift_extrema import filters, find_extrema
-
-    (rows, columns), reach = octave.source, tuple(map(reach_px, octave.sigmas))
-    across = filters(columns, octave.width, octave.sigmas, reach, octave.up)
-    down = filters(rows, octave.height, octave.sigmas, reach, octave.up)
-
-    def work(part: tuple[int, int]) -> Any:
-        return find_extrema(source, across, down, buffer, layout, part, _BORDER, np.float32(threshold))
-
-    parts = threads.parts(octave.height, octave.height * octave.width // _PART_PX)
-    return np.concatenate(threads.in_parallel(work, parts))
-
-
-_local = threading.local()
-
-
-def _buffer(size: int) -> Tensor:
-    """Return the thread's own memory for a scale space: allocating new pages takes a tenth of the time."""
-    buffer: Tensor | None = getattr(_local, "buffer", None)
-    if buffer is None or buffer.numel() < size:
-        buffer = _local.buffer = torch.empty(size)
-    return buffer[:size]
-
-
 def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: float) -> Points:
     """Find and refine the points of all octaves in their Gaussian levels, as tensor ops of fixed shapes.
 
@@ -155,12 +84,12 @@ def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: flo
         As many points as the plan has room for; valid are those that pass the tests of contrast and edges.
     """
     threshold = contrast_threshold / SCALES
-    found = [_extrema(gaussians, octave, plan.upsample, _EARLY * threshold) for octave in plan.octaves]
+    found = [_extrema(gaussians, octave, plan.upsample, EARLY * threshold) for octave in plan.octaves]
     number = torch.cat([torch.full_like(f[:, 0], n) for n, f in enumerate(found)])
     level, y, image, x = torch.cat(found).unbind(1)
     is_found = level >= 0
-    level, y, x, image = level.clamp_min(0) + 1, y + _BORDER, x + _BORDER, image.clamp_min(0)
-    for last in (False,) * _MOVES + (True,):
+    level, y, x, image = level.clamp_min(0) + 1, y + BORDER, x + BORDER, image.clamp_min(0)
+    for last in (False,) * MOVES + (True,):
         value, gradient, hessian, shift = _fit_quadratic(gaussians, plan, number, level, image, y, x)
         if not last:
             step = torch.where(shift.abs() > 0.5, shift.sign(), 0.0).long().unbind(1)
@@ -170,8 +99,8 @@ def find_points(gaussians: Tensor, plan: ScaleSpacePlan, contrast_threshold: flo
     contrast = (value + 0.5 * (gradient * shift).sum(1)).abs()
     xx, yy, _, xy, _, _ = hessian.unbind(1)
     trace, determinant = xx + yy, xx * yy - xy * xy
-    keep = (contrast >= threshold) & (shift.abs().amax(1) < _MAX_SHIFT)
-    keep &= is_found & (determinant > 0) & (trace * trace * _EDGE_RATIO < (_EDGE_RATIO + 1) ** 2 * determinant)
+    keep = (contrast >= threshold) & (shift.abs().amax(1) < MAX_SHIFT)
+    keep &= is_found & (determinant > 0) & (trace * trace * EDGE_RATIO < (EDGE_RATIO + 1) ** 2 * determinant)
     shift = torch.where(keep[:, None], shift, 0.0)  # what is no keypoint still lies in its octave
     growth = torch.exp2((level + shift[:, 2]) / SCALES)
     pixel = torch.exp2(number.float()) / plan.upsample
@@ -183,7 +112,7 @@ def _extrema(gaussians: Tensor, octave: Octave, upsample: int, threshold: float)
 
     They count from the first level and the first pixel that are searched. M is fixed; rows left over are -1.
     """
-    edge = _BORDER - 1
+    edge = BORDER - 1
     levels = octave.levels(gaussians)[:, edge : octave.height - edge, :, edge : octave.width - edge]
     if levels.shape[1] < 3 or levels.shape[3] < 3:
         return torch.full((1, 4), -1, device=gaussians.device)

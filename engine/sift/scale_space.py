@@ -1,8 +1,8 @@
 """Scale space: all Gaussian levels of a batch of images, octave by octave, in one flat buffer.
 
 Every level is ``G_y I G_x^T``; upsampling is part of G, so that no interpolation comes before the blur. As tensor
-ops G is a banded matrix that is cut into blocks for the matmul; :mod:`engine.kernels.sift_extrema` has the
-same weights as a filter.
+ops G is a banded matrix that is cut into blocks for the matmul; :func:`engine.sift.loops.filters` has the same
+weights as a filter.
 """
 
 import math
@@ -39,8 +39,8 @@ def reach_px(sigma: float) -> int:
     return math.ceil(_TRUNCATE * sigma)
 
 
-@lru_cache(maxsize=128)
-def _band(inputs: int, sigmas: tuple[float, ...], up: int, device: torch.device) -> _Band:
+@lru_cache(maxsize=512)
+def band(inputs: int, sigmas: tuple[float, ...], up: int, device: torch.device) -> _Band:
     """Return G[l, i, j] ~ exp(-(i / up - j)^2 / (2 sigma_l^2)), rows summing to 1 also at the edges."""
     outputs = _outputs(inputs, up)
     reach = reach_px(max(sigmas)) + up - 1
@@ -73,6 +73,16 @@ class Octave:
     shape: tuple[int, int, int, int]  # with the blocks' padding
     offset: int
 
+    @property
+    def per_level(self) -> int:
+        """Stride of a level."""
+        return math.prod(self.shape[1:])
+
+    @property
+    def end(self) -> int:
+        """Where its part of the buffer ends."""
+        return self.offset + math.prod(self.shape)
+
     def levels(self, gaussians: Tensor) -> Tensor:
         """Return the octave's part of the buffer.
 
@@ -82,7 +92,7 @@ class Octave:
         Returns:
             (levels, rows, images, columns), a view.
         """
-        return gaussians[self.offset : self.offset + math.prod(self.shape)].view(self.shape)
+        return gaussians[self.offset : self.end].view(self.shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +103,12 @@ class ScaleSpacePlan:
     octaves: tuple[Octave, ...]
     gaussian_size: int
     table: Tensor  # (octaves, 6) int64: height, width, offset, and the strides of level, row and image
+
+    def prepare(self) -> None:
+        """Compute the filters of its octaves, which other pictures of its sides share."""
+        for octave in self.octaves:
+            for length in octave.source:
+                band(length, octave.sigmas, octave.up, self.table.device)
 
     @property
     def index(self) -> torch.dtype:
@@ -105,25 +121,35 @@ class ScaleSpacePlan:
         return FIRST_SIGMA_PX * self.upsample
 
 
-@lru_cache(maxsize=256)
-def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> ScaleSpacePlan:
-    """Lay out the octaves; cached for the most recent shapes, as frames come in one size."""
+def octaves_of(height: int, width: int, batch: int, upsample: int) -> tuple[Octave, ...]:
+    """Lay out the octaves of a batch of pictures, one after the other.
+
+    Args:
+        height: of the pictures.
+        width: of the pictures.
+        batch: how many.
+        upsample: samples per pixel of the first octave.
+    """
     growth = [2.0 ** (level / SCALES) for level in range(_LEVELS)]
     sigmas = tuple(math.sqrt((FIRST_SIGMA_PX * g) ** 2 - _CAMERA_SIGMA_PX**2) for g in growth)
     octaves: list[Octave] = []
-    size, source, up = 0, (height, width), upsample
+    offset, source, up = 0, (height, width), upsample
     while not octaves or min(source) >= _MIN_OCTAVE:
         height, width = (_outputs(n, up) for n in source)
         rows, columns = (-(-n // (_BLOCK * up)) * _BLOCK * up for n in (height, width))
-        shape = (_LEVELS, rows, batch, columns)
-        octaves.append(Octave(source, up, sigmas, height, width, shape, size))
-        size += math.prod(shape)
+        octaves.append(Octave(source, up, sigmas, height, width, (_LEVELS, rows, batch, columns), offset))
+        offset = octaves[-1].end
         sigmas = tuple(FIRST_SIGMA_PX * upsample * math.sqrt(g**2 - 1) for g in growth)
         source, up = ((height + 1) // 2, (width + 1) // 2), 1
-    table = [
-        (o.height, o.width, o.offset, math.prod(o.shape[1:]), math.prod(o.shape[2:]), o.shape[3]) for o in octaves
-    ]
-    return ScaleSpacePlan(upsample, tuple(octaves), size, torch.tensor(table).to(device))
+    return tuple(octaves)
+
+
+@lru_cache(maxsize=256)
+def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> ScaleSpacePlan:
+    """Lay out the scale space of tensor ops; cached for the most recent shapes, as frames come in few sizes."""
+    octaves = octaves_of(height, width, batch, upsample)
+    table = [(o.height, o.width, o.offset, o.per_level, math.prod(o.shape[2:]), o.shape[3]) for o in octaves]
+    return ScaleSpacePlan(upsample, octaves, octaves[-1].end, torch.tensor(table).to(device))
 
 
 def gaussian_levels(images: Tensor, plan: ScaleSpacePlan) -> Tensor:
@@ -145,7 +171,7 @@ def gaussian_levels(images: Tensor, plan: ScaleSpacePlan) -> Tensor:
 def _blur(images: Tensor, octave: Octave, gaussians: Tensor) -> Tensor:
     """Write the octave's levels G_y I G_x^T into their place and return them as (L, B, height, width)."""
     batch, height, width = images.shape
-    across, down = (_band(n, octave.sigmas, octave.up, images.device) for n in (width, height))
+    across, down = (band(n, octave.sigmas, octave.up, images.device) for n in (width, height))
     count, levels, size, _ = across.blocks.shape
     wide = images.new_zeros(height, batch, across.padded)
     wide[..., across.reach : across.reach + width] = images.transpose(0, 1)

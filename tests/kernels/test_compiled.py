@@ -11,7 +11,7 @@ import torch
 
 from engine.features import sift
 from engine.kernels import jit, sift_descriptors
-from engine.sift import descriptors, keypoints, scale_space
+from engine.sift import descriptors, keypoints, loops, scale_space
 from engine.threads import count, set_threads
 
 CPU = torch.device("cpu")
@@ -41,51 +41,81 @@ def plan(shape, request):
 
 
 def both(plan, contrast_threshold=0.02):
-    """The picture's levels and points by either way."""
+    """The picture's levels and keypoints by the tensor ops, and by the loops with their plan."""
     image = picture(*plan.octaves[0].source)
     gaussians = scale_space.gaussian_levels(image, plan)
-    buffer, points = keypoints.detect(image, plan, contrast_threshold)
-    expected = keypoints.find_points(gaussians, plan, contrast_threshold)
-    return (gaussians, expected.take(expected.valid.nonzero()[:, 0])), (buffer.clone(), points)
+    points = keypoints.find_points(gaussians, plan, contrast_threshold)
+    by_loops = loops.plan_loops(*image.shape[1:], plan.upsample)
+    levels, rows = loops.detect(image[0].numpy(), by_loops, contrast_threshold)
+    return (gaussians, points.take(points.valid.nonzero()[:, 0])), (levels.copy(), rows, by_loops)
+
+
+def as_rows(points: keypoints.Points) -> np.ndarray:
+    """Keypoints (K, 6) as the loops have them."""
+    columns = (points.x, points.y, points.growth, points.contrast, points.level, points.octave)
+    return torch.stack([column.float() for column in columns], dim=1).numpy()
 
 
 def test_levels_are_those_of_the_banded_matrices(plan):
-    (expected, _), (got, _) = both(plan)
+    (expected, _), (got, _, _) = both(plan)
     for octave in plan.octaves:
         inner = np.s_[:, : octave.height, :, : octave.width]
-        torch.testing.assert_close(octave.levels(got)[inner], octave.levels(expected)[inner], atol=2e-6, rtol=0)
-
-
-def in_order(points: keypoints.Points) -> np.ndarray:
-    columns = (points.octave, points.level, points.y, points.x, points.growth, points.contrast, points.pixel_px)
-    table = torch.stack([c.double() for c in columns], dim=1).numpy()
-    return table[np.lexsort(table[:, :4].round(2).T[::-1])]
+        levels = octave.levels(torch.from_numpy(got))
+        torch.testing.assert_close(levels[inner], octave.levels(expected)[inner], atol=2e-6, rtol=0)
 
 
 def test_keypoints_are_those_of_the_tensor_ops(plan):
     """All but those that rounding moves across a threshold, of which there is at most one in a hundred."""
-    (_, expected), (_, got) = both(plan)
-    a, b = in_order(expected), in_order(got)
-    near = [np.abs(b[:, :5] - row[:5]).max(axis=1).min(initial=np.inf) < 0.02 for row in a]
-    assert len(a) - sum(near) <= 0.01 * len(a)
-    assert abs(len(a) - len(b)) <= 0.01 * len(a)
+    (_, points), (_, got, _) = both(plan)
+    expected = as_rows(points)
+    near = [np.abs(got - row).max(axis=1).min(initial=np.inf) < 0.02 for row in expected]
+    assert len(expected) - sum(near) <= 0.01 * len(expected)
+    assert abs(len(expected) - len(got)) <= 0.01 * len(expected)
     if min(plan.octaves[0].source) > 60:
-        assert len(a) > 20
+        assert len(expected) > 20
 
 
-def test_angles_and_descriptors_are_those_of_the_tensor_ops(plan):
-    (gaussians, points), _ = both(plan)
-    expected = descriptors.angle_by_tensors(gaussians, points, plan)
-    got = descriptors.dominant_angle(gaussians, points, plan)
-    apart = ((got - expected + math.pi).remainder(math.tau) - math.pi).abs()
-    assert (apart > 0.01).sum() <= 0.01 * len(apart)  # two peaks of one height
-    cells = descriptors.cells_by_tensors(gaussians, points, expected, plan)
+@pytest.mark.parametrize("spread", [1, 3, 6])
+@pytest.mark.parametrize("most", [7, 60, 5000])
+def test_the_strongest_are_those_of_the_tensor_ops(plan, spread, most):
+    (_, points), (_, _, by_loops) = both(plan)
+    height, width = plan.octaves[0].source
+    mask = np.random.default_rng(3).random((height, width)) > 0.3
+    allowed = points.within(torch.from_numpy(mask)[None, None])
+    index, filled = keypoints.strongest(allowed, plan, 1, most, spread)
+    expected = as_rows(points.take(index[filled]))
+    got = loops.strongest(as_rows(points), by_loops, mask, most, spread)
+    np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize("root", [True, False])
+@pytest.mark.parametrize("turn_rad", [None, 0.0], ids=["turned", "upright"])
+def test_angles_and_descriptors_are_those_of_the_tensor_ops(plan, turn_rad, root):
+    (gaussians, points), (_, _, by_loops) = both(plan)
+    levels, rows = gaussians.numpy(), as_rows(points)
+    expected = descriptors.dominant_angle(gaussians, points, plan)
+    apart = (
+        (torch.from_numpy(loops.dominant_angle(levels, rows, by_loops)) - expected + math.pi) % math.tau
+    ).abs()
+    assert ((apart - math.pi).abs() > 0.01).sum() <= 0.01 * len(apart)  # two peaks of one height
+    angle = expected if turn_rad is None else torch.full_like(expected, turn_rad)
     torch.testing.assert_close(
-        descriptors.describe(gaussians, points, expected, plan, root=True),
-        descriptors.normalise(cells, root=True),
+        torch.from_numpy(loops.describe(levels, rows, angle.numpy(), by_loops, root=root)),
+        descriptors.describe(gaussians, points, angle, plan, root=root),
         atol=2e-4,
         rtol=0,
     )
+
+
+def test_a_filter_at_the_edge_has_the_weight_of_one_inside():
+    """A picture of one grey level keeps it, at every level, also where it is a few pixels wide."""
+    for inputs in (3, 12, 40):
+        for upsample in (1, 2):
+            plan = loops.plan_loops(inputs, 60, upsample)
+            levels, _ = loops.detect(np.full((inputs, 60), 0.7, np.float32), plan, 0.02)
+            for octave, _, _ in plan.octaves:
+                inner = octave.levels(torch.from_numpy(levels))[:, : octave.height, :, : octave.width]
+                torch.testing.assert_close(inner, torch.full_like(inner, 0.7), atol=2e-6, rtol=0)
 
 
 def test_directions_are_the_arc_tangents():

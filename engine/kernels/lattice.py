@@ -1,0 +1,58 @@
+"""Places in a frame between the nodes of a lattice, compiled by numba: one pass, no temporary planes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from engine.kernels.jit import compiled
+
+_SEEN = 0.999  # of the weights of nodes that the frame can show, below which one of them is hidden
+
+
+@compiled
+def places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside):
+    """Interpolate a lattice at every pixel of a picture, bilinear from corner to corner.
+
+    Args:
+        nodes: (n, n, 3) float32 place x and y in the frame, and 1 where the frame can show it, else 0.
+        last_x: of the frame's columns.
+        last_y: of its rows.
+        x_px: (h, w) float32 takes the places.
+        y_px: (h, w) float32 likewise.
+        inside: (h, w) uint8 takes 1 where the place is in the frame and can be shown, else 0.
+    """
+    height, width = x_px.shape
+    across, down = _steps(len(nodes), width), _steps(len(nodes), height)
+    line, zero, seen = np.empty((3, len(nodes)), np.float32), np.float32(0), np.float32(_SEEN)
+    ahead = np.empty(width, np.float32)
+    for row in range(height):
+        top, share = down[0][row], down[1][row]
+        for k in range(3):
+            for n in range(len(nodes)):
+                line[k, n] = nodes[top, n, k] + share * (nodes[top + 1, n, k] - nodes[top, n, k])
+        x, y, shown = x_px[row], y_px[row], inside[row]
+        _along(line[0], across, x)
+        _along(line[1], across, y)
+        _along(line[2], across, ahead)
+        for c in range(width):
+            in_frame = (x[c] >= zero) & (x[c] <= last_x) & (y[c] >= zero) & (y[c] <= last_y)
+            shown[c] = in_frame & (ahead[c] > seen)
+
+
+@compiled
+def _steps(nodes, count):
+    """For each of ``count`` pixels from end to end the node before it, and its share of the way to the next."""
+    first, share = np.empty(count, np.int64), np.empty(count, np.float32)
+    for n in range(count):
+        at = n * (nodes - 1) / max(count - 1, 1)
+        first[n] = min(int(at), nodes - 2)
+        share[n] = at - first[n]
+    return first, share
+
+
+@compiled
+def _along(line, steps, out):
+    first, share = steps
+    for c in range(out.size):
+        low = line[first[c]]
+        out[c] = low + share[c] * (line[first[c] + 1] - low)

@@ -1,0 +1,240 @@
+"""SIFT on the CPU: compiled loops over one picture at a time, which find what the tensor ops find.
+
+Keypoints are rows (K, 6) float32 in the pixels of their octave: x, y, sigma over that of the octave's first level,
+contrast, level, octave.
+"""
+
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine import threads
+from engine.kernels.sift_descriptors import angles, descriptors
+from engine.kernels.sift_extrema import TAPS, find_extrema
+from engine.kernels.sift_refinement import refine_extrema
+from engine.kernels.sift_selection import spread_out
+from engine.sift.descriptors import CELL_SAMPLES, CELL_SIGMAS, ORIENT_STEP, orientation_weights, tents
+from engine.sift.keypoints import BORDER, EARLY, EDGE_RATIO, MAX_SHIFT, MOVES
+from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
+
+AnyArray = NDArray[Any]
+Floats = NDArray[np.float32]
+Filters = tuple[Floats, NDArray[np.int64], Floats]
+
+_PART_PX = 200_000  # pixels of an octave per thread, below which another thread does not pay
+_POINTS_PER_THREAD = 64
+_X, _Y, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class LoopPlan:
+    """What the loops need to know of pictures of one shape.
+
+    Attributes:
+        octaves: layout in the buffer of Gaussian levels, the filters along x and along y.
+        table: (octaves, 5) int64: height, width, offset, and the strides of level and row.
+        size: of the buffer.
+        upsample: samples per image pixel of the first octave.
+    """
+
+    octaves: tuple[tuple[Octave, Filters, Filters], ...]
+    table: NDArray[np.int64]
+    size: int
+    upsample: int
+
+    @property
+    def first_sigma(self) -> np.float32:
+        """Sigma of each octave's first level in pixels of the octave."""
+        return np.float32(FIRST_SIGMA_PX * self.upsample)
+
+
+@lru_cache(maxsize=256)
+def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
+    """Lay out the octaves of a picture; the filters of its sides are shared with others.
+
+    Args:
+        height: of the picture.
+        width: of the picture.
+        upsample: 1 or 2.
+    """
+    octaves = octaves_of(height, width, 1, upsample)
+    filtered = []
+    for octave in octaves:
+        (rows, columns), reach = octave.source, tuple(map(reach_px, octave.sigmas))
+        across, down = (filters(n, octave.sigmas, reach, octave.up) for n in (columns, rows))
+        filtered.append((octave, across, down))
+    table = np.array([(o.height, o.width, o.offset, o.per_level, o.shape[3]) for o in octaves])
+    return LoopPlan(tuple(filtered), table, octaves[-1].end, upsample)
+
+
+def prepare_sides(sides_px: Iterable[int]) -> None:
+    """Compute the filters of pictures whose sides are among these, so that none is computed in flight."""
+    for side_px in sides_px:
+        for upsample in (1, 2):
+            plan_loops(side_px, side_px, upsample)
+
+
+@lru_cache(maxsize=1024)
+def filters(inputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> Filters:
+    """Gaussian filters of all levels along one axis.
+
+    Args:
+        inputs: pixels along the axis; ``up (inputs - 1) + 1`` come out.
+        sigmas: of the levels, in pixels of the input; 0 copies.
+        reach: of each filter to either side, in pixels of the input.
+        up: outputs per input, 1 or 2.
+
+    Returns:
+        Weights (levels, up, taps), reach (levels,) and gains (levels, outputs) that make up for the edges.
+    """
+    near = np.array(reach)
+    taps = -(-(2 * near.max() + up) // TAPS) * TAPS
+    offsets = np.arange(taps) - near[:, None, None]  # (levels, 1, taps)
+    phase = np.arange(up).reshape(1, -1, 1) / up
+    weights = np.exp(-0.5 * ((offsets - phase) / np.maximum(np.array(sigmas), 1e-3).reshape(-1, 1, 1)) ** 2)
+    weights *= offsets < near[:, None, None] + up
+    weights /= weights.sum(-1, keepdims=True)
+    below = np.concatenate([np.zeros_like(weights[..., :1]), weights.cumsum(-1)], axis=-1)  # of the taps before
+    index = np.arange(up * (inputs - 1) + 1)
+    first, end = (np.clip(edge + near[:, None] - index // up, 0, taps) for edge in (0, inputs))
+    level = np.arange(len(near))[:, None]
+    gains = 1.0 / (below[level, index % up, end] - below[level, index % up, first])
+    return weights.astype(np.float32), near, gains.astype(np.float32)
+
+
+def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Floats, Floats]:
+    """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges.
+
+    Args:
+        image: (H, W), contiguous.
+        plan: of its shape.
+        contrast_threshold: Lowe's.
+
+    Returns:
+        The Gaussian levels (N,), which the thread's next call overwrites; and keypoints (K, 6).
+    """
+    buffer, found, source = _buffer(plan.size), [], image
+    threshold = contrast_threshold / SCALES
+    limits = (SCALES, MOVES, threshold, MAX_SHIFT, EDGE_RATIO)
+    for number, (octave, across, down) in enumerate(plan.octaves):
+        layout = (octave.offset, octave.per_level, octave.shape[3])
+        early = np.float32(EARLY * threshold)
+        voxels = _in_parts(
+            lambda part: find_extrema(source, across, down, buffer, layout, part, BORDER, early),  # noqa: B023
+            threads.parts(octave.height, octave.height * octave.width // _PART_PX),
+        )
+        found.append(refine_extrema(buffer, (octave.height, octave.width, *layout), voxels, limits, number))
+        start = octave.offset + SCALES * octave.per_level
+        level = buffer[start : start + octave.per_level].reshape(-1, octave.shape[3])
+        source = np.ascontiguousarray(level[: octave.height : 2, : octave.width : 2])
+    return buffer, np.concatenate(found)
+
+
+def strongest(
+    keypoints: Floats, plan: LoopPlan, mask: NDArray[np.bool_] | None, max_keypoints: int, spread: int
+) -> Floats:
+    """The keypoints to keep by precedence, as :func:`engine.sift.keypoints.strongest` ranks them.
+
+    Args:
+        keypoints: (K, 6).
+        plan: of their picture.
+        mask: (H, W), True where keypoints are allowed; None is everywhere.
+        max_keypoints: how many are kept.
+        spread: cells along each side of the picture; keypoints beyond a cell's double share come last.
+
+    Returns:
+        (M, 6) at most ``max_keypoints`` of them.
+    """
+    pixel_px = _pixel_px(keypoints, plan)
+    x, y = keypoints[:, _X] * pixel_px, keypoints[:, _Y] * pixel_px
+    if mask is not None:
+        column = np.clip(np.rint(x).astype(np.intp), 0, mask.shape[1] - 1)
+        row = np.clip(np.rint(y).astype(np.intp), 0, mask.shape[0] - 1)
+        allowed = mask[row, column]
+        keypoints, x, y = keypoints[allowed], x[allowed], y[allowed]
+    order = np.argsort(-keypoints[:, _CONTRAST] * np.sqrt(scale_px(keypoints)), kind="stable")
+    if spread == 1:
+        return np.asarray(keypoints[order[:max_keypoints]], np.float32)
+    octave = plan.octaves[0][0]
+    column = np.clip((x * (plan.upsample * spread / octave.width)).astype(np.int64), 0, spread - 1)
+    row = np.clip((y * (plan.upsample * spread / octave.height)).astype(np.int64), 0, spread - 1)
+    share = 2 * max_keypoints / spread**2
+    kept = spread_out((row * spread + column)[order], spread**2, share, max_keypoints)
+    return np.asarray(keypoints[order[kept]], np.float32)
+
+
+def dominant_angle(gaussians: Floats, keypoints: Floats, plan: LoopPlan) -> Floats:
+    """Direction of the highest peak in the histogram of gradient directions.
+
+    Args:
+        gaussians: (N,) levels.
+        keypoints: (K, 6).
+        plan: of their picture.
+
+    Returns:
+        (K,) radians from +x towards +y.
+    """
+    window, smooth = orientation_weights()
+    step = np.float32(ORIENT_STEP) * plan.first_sigma
+    return _in_parts(
+        lambda part: angles(gaussians, plan.table, keypoints[slice(*part)], step, window, smooth),
+        threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
+    )
+
+
+def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: LoopPlan, *, root: bool) -> Floats:
+    """4 x 4 cells of 8 orientations in the keypoints' frames.
+
+    Args:
+        gaussians: (N,) levels.
+        keypoints: (K, 6).
+        angle_rad: (K,) from +x towards +y.
+        plan: of their picture.
+        root: return RootSIFT.
+
+    Returns:
+        (K, 128) of unit L2 norm.
+    """
+    step = np.float32(CELL_SIGMAS / CELL_SAMPLES) * plan.first_sigma
+    return _in_parts(
+        lambda part: descriptors(
+            gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], step, tents(), root
+        ),
+        threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
+    )
+
+
+def xy_px(keypoints: Floats, plan: LoopPlan) -> Floats:
+    """Positions (K, 2) in pixels of the picture."""
+    return np.asarray(keypoints[:, :2] * _pixel_px(keypoints, plan)[:, None], np.float32)
+
+
+def scale_px(keypoints: Floats) -> Floats:
+    """Sigmas (K,) in pixels of the picture."""
+    return np.asarray(np.float32(FIRST_SIGMA_PX) * keypoints[:, _GROWTH] * np.exp2(keypoints[:, _OCTAVE]))
+
+
+def _pixel_px(keypoints: Floats, plan: LoopPlan) -> Floats:
+    """(K,) pixels of the picture per octave pixel."""
+    return np.asarray(np.exp2(keypoints[:, _OCTAVE]) / np.float32(plan.upsample))
+
+
+def _in_parts(work: Callable[[tuple[int, int]], AnyArray], parts: list[tuple[int, int]]) -> AnyArray:
+    done = threads.in_parallel(work, parts)
+    return done[0] if len(done) == 1 else np.concatenate(done)
+
+
+_local = threading.local()
+
+
+def _buffer(size: int) -> Floats:
+    """The thread's own memory for a scale space: allocating new pages takes a tenth of the time."""
+    buffer: Floats | None = getattr(_local, "buffer", None)
+    if buffer is None or buffer.size < size:
+        buffer = _local.buffer = np.empty(size, np.float32)
+    return buffer[:size]
