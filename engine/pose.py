@@ -350,16 +350,16 @@ def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
     total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
     if k < options.min_inliers:
         return math.inf
+    from engine.kernels import clusters  # numba takes a while to import
+
     square = options.reprojection_px**2
     own = slice(None, None, -(-total // _PAIRED))
-    a, b, one = fit.view.projected[:, own], problem.pixels, np.ones((1, total))
-    left = np.concatenate([a, np.sum(a * a, axis=0, keepdims=True), one[:, own]])
-    right = np.concatenate([-2 * b, one, np.sum(b * b, axis=0, keepdims=True)])
-    near = left.T @ right <= square  # |a|^2 - 2 a b + |b|^2
-    agree = np.count_nonzero(near) - np.count_nonzero(fit.inliers[own])
+    some = fit.view.projected[:, own]
+    near = clusters.count_near_pairs(*some, *problem.pixels, options.reprojection_px)
+    agree = near - int(np.count_nonzero(fit.inliers[own]))
     extent = np.ptp(problem.pixels, axis=1) + 1
     uniform = math.pi * square / float(extent[0] * extent[1])
-    p = min(max(agree / (len(near) * (total - 1)), uniform), 1.0)
+    p = min(max(agree / (some.shape[1] * (total - 1)), uniform), 1.0)
     counts = (
         _log10_choose(total, k) + _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
     )

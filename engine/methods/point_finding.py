@@ -64,7 +64,8 @@ class PointFinder:
                 points, places = (_points(found) for found in self.matcher(picture, crop))
                 shown = _is_valid(points, valid)
                 points, places = points[shown], places[shown]
-        return points, places + view.corner_px
+        known = np.isfinite(places).all(axis=1)  # a matcher of others' may say NaN
+        return points[known], places[known] + view.corner_px
 
     def _by_keypoints(
         self,
@@ -104,6 +105,11 @@ def _points(xy_px: torch.Tensor) -> Array:
 
 
 def _is_valid(xy_px: Array, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which points (M, 2) lie where a mask (h, w) holds."""
-    x, y = np.clip(np.rint(xy_px), 0, np.array(valid.shape)[::-1] - 1).astype(np.intp).T
-    return np.asarray(valid[y, x])
+    """Which points (M, 2) lie where a mask (h, w) holds; those that are not finite do not."""
+    known = np.asarray(np.isfinite(xy_px).all(axis=1))
+    x, y = (
+        np.clip(np.rint(np.where(known[:, None], xy_px, 0.0)), 0, np.array(valid.shape)[::-1] - 1)
+        .astype(np.intp)
+        .T
+    )
+    return np.asarray(known & valid[y, x])

@@ -10,9 +10,10 @@ import itertools
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from engine.kernels import clusters
 
 Array = NDArray[np.float64]
 
@@ -20,8 +21,6 @@ TURNS_DEG = (0.0, -6.0, 6.0)
 """By which an orthophoto may be turned, since a heading may be wrong."""
 SCALES = (1.0, 0.93, 1.075)
 """By which it may be scaled, since a height may be wrong."""
-_ROUNDS = 4  # of the mean shift from the fullest cells to the middle of the votes
-_MAX_SIDE = 2048  # cells along a side of the histogram
 _RIVAL_RADII = 3.0  # from the best translation: within, its own votes scatter where the tilt is not known
 _PAIRED = 300  # points that are compared with all others for the probability of a vote by chance
 
@@ -66,7 +65,7 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
     best: tuple[int, float, float, NDArray[np.bool_], Array] | None = None
     for turn_deg, scale in itertools.product(TURNS_DEG, SCALES):
         shifts = map_px - photo_px @ similarity(turn_deg, scale).T
-        voters = densest(shifts, radius_px)
+        voters = clusters.densest(shifts, radius_px)
         count = int(np.count_nonzero(voters))
         if count and (best is None or count > best[0]):
             best = (count, turn_deg, scale, voters, shifts)
@@ -76,8 +75,9 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
         return None
     _, turn_deg, scale, voters, shifts = best
     shift_px = shifts[voters].mean(axis=0)
-    elsewhere = ~_within(shifts, shift_px, _RIVAL_RADII * radius_px)
-    rival = int(np.count_nonzero(densest(shifts[elsewhere], radius_px)))
+    apart = shifts - shift_px
+    elsewhere = np.einsum("ij,ij->i", apart, apart) > (_RIVAL_RADII * radius_px) ** 2
+    rival = int(np.count_nonzero(clusters.densest(shifts[elsewhere], radius_px)))
     log10_nfa = _log10_nfa(photo_px @ similarity(turn_deg, scale).T, map_px, shift_px, voters, radius_px)
     return Vote(turn_deg, scale, voters, shift_px, rival, log10_nfa)
 
@@ -95,12 +95,11 @@ def _log10_nfa(
     if votes < 2:
         return math.log10(total * len(TURNS_DEG) * len(SCALES))
     some = slice(None, None, -(-total // _PAIRED))
-    apart_x, apart_y = (np.subtract.outer(photo_px[some, k] + shift_px[k], map_px[:, k]) for k in (0, 1))
-    near = apart_x * apart_x + apart_y * apart_y <= radius_px * radius_px
-    agree = int(np.count_nonzero(near)) - int(np.count_nonzero(voters[some]))
+    near = clusters.count_near_pairs(*(photo_px[some] + shift_px).T, *map_px.T, radius_px)
+    agree = near - int(np.count_nonzero(voters[some]))
     extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
     uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])
-    p = min(max(agree / (near.shape[0] * max(total - 1, 1)), uniform), 1.0)
+    p = min(max(agree / (len(photo_px[some]) * max(total - 1, 1)), uniform), 1.0)
     tests = math.log10(total * len(TURNS_DEG) * len(SCALES))
     return tests + _log10_binomial_tail(total - 1, votes - 1, p)
 
@@ -118,42 +117,3 @@ def similarity(turn_deg: float, scale: float) -> Array:
     """(2, 2) matrix that turns from +x towards +y and scales."""
     turn = math.radians(turn_deg)
     return scale * np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-
-
-def densest(points: Array, radius: float) -> NDArray[np.bool_]:
-    """Which of some points lie within a radius of the place about which most lie.
-
-    The fullest 5 x 5 cells of a histogram, whose cells are half a radius wide, give the place nearly; from there
-    the mean of the points within the radius is followed.
-
-    Args:
-        points: (M, 2).
-        radius: in their unit.
-
-    Returns:
-        (M,) bool.
-    """
-    if not len(points):
-        return np.zeros(0, np.bool_)
-    low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
-    cell = max(radius / 2.0, extent / _MAX_SIDE)
-    columns, rows = ((points - low) / cell).astype(np.intp).T
-    shape = (int(rows.max()) + 1, int(columns.max()) + 1)
-    counts = np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)
-    sums = cv2.boxFilter(counts.astype(np.float32), -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    row, column = np.unravel_index(int(sums.argmax()), sums.shape)
-    center = low + (np.array([column, row]) + 0.5) * cell
-    near = _within(points, center, 1.25 * radius)
-    best = near & False
-    for _ in range(_ROUNDS):
-        if not near.any():
-            break
-        near = _within(points, points[near].mean(axis=0), radius)
-        if np.count_nonzero(near) > np.count_nonzero(best):
-            best = near
-    return best
-
-
-def _within(points: Array, center: Array, radius: float) -> NDArray[np.bool_]:
-    offsets = points - center
-    return np.asarray(np.einsum("ij,ij->i", offsets, offsets) <= radius * radius)

@@ -1,1 +1,1 @@
-"""The steps of SIFT as tensor ops: scale space, keypoints, descriptors."""
+"""The steps of SIFT, as tensor ops and as compiled loops: scale space, keypoints, descriptors, matching."""

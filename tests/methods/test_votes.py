@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from engine.methods.votes import SCALES, TURNS_DEG, _log10_binomial_tail, densest, similarity, vote
+from engine.kernels.clusters import count_near_pairs, densest
+from engine.methods.votes import SCALES, TURNS_DEG, _log10_binomial_tail, similarity, vote
 
 RADIUS_PX = 4.0
 
@@ -60,6 +61,22 @@ def test_the_densest_place_is_where_brute_force_finds_it():
         points = np.concatenate([rng.uniform(0, 100, (60, 2)), rng.normal(rng.uniform(10, 90, 2), 1.0, (12, 2))])
         near = np.hypot(*(points[:, None] - points).transpose(2, 0, 1)) <= 4.0
         assert np.count_nonzero(densest(points, 4.0)) >= 0.9 * near.sum(axis=1).max()
+
+
+@pytest.mark.parametrize("spread", [0.01, 1.0, 1e5])
+def test_the_densest_place_holds_every_point_where_all_lie_together(spread):
+    points = np.random.default_rng(12).uniform(0.0, spread, (50, 2)) + 3e5
+    assert densest(points, 2.0 * spread).all()
+    apart = np.concatenate([points, points[:30] - 50.0 * spread])
+    assert densest(apart, 2.0 * spread).tolist() == [True] * 50 + [False] * 30
+
+
+def test_near_pairs_are_counted_one_by_one():
+    rng = np.random.default_rng(13)
+    a, b = rng.uniform(0, 50, (2, 40)), rng.uniform(0, 50, (2, 70))
+    apart = np.hypot(*(a[:, :, None] - b[:, None, :]))
+    assert count_near_pairs(*a, *b, 6.0) == np.count_nonzero(apart <= 6.0) > 50
+    assert count_near_pairs(*a[:, :0], *b, 6.0) == 0
 
 
 def test_without_matches_nothing_is_voted_for():

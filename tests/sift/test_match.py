@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from engine import features as module
 from engine.features import Features, match
+from engine.sift import matching as module
 
 
 def described(count, seed, *, like=None):
@@ -55,6 +55,25 @@ def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk,
     expected = plainly(query, train, 0.9, 20.0, most_deg, 1.2, factor)
     assert len(expected) > 3
     assert [tuple(pair) for pair in found.pairs().tolist()] == expected
+
+
+@pytest.mark.parametrize(("most_deg", "factor"), [(None, None), (60.0, None), (None, 1.5), (75.0, 2.0)])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
+    query = described(50, 3)
+    trains = [described(90, seed, like=query) for seed in range(batch)]
+    train = Features(*(torch.cat(values) for values in zip(*map(module._fields, trains), strict=True)))
+    limits = (20.0, most_deg, 1.2, factor)
+    got, expected = (two(query, train, limits) for two in (module._two_nearest_by_loops, module._two_nearest))
+    allowed = expected[0] > -2.0
+    assert allowed.sum() > 20 * batch
+    torch.testing.assert_close(got[0][allowed], expected[0][allowed])
+    assert torch.equal(got[1][allowed], expected[1][allowed])
+    assert torch.equal(got[3][allowed], expected[3][allowed])
+    assert (got[0][~allowed] < -2.0).all()
+    two = expected[2] > -2.0
+    torch.testing.assert_close(got[2][two], expected[2][two])
+    assert (got[2][~two] < -2.0).all()
 
 
 def test_nothing_matches_a_map_without_features():

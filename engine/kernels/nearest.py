@@ -1,0 +1,55 @@
+"""The two nearest of many descriptors for the CPU, compiled by numba: one pass over a table of cosines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from engine.kernels.jit import compiled
+
+FORBIDDEN = -1e30
+"""In place of the cosine of a pair that is not allowed."""
+
+
+@compiled
+def two_nearest(cosine, own, other, least_cos, most_log, best, index, second):
+    """For each query the largest cosine among the allowed pairs, its row, and the second largest.
+
+    Args:
+        cosine: (M, N) float32 of M others with N queries; those of pairs that are not allowed are overwritten.
+        own: (3, N) float32 of the queries: logarithm of scale, NaN where not valid; cosine and sine of the angle.
+        other: (3, M) float32 likewise of the others, by the known rotation and scale.
+        least_cos: of the difference of two angles; -2 allows all.
+        most_log: difference of two logarithms of scale; infinite allows all.
+        best: (N,) float32 takes the largest cosine, minus infinity where there is none.
+        index: (N,) int32 takes its row, the first of equal ones.
+        second: (N,) float32 takes the second largest, minus infinity where there is one row.
+    """
+    best[:] = second[:] = np.float32(-np.inf)
+    index[:] = 0
+    for m in range(len(cosine)):
+        row, at = cosine[m], np.int32(m)
+        _forbid_scales(row, own[0], other[0, m], most_log)
+        if least_cos > -1:
+            _forbid_angles(row, own[1], own[2], other[1, m], other[2, m], least_cos)
+        for n in range(row.size):  # over all queries at once, which is vectorised
+            value, top, next_best = row[n], best[n], second[n]
+            is_best = value > top
+            rest = top if is_best else value
+            second[n] = rest if rest > next_best else next_best
+            index[n] = at if is_best else index[n]
+            best[n] = value if is_best else top
+
+
+@compiled
+def _forbid_scales(row, logs, own, most):
+    """Forbid pairs of other scales, and by a comparison with NaN those that are not valid."""
+    forbidden = np.float32(FORBIDDEN)
+    for m in range(row.size):
+        row[m] = row[m] if abs(logs[m] - own) <= most else forbidden
+
+
+@compiled
+def _forbid_angles(row, cos, sin, own_cos, own_sin, least):
+    forbidden = np.float32(FORBIDDEN)
+    for m in range(row.size):
+        row[m] = row[m] if own_cos * cos[m] + own_sin * sin[m] >= least else forbidden

@@ -1,0 +1,81 @@
+"""Keypoints with their descriptors in a fixed number of slots, and pairs of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from engine.errors import require
+from engine.tensors import Tensor, torch
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Keypoints and descriptors of a batch of images, in a fixed number of slots.
+
+    A slot without keypoint is False in ``valid`` and zero elsewhere. The first slots hold the keypoints within
+    their cell's share (see :func:`sift`), the next those beyond it, both by falling strength.
+
+    Attributes:
+        xy_px: (B, N, 2) positions (x, y), pixel centres at integers.
+        scale_px: (B, N) sigma of the keypoint in pixels of the image.
+        angle_deg: (B, N) in [0, 360), from +x towards +y (clockwise on the screen).
+        descriptors: (B, N, 128) of unit L2 norm; 4 x 4 cells row by row, 8 orientations each.
+        valid: (B, N) bool.
+    """
+
+    xy_px: Tensor
+    scale_px: Tensor
+    angle_deg: Tensor
+    descriptors: Tensor
+    valid: Tensor
+
+    def lafs(self, magnification: float = 6.0) -> Tensor:
+        """Return kornia's local affine frames, (B, N, 2, 3).
+
+        Args:
+            magnification: Half the side of the described square in sigmas; kornia's SIFT uses 6.
+
+        Returns:
+            (B, N, 2, 3) affine matrices.
+
+        Raises:
+            MissingExtraError: kornia is not installed.
+
+        Convention:
+            The first two columns are the images of the patch's x and y axes, the third is the centre.
+            kornia's own angles turn the other way, so ``kornia.feature.get_laf_orientation`` gives -angle_deg.
+        """
+        kornia_feature = require("kornia.feature", "learned")
+        scale = (magnification * self.scale_px)[..., None, None]
+        lafs: Tensor = kornia_feature.laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
+        return lafs
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """The nearest train slot of every query slot, and whether the pair passes the tests.
+
+    Attributes:
+        train_index: (B, N) int64.
+        distance: (B, N) Euclidean distance of the descriptors, in [0, 2]; infinite where none was allowed.
+        ratio: (B, N) distance over the second nearest's, in [0, 1]; 0 where there is no second, 1 where both are
+            0.
+        valid: (B, N) bool.
+    """
+
+    train_index: Tensor
+    distance: Tensor
+    ratio: Tensor
+    valid: Tensor
+
+    def pairs(self, element: int = 0) -> Tensor:
+        """Return the accepted pairs of one element of the batch.
+
+        Args:
+            element: Index in the batch.
+
+        Returns:
+            (M, 2) int64 slots (query, train).
+        """
+        query = self.valid[element].nonzero()[:, 0]
+        return torch.stack([query, self.train_index[element, query]], dim=1)
