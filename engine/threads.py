@@ -74,10 +74,22 @@ def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
     It is faster only where the function releases Python's global lock. A call inside a worker runs in that worker,
     so that no worker waits for another.
     """
-    threads = count()
-    if len(pieces) == 1 or threads == 1 or threading.current_thread().name.startswith(_WORKER):
+    helpers = min(count(), len(pieces)) - 1
+    if helpers < 1 or threading.current_thread().name.startswith(_WORKER):
         return [work(piece) for piece in pieces]
-    return list(_workers(threads).map(work, pieces))
+    done: dict[int, R] = {}
+    left = iter(range(len(pieces)))
+
+    def take() -> None:
+        for number in left:
+            done[number] = work(pieces[number])
+
+    waiting = [_workers(count()).submit(take) for _ in range(helpers)]
+    take()  # the calling thread works, too, and waits for no worker that has not woken before all is taken
+    for worker in waiting:
+        if not worker.cancel():
+            worker.result()
+    return [done[number] for number in range(len(pieces))]
 
 
 @lru_cache(maxsize=1)

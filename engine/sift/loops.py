@@ -26,8 +26,8 @@ AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
 Filters = tuple[Floats, NDArray[np.int64], Floats]
 
-_PART_PX = 200_000  # pixels of an octave per thread, below which another thread does not pay
-_POINTS_PER_THREAD = 64
+_PART_PX = 60_000  # pixels of an octave per thread, below which another thread does not pay
+_POINTS_PER_THREAD = 150
 _X, _Y, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
 
 
