@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -26,11 +27,11 @@ def town_gray(seed: int = 1) -> NDArray[np.uint8]:
 def mosaic(side: int) -> NDArray[np.uint8]:
     """A square map of any size, of simulated towns turned and mirrored, each lit a little differently."""
     rng = np.random.default_rng(side)
-    towns = [town_gray(seed)[50:950] for seed in (2, 3, 4, 5)]
     out = np.empty((side, side), np.uint8)
     for y in range(0, side, 900):
         for x in range(0, side, 900):
-            tile = np.rot90(towns[rng.integers(len(towns))], rng.integers(4))
+            town = town_gray(2 + int(rng.integers(4)))[50:950]
+            tile = np.rot90(town, rng.integers(4))
             tile = tile[:, :: rng.choice([-1, 1])] * rng.uniform(0.8, 1.1)
             part = out[y : y + 900, x : x + 900]
             part[:] = tile[: part.shape[0], : part.shape[1]]
@@ -66,7 +67,7 @@ def flight(count: int = 40) -> Flight:
     """Every fourth frame of the built-in flight, with a prior a few metres off."""
     plan = plan_flight(1, rate_hz=0.28)
     site = plan.town.site()
-    frames, truth = list(plan.iter_frames())[:count], plan.truth_rows()[:count]
+    frames, truth = list(islice(plan.iter_frames(), count)), plan.truth_rows()[:count]
     rng = np.random.default_rng(0)
     priors = []
     for row in truth:

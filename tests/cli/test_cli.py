@@ -226,7 +226,6 @@ def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsy
     assert "deadlines missed" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("towns_drawn_once")
 def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsys):
     out = tmp_path / "demo"
     assert run(["demo", "--frames=2", "--threads=1", f"--out={out}"]) == 0

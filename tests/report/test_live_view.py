@@ -174,7 +174,7 @@ def matcher(sim_site, sim_flight):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
+@pytest.mark.usefixtures("bare_runs")
 def test_the_closed_loop_is_recorded_frame_by_frame(tmp_path, capsys):
     recording, out = tmp_path / "loop.rrd", tmp_path / "out"
     command = ["simulate", "--closed-loop", "--minutes", "0.1", "--method", "ncc", "--device", "cpu"]
