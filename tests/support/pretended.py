@@ -127,8 +127,10 @@ class Crossings(TorchDispatchMode):
             )
 
 
-# Arguments and results of an operation are tensors, numbers, and lists, tuples and dictionaries of them: with torch's
-# own trees, which know more, they took a third of the tests' time.
+# Arguments and results of an operation are tensors, numbers, and lists, tuples and dictionaries of them: the trees of
+# torch, which know more, took a third of the tests' time.
+
+
 def _tensors(tree: Any) -> list[Tensor]:
     """The tensors of it, in order."""
     if isinstance(tree, Tensor):
