@@ -127,8 +127,8 @@ class Crossings(TorchDispatchMode):
             )
 
 
-# Arguments and results of an operation are tensors, numbers, and lists, tuples and dictionaries of them: the trees of
-# torch, which know more, took a third of the tests' time.
+# Arguments and results of an operation are tensors, numbers, and lists, tuples and dictionaries of them: the trees
+# of torch, which know more, took a third of the tests' time.
 
 
 def _tensors(tree: Any) -> list[Tensor]:
