@@ -69,14 +69,14 @@ def shared():
 
 
 @pytest.fixture(scope="session")
-def sim_flight():
-    """The first 24 frames of the paper's flight over a simulated town."""
-    return plan_flight(1, town=drawn_town(1), frames=24).draw()
+def sim_town():
+    return drawn_town(1)
 
 
 @pytest.fixture(scope="session")
-def sim_town(sim_flight):
-    return sim_flight.town
+def sim_flight(sim_town):
+    """The first 24 frames of the paper's flight over a simulated town."""
+    return plan_flight(1, town=sim_town, frames=24).draw()
 
 
 @pytest.fixture(scope="session")
