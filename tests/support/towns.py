@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import os
 import pickle
 from functools import cache
 from pathlib import Path
@@ -38,10 +37,12 @@ def _drawn(options: tuple[tuple[str, Any], ...]) -> Town:
         return build_town(**dict(options))
     name = hashlib.sha256(repr(options).encode()).hexdigest()[:16]
     path = kept_in / f"town-{name}.pickle"
-    if not path.exists():
-        unfinished = path.with_suffix(f".{os.getpid()}")
-        unfinished.write_bytes(pickle.dumps(build_town(**dict(options))))
-        unfinished.replace(path)
+    import fcntl  # not on Windows
+
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # who comes second waits, and draws nothing
+        if not path.exists():
+            path.write_bytes(pickle.dumps(build_town(**dict(options))))
     return pickle.loads(path.read_bytes())
 
 
