@@ -239,14 +239,20 @@ def chi_square(difference: Array, covariance: Array) -> float:
 
     Args:
         difference: (2,).
-        covariance: (2, 2) of the difference, positive definite.
+        covariance: (2, 2) of the difference, positive semidefinite.
 
     Returns:
-        0 or more.
+        0 or more; infinite for a difference in a direction in which the covariance allows none.
     """
     (a, b), (c, d) = covariance.tolist()  # a tenth of the time of NumPy's solver
     x, y = difference.tolist()
-    return float((d * x * x - (b + c) * x * y + a * y * y) / (a * d - b * c))
+    across, determinant = d * x * x - (b + c) * x * y + a * y * y, a * d - b * c
+    if determinant <= 0.0:  # singular: what lies along the one direction that it allows, if any
+        allowed, squared = a + d, x * x + y * y
+        if across > 0.0 or squared > 0.0 >= allowed:
+            return math.inf
+        return float(squared / allowed) if allowed > 0.0 else 0.0
+    return float(across / determinant)
 
 
 def inverse_2x2(matrix: Array) -> Array:

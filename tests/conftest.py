@@ -51,12 +51,13 @@ def _workers_share_towns(tmp_path_factory):
         towns.kept_in = tmp_path_factory.getbasetemp().parent
 
 
-@pytest.fixture
-def towns_drawn_once(monkeypatch):
-    """Commands that draw a town take the one that was drawn before."""
-    monkeypatch.setattr("engine.sim.flight.build_town", drawn_once)
-    monkeypatch.setattr("engine.runs.simulation.build_town", drawn_once)
-    monkeypatch.setattr("engine.sim.build_town", drawn_once)
+@pytest.fixture(scope="session", autouse=True)
+def _towns_drawn_once(_workers_share_towns):
+    """Who draws a town below the tests takes the one that was drawn before; tests of towns call `build_town`."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("engine.sim", "engine.sim.flight", "engine.runs.simulation", "bench.inputs.scenes"):
+            patch.setattr(f"{module}.build_town", drawn_once)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -68,14 +69,14 @@ def shared():
 
 
 @pytest.fixture(scope="session")
-def sim_flight():
-    """The first 24 frames of the paper's flight over a simulated town."""
-    return plan_flight(1, town=drawn_town(1), frames=24).draw()
+def sim_town():
+    return drawn_town(1)
 
 
 @pytest.fixture(scope="session")
-def sim_town(sim_flight):
-    return sim_flight.town
+def sim_flight(sim_town):
+    """The first 24 frames of the paper's flight over a simulated town."""
+    return plan_flight(1, town=sim_town, frames=24).draw()
 
 
 @pytest.fixture(scope="session")

@@ -186,7 +186,7 @@ def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
 def test_pictures_say_it_by_themselves():
     """The whole way, on a drawn town: a heading that is off, mirrored pictures, stamps in milliseconds."""
     town = drawn_town()
-    plan = plan_flight(town=town, frames=12)
+    plan = plan_flight(town=town, frames=8)
     frames, site, camera = list(plan.iter_frames()), site_of(town), plan.camera
     first = plan.truth_rows()[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=15.0)

@@ -46,7 +46,6 @@ def flight(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("towns_drawn_once")
 @pytest.mark.parametrize(
     "page",
     [

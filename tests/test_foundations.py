@@ -328,19 +328,24 @@ def test_the_tree_of_errors_is_whole():
 
 
 def test_a_matcher_takes_one_thread_unless_somebody_chose():
-    """In processes of their own: the number of threads is the process's."""
+    """In processes of their own: the number of threads is the process's. Forks share what was imported."""
     program = """
-import numpy as np, torch, cv2, sys
+import numpy as np, os, torch, cv2, sys
 from engine import Camera, OrthoMap, SceneMatcher, set_threads
-if "before" in sys.argv:
-    set_threads(2)
-gray = np.zeros((200, 200), np.uint8)
-site = OrthoMap.from_arrays(gray, [[0.5, 0.0, 500000.0], [0.0, -0.5, 5000000.0]], "EPSG:32633")
-SceneMatcher(site, Camera.from_fov(100, 100, 60.0), "ncc", "cpu")
-if "after" in sys.argv:
-    set_threads(2)
-SceneMatcher(site, Camera.from_fov(100, 100, 60.0), "ncc", "cpu")
-print(torch.get_num_threads(), cv2.getNumThreads())
+for chosen in sys.argv[1:]:
+    if os.fork():
+        assert os.wait()[1] == 0
+        continue
+    if chosen == "before":
+        set_threads(2)
+    gray = np.zeros((200, 200), np.uint8)
+    site = OrthoMap.from_arrays(gray, [[0.5, 0.0, 500000.0], [0.0, -0.5, 5000000.0]], "EPSG:32633")
+    SceneMatcher(site, Camera.from_fov(100, 100, 60.0), "ncc", "cpu")
+    if chosen == "after":
+        set_threads(2)
+    SceneMatcher(site, Camera.from_fov(100, 100, 60.0), "ncc", "cpu")
+    print(chosen, torch.get_num_threads(), cv2.getNumThreads(), flush=True)
+    os._exit(0)
 """
     bare = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
 
@@ -349,8 +354,7 @@ print(torch.get_num_threads(), cv2.getNumThreads())
             [sys.executable, "-c", program, *words],
             capture_output=True, text=True, check=True, env=bare | environment,
         )  # fmt: skip
-        return done.stdout.split()
+        return done.stdout.splitlines()
 
-    assert threads() == ["1", "1"]
-    assert threads("before") == threads("after") == ["2", "2"]
-    assert threads(OMP_NUM_THREADS="2")[0] == "2"
+    assert threads("nobody", "before", "after") == ["nobody 1 1", "before 2 2", "after 2 2"]
+    assert threads("environment", OMP_NUM_THREADS="2")[0].split()[1] == "2"

@@ -189,6 +189,24 @@ def test_chi_square_counts_in_standard_deviations():
     assert chi_square(np.array([3.0, 8.0]), np.diag([9.0, 16.0])) == pytest.approx(5.0)
 
 
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (3.0, 4.0), (-1.0, 2.0)])
+def test_chi_square_of_a_singular_covariance_is_the_limit_of_regular_ones(direction):
+    along = np.array(direction)
+    across = np.array([-along[1], along[0]])
+    singular = 4.0 * np.outer(along, along)
+    for difference in (np.zeros(2), along, -3.0 * along):
+        regular = chi_square(difference, singular + 1e-6 * np.eye(2))
+        assert chi_square(difference, singular) == pytest.approx(regular, rel=1e-5)
+    for difference in (across, along + 1e-3 * across):
+        assert chi_square(difference, singular) == math.inf
+        assert chi_square(difference, singular + 1e-9 * np.eye(2)) > 900.0
+
+
+def test_chi_square_without_any_spread_is_nothing_or_infinite():
+    assert chi_square(np.zeros(2), np.zeros((2, 2))) == 0.0
+    assert chi_square(np.array([0.0, 1e-9]), np.zeros((2, 2))) == math.inf
+
+
 def test_covariance_transport_is_first_order_and_symmetric():
     rng = np.random.default_rng(3)
     jacobian, root = rng.normal(size=(2, 3)), rng.normal(size=(3, 3))

@@ -77,7 +77,8 @@ def test_one_module_imports_torch():
     found = {
         str(path.relative_to(ENGINE))
         for path in ENGINE.rglob("*.py")
-        if any(name.split(".")[0] == "torch" for name in imported(path, at_top=False))
+        if "torch" in path.read_text()  # few are worth parsing
+        and any(name.split(".")[0] == "torch" for name in imported(path, at_top=False))
     }
     assert found == {"tensors.py"}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -23,17 +24,21 @@ def town_gray(seed: int = 1) -> NDArray[np.uint8]:
 
 
 @cache
-def mosaic(side: int) -> NDArray[np.uint8]:
-    """A square map of any size, of simulated towns turned and mirrored, each lit a little differently."""
-    rng = np.random.default_rng(side)
-    towns = [town_gray(seed)[50:950] for seed in (2, 3, 4, 5)]
-    out = np.empty((side, side), np.uint8)
+def mosaic(side: int, shown: int | None = None) -> NDArray[np.uint8]:
+    """A square map of any size, of simulated towns turned and mirrored, each lit a little differently.
+
+    Of its rows and columns the first ``shown`` are drawn, and no town for what lies beyond.
+    """
+    rng, shown = np.random.default_rng(side), shown or side
+    out = np.empty((shown, shown), np.uint8)
     for y in range(0, side, 900):
         for x in range(0, side, 900):
-            tile = np.rot90(towns[rng.integers(len(towns))], rng.integers(4))
-            tile = tile[:, :: rng.choice([-1, 1])] * rng.uniform(0.8, 1.1)
+            seed, turns = 2 + int(rng.integers(4)), rng.integers(4)
+            mirrored, light = rng.choice([-1, 1]), rng.uniform(0.8, 1.1)
             part = out[y : y + 900, x : x + 900]
-            part[:] = tile[: part.shape[0], : part.shape[1]]
+            if part.size:
+                tile = np.rot90(town_gray(seed)[50:950], turns)[:, ::mirrored] * light
+                part[:] = tile[: part.shape[0], : part.shape[1]]
     return out
 
 
@@ -42,7 +47,7 @@ def pair(window_px: int, template_px: int) -> tuple[Image, Image]:
     """A window of map, enhanced, and a noisy cut of it as template."""
     from engine.scores import enhance
 
-    gray = mosaic(max(window_px, 1000))[:window_px, :window_px]
+    gray = mosaic(max(window_px, 1000), window_px)
     window = enhance(gray)
     start = (window_px - template_px) // 3
     cut = window[start : start + template_px, start : start + template_px]
@@ -66,7 +71,7 @@ def flight(count: int = 40) -> Flight:
     """Every fourth frame of the built-in flight, with a prior a few metres off."""
     plan = plan_flight(1, rate_hz=0.28)
     site = plan.town.site()
-    frames, truth = list(plan.iter_frames())[:count], plan.truth_rows()[:count]
+    frames, truth = list(islice(plan.iter_frames(), count)), plan.truth_rows()[:count]
     rng = np.random.default_rng(0)
     priors = []
     for row in truth:

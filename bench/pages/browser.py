@@ -58,10 +58,25 @@ class Browser:
         self.driver = driver
 
     def open(self, page: Path | str, width_px: int, height_px: int = 900) -> None:
-        """Load a file or an address in a window of this size."""
+        """Load a file or an address in a window of this size, and wait until it is drawn: until then Chromium
+        drops what is typed and clicked.
+        """
         self.resize(width_px, height_px)
         self.requests()  # those of the page before, and of the browser's own first one
         self.driver.get(page if isinstance(page, str) else page.resolve().as_uri())
+        self.wait_for("performance.getEntriesByName('first-contentful-paint').length > 0")
+
+    def wait_for(self, condition: str) -> None:
+        """Wait until an expression holds in the page, which is looked at with every frame that is drawn.
+
+        Raises:
+            selenium.common.exceptions.TimeoutException: it does not come to hold.
+        """
+        self.driver.set_script_timeout(_PATIENCE_S)
+        self.driver.execute_async_script(
+            "const done = arguments[0];"
+            f"const look = () => ({condition}) ? done() : requestAnimationFrame(look); look();"
+        )
 
     def wait_until_still(self) -> None:
         """Wait until what is shown has colours and does not change any more.

@@ -26,7 +26,6 @@ def test_the_way_leads_forth_and_back_without_a_jump():
     assert there_and_back(7, 1) == (0, False)
 
 
-@pytest.mark.usefixtures("towns_drawn_once")
 def test_an_endless_course_moves_as_its_velocities_say_also_on_the_way_back():
     course = draw(4)
     frames = [course.frame(number) for number in range(7)]

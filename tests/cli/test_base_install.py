@@ -19,6 +19,8 @@ PROGRAM = """
 import json, sys
 for name in {absent}:
     sys.modules[name] = None
+import engine.runs.mavlink_bridge
+engine.runs.mavlink_bridge._AUTOPILOT_TIMEOUT_S = 0.1  # there is none
 from engine.cli.app import run
 print("CODES", json.dumps([run(line) for line in {lines}]))
 """

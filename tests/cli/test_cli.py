@@ -182,12 +182,14 @@ def test_evaluate_takes_another_truth_and_drops_figures_that_no_longer_hold(done
     assert (folder / "path.png").exists()
 
 
-def test_start_comes_before_the_telemetry(flight, tmp_path):
-    truth = cells(flight / "truth.csv")[0]
+def test_start_comes_before_the_telemetry(copy, tmp_path):
+    truth = cells(copy / "truth.csv")[0]
+    told = (copy / "telemetry.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    (copy / "telemetry.csv").write_text("".join(told[:2]), encoding="utf-8")  # of the first frame alone
     # So far from the truth, and so sure of it, that nothing but the start itself can lead astray.
     lat = float(truth["lat_deg"]) + 0.002
     out = tmp_path / "out"
-    assert run(track(flight, out, f"--start={lat},{truth['lon_deg']},1")) == 0
+    assert run(track(copy, out, f"--start={lat},{truth['lon_deg']},1")) == 0
     assert cells(out / "track.csv")[0]["status"] == "no_fix" or (
         abs(float(cells(out / "track.csv")[0]["lat_deg"]) - lat) < 0.001
     )
@@ -226,7 +228,6 @@ def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsy
     assert "deadlines missed" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("towns_drawn_once")
 def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsys):
     out = tmp_path / "demo"
     assert run(["demo", "--frames=2", "--threads=1", f"--out={out}"]) == 0

@@ -34,8 +34,8 @@ from rosbags.typesys import Stores, get_typestore
 from engine.report import live_view
 from engine.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 
-FRAMES = 8
-DARK = 5  # a frame that shows nothing
+FRAMES = 5
+DARK = 3  # a frame that shows nothing
 
 
 def rows_of(recording):
@@ -174,7 +174,7 @@ def matcher(sim_site, sim_flight):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("towns_drawn_once", "bare_runs")
+@pytest.mark.usefixtures("bare_runs")
 def test_the_closed_loop_is_recorded_frame_by_frame(tmp_path, capsys):
     recording, out = tmp_path / "loop.rrd", tmp_path / "out"
     command = ["simulate", "--closed-loop", "--minutes", "0.1", "--method", "ncc", "--device", "cpu"]

@@ -132,7 +132,8 @@ def span(browser):
 
 
 def drag(browser, begin, end):
-    """From one share of the first chart's width to another."""
+    """From one share of the first chart's width to another, until the page shows another span of time."""
+    before = json.dumps(browser.run("return document.getElementById('time-span').textContent"))
     box = browser.run(
         "const c = document.querySelector('svg.chart[data-from]'); c.scrollIntoView({block: 'center'});"
         "const b = c.querySelector('.axis').getBoundingClientRect(); return [b.left, b.width, b.top]"
@@ -141,6 +142,7 @@ def drag(browser, begin, end):
     for kind, place in zip(("mousePressed", "mouseMoved", "mouseReleased"), at, strict=True):
         event = {"type": kind, "button": "left", "buttons": 1, "clickCount": 1, **place}
         browser.driver.execute_cdp_cmd("Input.dispatchMouseEvent", event)
+    browser.wait_for(f"document.getElementById('time-span').textContent !== {before}")
 
 
 def test_time_zooms_in_all_charts_by_dragging_and_comes_back(browser, pages):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import inspect
 import pickle
 from functools import cache
 from pathlib import Path
@@ -23,17 +23,26 @@ def drawn_town(seed: int = 1) -> Town:
     return drawn_once(seed)
 
 
-@cache
 def drawn_once(*seed: Any, **options: Any) -> Town:
-    """What ``build_town`` draws, kept in a file where the workers of a run share a folder."""
+    """What ``build_town`` draws of these arguments, whether they are given or the defaults."""
+    bound = inspect.signature(build_town).bind(*seed, **options)
+    bound.apply_defaults()
+    return _drawn(tuple(bound.arguments.items()))
+
+
+@cache
+def _drawn(options: tuple[tuple[str, Any], ...]) -> Town:
+    """A town, kept in a file where the workers of a run share a folder."""
     if kept_in is None:
-        return build_town(*seed, **options)
-    name = hashlib.sha256(repr((seed, sorted(options.items()))).encode()).hexdigest()[:16]
+        return build_town(**dict(options))
+    name = hashlib.sha256(repr(options).encode()).hexdigest()[:16]
     path = kept_in / f"town-{name}.pickle"
-    if not path.exists():
-        unfinished = path.with_suffix(f".{os.getpid()}")
-        unfinished.write_bytes(pickle.dumps(build_town(*seed, **options)))
-        unfinished.replace(path)
+    import fcntl  # not on Windows
+
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # who comes second waits, and draws nothing
+        if not path.exists():
+            path.write_bytes(pickle.dumps(build_town(**dict(options))))
     return pickle.loads(path.read_bytes())
 
 

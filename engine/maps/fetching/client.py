@@ -24,6 +24,8 @@ FIRST_WAIT_S = 2.0
 MAX_WAIT_S = 300.0
 """A server that asks for a longer wait ends the fetch, which goes on later where it was."""
 MAX_BYTES = 128 << 20
+PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+"""What stands in braces in a template of addresses."""
 _BUSY = (429, 500, 502, 503, 504)
 _NO_DATA = (404, 410)
 _SECRET = re.compile(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from urllib.parse import parse_qsl, quote, urljoin, urlsplit
 from xml.etree import ElementTree as Xml
 
 from engine.errors import MapError, OptionError
-from engine.maps.fetching.client import check_url
+from engine.maps.fetching.client import PLACEHOLDER, check_url
 from engine.maps.fetching.mosaic import (
     Level,
     Mosaic,
@@ -38,7 +37,6 @@ from engine.maps.fetching.services import (
 
 _HREF = "{http://www.w3.org/1999/xlink}href"
 _PIXEL_M = 0.00028  # of the screen that scale denominators are stated for
-_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,11 +175,11 @@ def _address(url: str, query_url: str, chosen: _Chosen, level: Level) -> Callabl
     template = urljoin(url, template)
     check_url("source", template)
     known = {name.lower(): quote(value, safe=":") for name, value in values.items()}
-    unknown = {n.lower() for n in _PLACEHOLDER.findall(template)} - set(known) - {"tilerow", "tilecol"}
+    unknown = {n.lower() for n in PLACEHOLDER.findall(template)} - set(known) - {"tilerow", "tilecol"}
     if unknown:
         raise OptionError(
             f"source: the server's tiles have a value that is not known, {', '.join(sorted(unknown))}"
         )
-    return lambda column, row: _PLACEHOLDER.sub(
+    return lambda column, row: PLACEHOLDER.sub(
         lambda name: (known | {"tilerow": str(row), "tilecol": str(column)})[name[1].lower()], template
     )

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 
 from engine.errors import OptionError
-from engine.maps.fetching.client import shown
+from engine.maps.fetching.client import PLACEHOLDER, shown
 from engine.maps.fetching.mosaic import (
     Level,
     Mosaic,
@@ -20,12 +19,11 @@ from engine.maps.fetching.mosaic import (
 MAX_ZOOM = 24
 _HALF_WORLD_M = math.pi * 6378137.0
 _KNOWN = ("z", "x", "y", "-y", "q")
-_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
 
 def is_template(url: str) -> bool:
     """Whether a source is a template of tiles, and not a service that describes itself."""
-    return bool(_PLACEHOLDER.search(url))
+    return bool(PLACEHOLDER.search(url))
 
 
 def check_template(url: str) -> None:
@@ -34,7 +32,7 @@ def check_template(url: str) -> None:
     Raises:
         OptionError: a placeholder is unknown, or one is missing.
     """
-    names = _PLACEHOLDER.findall(url)
+    names = PLACEHOLDER.findall(url)
     unknown = [name for name in names if name not in _KNOWN]
     if unknown:
         raise OptionError(
@@ -63,7 +61,7 @@ def tile_url(template: str, zoom: int, column: int, row: int) -> str:
         "-y": str((1 << zoom) - 1 - row),
         "q": "".join(str((column >> n & 1) | (row >> n & 1) << 1) for n in reversed(range(zoom))),
     }
-    return _PLACEHOLDER.sub(lambda name: values[name[1]], template)
+    return PLACEHOLDER.sub(lambda name: values[name[1]], template)
 
 
 def plan_xyz(template: str, wanted: Wanted, tile_px: int) -> Mosaic:
