@@ -143,6 +143,10 @@ OptionalDeviceOption = Annotated[
 ImageTopicOption = Annotated[
     str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")
 ]
+OdometryTopicOption = Annotated[
+    str | None,
+    typer.Option("--odometry-topic", metavar="NAME", help="Of a bag: nav_msgs/Odometry that has the velocity."),
+]
 FrameStampsOption = Annotated[
     Path | None,
     typer.Option("--frame-stamps", metavar="FILE", help="With a log: a CSV with timestamp_ns and frame."),

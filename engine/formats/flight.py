@@ -116,6 +116,7 @@ def open_flight(
     clock: LogClock = AS_LOGGED,
     image_topic: str | None = None,
     columns: Mapping[str, str] = {},
+    odometry_topic: str | None = None,
 ) -> Flight:
     """Open a flight and check up front that its parts belong together.
 
@@ -128,6 +129,7 @@ def open_flight(
         clock: capture times of the frames, where the telemetry is a log.
         image_topic: topic of a bag's images; None where there is only one.
         columns: what a telemetry.csv calls a column, by its name in :data:`engine.formats.telemetry.COLUMNS`.
+        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
 
     Returns:
         The flight; no image but the first has been read.
@@ -145,7 +147,7 @@ def open_flight(
     remarks: list[str] = []
     of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"
     if telemetry is not None and is_log(telemetry):
-        log = open_log(telemetry)
+        log = open_log(telemetry, odometry_topic)
         rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
         _check_is_table(Path(telemetry))

@@ -33,7 +33,7 @@ HEIGHT_SOURCES = ("rangefinder", "terrain", "take-off")
 _ANGLES = ("heading_deg", "roll_deg", "lon_deg")
 _COLUMNS = (
     "alt_amsl_m", "heading_deg", "heading_sigma_deg", "roll_deg", "pitch_deg", "tilt_sigma_deg",
-    "east_velocity_mps", "north_velocity_mps",
+    "east_velocity_mps", "north_velocity_mps", "velocity_sigma_mps",
 )  # fmt: skip
 _POSITION = ("lat_deg", "lon_deg", "sigma_m")
 

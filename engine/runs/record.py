@@ -14,8 +14,8 @@ from engine.formats.corrections import Corrections
 
 _TEXTS = ("map", "method", "profile")
 _TEXTS_OR_NONE = (
-    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "device", "start",
-    "map_bounds", "map_crs", "mount", "surface_datum",
+    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "odometry_topic",
+    "device", "start", "map_bounds", "map_crs", "mount", "surface_datum",
 )  # fmt: skip
 _NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")
 
@@ -34,6 +34,7 @@ class RunRecord:
         frame_stamps: when the frames were taken, where the telemetry is a log.
         log_offset_s: added to the frames' own stamps, in the same case.
         image_topic: of the pictures, where the frames are a bag.
+        odometry_topic: that the velocity was taken from, where the telemetry is a bag.
         map_sigma_m: georeferencing accuracy of the map, where it was given, as are the next five.
         map_bounds: of a picture, as typed.
         map_crs: of a map that names none.
@@ -70,6 +71,7 @@ class RunRecord:
     frame_stamps: str | None = None
     log_offset_s: float | None = None
     image_topic: str | None = None
+    odometry_topic: str | None = None
     map_sigma_m: float | None = None
     map_bounds: str | None = None
     map_crs: str | None = None

@@ -16,7 +16,8 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from engine.adapters.ros import OUTPUTS, RosBridge, RosTelemetry, RosTopics
+from engine.adapters.ros import OUTPUTS, RosBridge
+from engine.adapters.ros_in import RosTelemetry, RosTopics
 from engine.adapters.ros_out import FIRMWARES, RosOptions, diagnostics, pose, window_picture
 from engine.adapters.vehicle import NedOrigin, VehicleState
 from engine.camera import Camera
@@ -27,6 +28,7 @@ from engine.formats.ros.messages import (
     NO_POSITION,
     MessageFactory,
     attitude_from_message,
+    body_velocity_from_message,
     camera_from_message,
     image_from_message,
     position_from_message,
@@ -37,6 +39,7 @@ from engine.formats.ros.messages import (
 from engine.live import LiveOptions
 from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.support.ground import body_axes
+from tests.support.odometries import odometry_message
 from tests.support.towns import drawn_town
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
@@ -300,6 +303,62 @@ def test_a_time_that_goes_back_begins_again():
     heard.height(70.0, NOW_NS - 60_000_000_000)
     assert heard.vehicle(NOW_NS - 60_000_000_000).height_agl_m == 70.0
     assert heard.vehicle(NOW_NS).height_agl_m is None
+
+
+@pytest.mark.parametrize("child", ["base_link", "", "odom"])
+def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, child):
+    """Wherever the odometry has its own north, and along whichever of the two frames its twist is."""
+    rng = np.random.default_rng(5)
+    for roll_deg, pitch_deg, heading_deg in random_angles(20):
+        enu_mps, yaw_deg = rng.normal(0.0, 8.0, 3), rng.uniform(-180.0, 180.0)
+        angles = (roll_deg, pitch_deg, heading_deg)
+        message = wired(ros, odometry_message(maker, NOW_NS, angles, enu_mps, yaw_deg=yaw_deg, child=child))
+        heard = RosTelemetry()
+        heard.odometry(message, 0)
+        assert heard.vehicle(NOW_NS).east_velocity_mps is None  # towards nobody knows where
+        heard.imu(maker.imu(NOW_NS, "", *angles))
+        now = heard.vehicle(NOW_NS)
+        assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
+        assert now.velocity_sigma_mps is None  # zeros state nothing
+
+
+@pytest.mark.parametrize(
+    ("variances", "told_mps"),
+    [
+        ((0.04, 0.09, 0.01), math.hypot(0.3, math.radians(1.0) * 10.0)),  # the heading is off by a degree
+        ((1e-12, 1e-12, 1e-12), math.radians(1.0) * 10.0),
+        ((0.0, 0.0, 0.0), 0.0),
+        ((-1.0, 9.0, 9.0), 0.0),  # not stated, by its first element
+        ((math.nan, 0.04, 0.04), 0.0),
+        ((0.04, 30.0, 0.04), None),  # lost
+    ],
+)
+def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, told_mps):
+    message = odometry_message(maker, NOW_NS, (0.0, 0.0, 90.0), (10.0, 0.0, 0.0), variances=variances)
+    told = body_velocity_from_message(wired(ros, message))
+    if told_mps is None:
+        assert told is None
+    else:
+        assert told == pytest.approx((10.0, 0.0, 0.0, told_mps), abs=1e-9)
+        heard = RosTelemetry()
+        heard.odometry(message, 0)
+        heard.imu(maker.imu(NOW_NS, "", 0.0, 0.0, 90.0))
+        frame = heard.vehicle(NOW_NS).frame(np.zeros((4, 6), np.uint8), NOW_NS)
+        assert frame.velocity_sigma_mps == (pytest.approx(told_mps) if told_mps else None)
+
+
+def test_an_odometry_that_says_nothing(maker):
+    angles = (0.0, 0.0, 0.0)
+    for velocity in ((math.nan, 0.0, 0.0), (0.0, 1e4, 0.0)):
+        assert body_velocity_from_message(odometry_message(maker, NOW_NS, angles, velocity)) is None
+    message = odometry_message(maker, NOW_NS, angles, (1.0, 2.0, 3.0), child="odom")
+    message.pose.pose.orientation.w = 5.0  # no turn, which a twist along the pose's frame needs
+    assert body_velocity_from_message(message) is None
+    heard = RosTelemetry()
+    heard.imu(maker.imu(NOW_NS, "", *angles))
+    heard.odometry(odometry_message(maker, 0, angles, (1.0, 2.0, 3.0)), NOW_NS)  # without a stamp it is of now
+    assert heard.vehicle(NOW_NS).north_velocity_mps == pytest.approx(2.0)
+    assert heard.vehicle(NOW_NS + 600_000_000).north_velocity_mps is None
 
 
 # ---------------------------------------------------------------------------------------------------- poses
@@ -624,8 +683,11 @@ def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
         handlers[RosTopics().height][1](maker.float64(42.0))
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
+        instead = bridge.handlers(RosTopics(odometry="/vio/odometry"))
     assert "" not in kinds
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
+    assert instead["/vio/odometry"][0] == "nav_msgs/msg/Odometry"
+    assert RosTopics().velocity not in instead
     assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
 

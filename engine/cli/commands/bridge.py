@@ -292,6 +292,9 @@ def ros(
     velocity: Annotated[
         str, typer.Option("--velocity-topic", metavar="NAME", help="geometry_msgs/TwistStamped, east and north.")
     ] = "/mavros/local_position/velocity_local",
+    odometry_topic: Annotated[
+        str, typer.Option("--odometry-topic", metavar="NAME", help="nav_msgs/Odometry; outranks the velocity.")
+    ] = "",
     firmware: Annotated[
         str,
         typer.Option("--firmware", metavar="none|ardupilot|px4", help="For whom the poses are, behind MAVROS."),
@@ -328,7 +331,7 @@ def ros(
     use_threads(threads)
     topics = RosTopics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
-        velocity=velocity,
+        velocity=velocity, odometry=odometry_topic,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
