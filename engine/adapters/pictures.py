@@ -19,7 +19,7 @@ CapturedImage = tuple[NDArray[np.uint8], int]
 
 
 def replay(
-    frames: Path, telemetry: Path | None, *, rate_hz: float, wait: Callable[[], None] | None = None
+    frames: Path, telemetry: Path | None, *, rate_hz: float, every: int = 1, wait: Callable[[], None] | None = None
 ) -> Generator[CapturedImage, None, None]:
     """Replay a folder of images or a video in real time.
 
@@ -30,6 +30,7 @@ def replay(
         telemetry: telemetry.csv or a log, whose stamps set the pace; None uses the subtitles beside a video, the
             EXIF of photographs, else ``rate_hz``.
         rate_hz: images per second where there are no stamps.
+        every: one image in so many is played, at its own time.
         wait: called when the first image has been read; the replay starts when it returns.
 
     Returns:
@@ -38,7 +39,7 @@ def replay(
     Raises:
         TelemetryError: an image or the telemetry cannot be read.
     """
-    return _play(open_flight(frames, telemetry), rate_hz, wait)
+    return _play(open_flight(frames, telemetry).every(every), rate_hz / every, wait)
 
 
 def _play(flight: Flight, rate_hz: float, wait: Callable[[], None] | None) -> Generator[CapturedImage, None, None]:

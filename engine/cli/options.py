@@ -143,6 +143,7 @@ OptionalDeviceOption = Annotated[
 ImageTopicOption = Annotated[
     str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")
 ]
+EveryOption = Annotated[int, typer.Option("--every", metavar="N", help="Use one frame in N, from the first on.")]
 OdometryTopicOption = Annotated[
     str | None,
     typer.Option("--odometry-topic", metavar="NAME", help="Of a bag: nav_msgs/Odometry that has the velocity."),

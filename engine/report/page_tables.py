@@ -20,7 +20,7 @@ from engine.values import Reason
 
 _FACTS = {
     "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
-    "frames": "frames", "image_topic": "image topic", "telemetry": "telemetry",
+    "frames": "frames", "every": "one frame in", "image_topic": "image topic", "telemetry": "telemetry",
     "odometry_topic": "velocity from", "frame_stamps": "frame stamps",
     "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
     "device": "device", "start": "start", "budget_ms": "budget (ms)",

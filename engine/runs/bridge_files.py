@@ -12,7 +12,7 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.flight import open_flight
 from engine.formats.frames import VIDEO_SUFFIXES
-from engine.runs.arguments import check_unused
+from engine.runs.arguments import check_every, check_unused
 from engine.runs.cameras import CameraFiles
 from engine.runs.folders import StrPath
 from engine.runs.progress import SILENT, Progress
@@ -33,6 +33,7 @@ class BridgeFiles:
         telemetry: telemetry.csv or a log, whose stamps set that pace; None takes a video's own times.
         camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: pace of pictures without stamps; None is 10.
+        every: one of the pictures that are played in so many is used, at its own time.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
@@ -53,6 +54,7 @@ class BridgeFiles:
     telemetry: StrPath | None = None
     camera_source: str | None = None
     rate_hz: float | None = None
+    every: int = 1
     exposure_to_grab_ms: float | None = None
     map_sigma_m: float | None = None
     map_bounds: str | None = None
@@ -66,10 +68,12 @@ class BridgeFiles:
         if (self.frames is None) == (self.camera_source is None):
             raise OptionError("frames: expected either `frames` or `camera_source`")
         if self.frames is None:
-            check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz}, "frames")
+            every = None if self.every == 1 else self.every
+            check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz, "every": every}, "frames")
             self._check_live_camera()
         else:
             check_unused({"exposure_to_grab_ms": self.exposure_to_grab_ms}, "camera_source")
+        check_every(self.every)
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
             raise OptionError(f"rate_hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
         if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MAX_GRAB_MS:
@@ -105,6 +109,7 @@ class BridgeFiles:
         """
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)
-            return replay(Path(self.frames), telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
+            rate_hz = self.rate_hz or 10.0
+            return replay(Path(self.frames), telemetry, rate_hz=rate_hz, every=self.every, wait=wait)
         assert self.camera_source is not None  # one of the two is given
         return capture(self.camera_source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)

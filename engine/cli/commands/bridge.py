@@ -16,6 +16,7 @@ from engine.cli.options import (
     CoresOption,
     DeadlineOption,
     DeviceOption,
+    EveryOption,
     FirmwareOption,
     HfovOption,
     JsonOption,
@@ -77,6 +78,7 @@ def mavlink(
         float | None,
         typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless given."),
     ] = None,
+    every: EveryOption = 1,
     camera_source: Annotated[
         str | None,
         typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
@@ -142,7 +144,7 @@ def mavlink(
     use_threads(threads)
     files = BridgeFiles(
         map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry,
-        camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
+        camera_source=camera_source, rate_hz=rate_hz, every=every, exposure_to_grab_ms=exposure_to_grab_ms,
         map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
         camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
     )  # fmt: skip
