@@ -4,18 +4,47 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.adapters.camera_stream import capture
+from engine.errors import TelemetryError
 from engine.formats.flight import Flight, open_flight
+from engine.formats.tables import quoted
 
-__all__ = ["CapturedImage", "capture", "replay"]
+__all__ = ["CapturedImage", "capture", "first_picture", "replay"]
+
+_FIRST_PICTURE_S = 30.0
 
 CapturedImage = tuple[NDArray[np.uint8], int]
 """Image (H, W, 3) RGB uint8, and its capture time on ``time.monotonic_ns``."""
+
+
+def first_picture(camera_source: str) -> NDArray[np.uint8]:
+    """The first picture of a camera, which is closed again.
+
+    Args:
+        camera_source: as of :func:`engine.adapters.camera_stream.capture`.
+
+    Returns:
+        (H, W, 3) RGB uint8.
+
+    Raises:
+        TelemetryError: the camera does not open, or gives no picture for a while.
+    """
+    until = time.monotonic() + _FIRST_PICTURE_S
+    with closing(capture(camera_source)) as pictures:
+        for picture in pictures:
+            if picture is not None:
+                return picture[0]
+            if time.monotonic() > until:
+                break
+    raise TelemetryError(
+        f"camera_source: expected a picture within {_FIRST_PICTURE_S:g} s, got none of {quoted(camera_source)}"
+    )
 
 
 def replay(

@@ -28,9 +28,6 @@ MapBoundsOption = Annotated[
 MapCrsOption = Annotated[
     str | None, typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.")
 ]
-CameraOption = Annotated[
-    Path, typer.Option("--camera", metavar="FILE", help="Calibration: ROS camera_info, OpenCV's or Kalibr's.")
-]
 OptionalCameraOption = Annotated[
     Path | None,
     typer.Option("--camera", metavar="FILE", help="Calibration file; without it a bag's own, or EXIF."),

@@ -26,8 +26,8 @@ class BridgeFiles:
 
     Attributes:
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration; None takes that of the pictures that are played, or ``hfov_deg``.
-        hfov_deg: horizontal field of view of the pictures that are played, in place of a calibration.
+        camera: calibration; None takes ``hfov_deg``, or that of the pictures that are played.
+        hfov_deg: horizontal field of view, in place of a calibration; of a camera with the size of its pictures.
         surface: surface model, a GeoTIFF of heights.
         frames: pictures that are played at their own pace, a folder or a video.
         telemetry: telemetry.csv or a log, whose stamps set that pace; None takes a video's own times.
@@ -82,8 +82,10 @@ class BridgeFiles:
             )
 
     def _check_live_camera(self) -> None:
-        if self.camera is None:
-            raise OptionError("camera: expected a calibration of the camera that `camera_source` opens")
+        if self.camera is None and self.hfov_deg is None:
+            raise OptionError(
+                "camera: expected a calibration of the camera that `camera_source` opens, or `hfov_deg`"
+            )
         source = Path(self.camera_source or "")
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():  # it would be read as fast as it can
             raise OptionError(f"camera_source: expected a camera, got the video {source}; `frames` plays it")
@@ -96,7 +98,9 @@ class BridgeFiles:
         )  # fmt: skip
 
     def load_camera(self, progress: Progress = SILENT) -> Camera:
-        """The calibration, else what is said of the pictures that are played, or by them."""
+        """The calibration, else what is said of the pictures or by them, for which a camera is opened once."""
+        if self.camera_source is not None:
+            return self.camera_files().load_live(self.camera_source, progress=progress)
         if self.camera is not None or self.frames is None:
             return self.camera_files().load(None)
         flight = open_flight(self.frames, self.telemetry)

@@ -844,6 +844,44 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
         ros1.Node("again")
 
 
+def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp_path, monkeypatch):
+    """Of its field of view; nothing but the picture's topic is waited for."""
+    from engine.runs.ros_bridge import RosSettings, run_ros_bridge
+    from engine.runs.simulation import write_flight
+    from engine.sim import plan_flight
+
+    class Spun(StandIn):
+        asked, picture = [], an_image(maker, NOW_NS, (30, 40, 3))
+
+        def wait_for(self, topic, msgtype, timeout_s):
+            self.asked.append((topic, msgtype))
+            return self.picture
+
+        def spin(self, handlers, every_second, seconds):
+            pass
+
+    class LoadedError(Exception):
+        """Ends the run where the camera is known."""
+
+    def matcher(site, camera, *_):
+        raise LoadedError(camera)
+
+    monkeypatch.setattr("engine.runs.ros_bridge.SceneMatcher", matcher)
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+    settings = RosSettings(map=tmp_path / "map.tif", hfov_deg=90.0, topics=RosTopics(image="/down"))
+    node = Spun(maker)
+    with pytest.raises(LoadedError) as ended:
+        run_ros_bridge(settings, node=node)
+    (camera,) = ended.value.args
+    assert node.asked == [("/down", "sensor_msgs/msg/Image")]
+    assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (40, 30, pytest.approx(20.0))
+    Spun.picture = None
+    with pytest.raises(BackendError, match=r"image_topic: expected a picture on /down within 30 s, got none"):
+        run_ros_bridge(settings, node=node)
+    with pytest.raises(OptionError, match="hfov_deg: expected without `camera`"):
+        RosSettings(map="m.tif", hfov_deg=90.0, camera="c.yaml")
+
+
 def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
     from engine.runs.simulation import write_flight
     from engine.sim import plan_flight

@@ -1,5 +1,6 @@
 """Inputs of a run that no file was written for: pictures with corners, lenses by their field of view, mounts."""
 
+import shlex
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from PIL import Image
 
 from engine.camera import Camera, mount_rotation
 from engine.cli.app import run
-from engine.errors import CalibrationError, MapError, OptionError
+from engine.errors import CalibrationError, MapError, OptionError, TelemetryError
 from engine.formats.corrections import Corrections
 from engine.formats.flight import camera_info
 from engine.formats.geotiff import write_geotiff
@@ -175,8 +176,9 @@ def test_pictures_without_exif_need_a_camera(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "camera: expected a calibration of the camera that `camera_source` opens"),
-        ({"hfov_deg": 64.0}, "camera: expected a calibration of the camera that `camera_source` opens"),
+        ({}, "camera: expected a calibration of the camera that `camera_source` opens, or `hfov_deg`"),
+        ({"hfov_deg": 64.0}, r"camera_source: expected a camera, got the video .*\.mp4; `frames` plays it"),
+        ({"hfov_deg": 64.0, "camera": "c.yaml"}, "hfov_deg: expected without `camera`"),
         ({"camera": "c.yaml"}, r"camera_source: expected a camera, got the video .*\.mp4; `frames` plays it"),
     ],
 )
@@ -185,6 +187,34 @@ def test_a_bridge_refuses_a_camera_without_a_calibration_and_a_video_as_one(tmp_
     video.touch()
     with pytest.raises(OptionError, match=words):
         BridgeFiles(map="m.tif", camera_source=str(video), **options)
+
+
+def test_a_live_camera_by_its_field_of_view_has_the_size_of_its_first_picture(tmp_path):
+    picture, messages = tmp_path / "1.jpg", []
+    Image.fromarray(noise()).save(picture)
+    source = f"exec:{shlex.join(['cat', str(picture)])}"
+    files = BridgeFiles(map="m.tif", camera_source=source, hfov_deg=90.0, mount="nadir-tail")
+    camera = files.load_camera(SimpleNamespace(message=messages.append))
+    assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (80, 60, pytest.approx(40.0))
+    assert np.array_equal(camera.mount, mount_rotation("nadir-tail"))
+    assert messages[-1] == "camera: 80 x 60, 90 degrees wide"
+    silent = BridgeFiles(map="m.tif", camera_source="exec:true", hfov_deg=90.0)
+    with pytest.raises(TelemetryError, match="camera_source: expected pictures, got none"):
+        silent.load_camera()
+
+
+def test_a_live_camera_that_gives_no_picture_is_not_waited_for_without_end(monkeypatch):
+    monkeypatch.setattr("engine.adapters.pictures._FIRST_PICTURE_S", 0.1)
+    files = BridgeFiles(map="m.tif", camera_source="exec:sleep 60", hfov_deg=90.0)
+    with pytest.raises(TelemetryError, match=r"camera_source: expected a picture within 0\.1 s, got none"):
+        files.load_camera()
+
+
+def test_the_delay_of_a_camera_needs_to_know_its_lens(capsys):
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    command = ["bridge", "camera-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
+    assert run(command) == 2
+    assert "--camera: expected a calibration, or --hfov-deg" in capsys.readouterr().err
 
 
 def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_path):

@@ -11,7 +11,6 @@ import typer
 from engine.cli import console
 from engine.cli.options import (
     BridgeDeadlineOption,
-    CameraOption,
     CameraPitchOption,
     CoresOption,
     DeadlineOption,
@@ -174,11 +173,12 @@ def camera_delay(
         str,
         typer.Option("--connect", metavar="LINK", help="The autopilot, as of bridge mavlink."),
     ],
-    camera: CameraOption,
     camera_source: Annotated[
         str,
         typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
     ],
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
     seconds: Annotated[
         float, typer.Option("--seconds", min=5.0, metavar="S", help="How long pictures are taken.")
     ] = 20.0,
@@ -197,13 +197,14 @@ def camera_delay(
     from engine.runs.camera_delay import measure_camera_delay
 
     found = measure_camera_delay(
-        connect, camera, camera_source, seconds=seconds, mount=mount, firmware=firmware, system_id=system_id,
-        key=key, listen_anywhere=listen_anywhere, progress=console.PROGRESS,
+        connect, camera, camera_source, hfov_deg=hfov_deg, seconds=seconds, mount=mount,
+        firmware=firmware, system_id=system_id, key=key, listen_anywhere=listen_anywhere,
+        progress=console.PROGRESS,
     )  # fmt: skip
     values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
     console.facts(values, as_json, title=f"camera {camera_source}")
     late = console.options(
-        connect=connect, camera=camera, camera_source=camera_source,
+        connect=connect, camera=camera, hfov_deg=hfov_deg, camera_source=camera_source,
         exposure_to_grab_ms=values["exposure_to_grab_ms"],
     )  # fmt: skip
     console.next_step(f"bridge mavlink --map MAP {late}", as_json=as_json)
@@ -271,6 +272,7 @@ def ros(
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
     ] = None,
+    hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
     image: Annotated[
@@ -340,9 +342,9 @@ def ros(
         seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     ros_settings = RosSettings(
-        map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
-        firmware=firmware, origin=origin, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
-        camera_pitch_deg=camera_pitch_deg, arguments=tuple(ros_arguments or ()),
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, topics=topics,
+        map_sigma_m=map_sigma_m, version=version, firmware=firmware, origin=origin, map_bounds=map_bounds,
+        map_crs=map_crs, mount=mount, camera_pitch_deg=camera_pitch_deg, arguments=tuple(ros_arguments or ()),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)
