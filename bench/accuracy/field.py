@@ -26,7 +26,6 @@ from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
 from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.formats.flight import Flight
 from engine.formats.track import TrackRow, read_track, track_row
 from engine.formats.truth import interpolate_truth
 from engine.navigator_options import ACCEPT_ALL
@@ -103,8 +102,7 @@ def inputs_of(name: str, step: int) -> tuple[FlightFiles, FlightInputs]:
     folder = SHARED / name
     files = _with_video(folder) if (folder / VIDEO).is_file() else FlightFiles.in_folder(folder)
     inputs = open_inputs(files, [])
-    flight = inputs.flight
-    return files, replace(inputs, flight=Flight(flight.source, flight.rows[::step], flight.heights))
+    return files, replace(inputs, flight=inputs.flight.every(step))
 
 
 def _with_video(folder: Path) -> FlightFiles:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.packets import AUTOPILOT_COMPONENT, BRIDGE_COMPONENT
-from engine.covariance import AssumedErrors
+from engine.formats.velocities import velocity_sigma_mps
 from engine.geo import enu_from_body
 
 Array = NDArray[np.float64]
@@ -19,8 +18,6 @@ _OVER_GROUND = (mavlink.MAV_FRAME_LOCAL_NED,)
 _OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter was its name before
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FAILED = -1  # quality
-_MIN_SIGMA_MPS, _MAX_SIGMA_MPS = 0.1, 5.0  # covariances of odometry are often too small; beyond this it is lost
-_MAX_SPEED_MPS = 150.0
 
 
 def vision_velocity(
@@ -45,15 +42,11 @@ def vision_velocity(
         velocity = np.array([message.vx, message.vy, message.vz])
         variances = [message.velocity_covariance[i] for i in (0, 6, 11)]  # of a 6 x 6 upper triangle
         turn = _turn(message.child_frame_id, attitude_deg)
-    speed_mps = float(np.hypot.reduce(velocity))
-    # What is not finite compares as false.
-    if turn is None or not speed_mps <= _MAX_SPEED_MPS or any(v > _MAX_SIGMA_MPS**2 for v in variances):
+    sigma_mps = velocity_sigma_mps(velocity, variances, turned=turn is not _ENU_FROM_NED)
+    if turn is None or sigma_mps is None:
         return None
     east, north, up = (float(v) for v in turn @ velocity)
-    if not all(math.isfinite(v) for v in variances) or max(variances) <= 0.0:
-        return east, north, up, 0.0
-    turned_mps = 0.0 if turn is _ENU_FROM_NED else math.radians(AssumedErrors().heading_deg) * speed_mps
-    return east, north, up, max(math.hypot(math.sqrt(max(variances)), turned_mps), _MIN_SIGMA_MPS)
+    return east, north, up, sigma_mps
 
 
 def has_failed(message: Any) -> bool:

@@ -28,9 +28,6 @@ MapBoundsOption = Annotated[
 MapCrsOption = Annotated[
     str | None, typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.")
 ]
-CameraOption = Annotated[
-    Path, typer.Option("--camera", metavar="FILE", help="Calibration: ROS camera_info, OpenCV's or Kalibr's.")
-]
 OptionalCameraOption = Annotated[
     Path | None,
     typer.Option("--camera", metavar="FILE", help="Calibration file; without it a bag's own, or EXIF."),
@@ -142,6 +139,11 @@ OptionalDeviceOption = Annotated[
 ]
 ImageTopicOption = Annotated[
     str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")
+]
+EveryOption = Annotated[int, typer.Option("--every", metavar="N", help="Use one frame in N, from the first on.")]
+OdometryTopicOption = Annotated[
+    str | None,
+    typer.Option("--odometry-topic", metavar="NAME", help="Of a bag: nav_msgs/Odometry that has the velocity."),
 ]
 FrameStampsOption = Annotated[
     Path | None,

@@ -36,6 +36,8 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     known = [(name, form, summary[key]) for name, key, form in _SUMMARY if summary.get(key) is not None]
     # A wild value keeps to its column.
     pairs = [(name, form.replace(".2f", ".1e" if abs(v) >= 1e5 else ".2f").format(v)) for name, form, v in known]
+    if summary.get("rms_m") is None:
+        pairs += _stated(summary)
     latency = summary["latency_ms"]
     if latency["p50"] is not None:
         shown = ", ".join(f"{name} {latency[name]:.1f}" for name in ("p50", "p95", "p99", "max"))
@@ -46,6 +48,18 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     pairs += list((summary["settings"].get("diagnosis") or {}).items())
     console.print_pairs(title, pairs)
     console.say(f"written to {out}")
+
+
+def _stated(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a track without truth says of itself, which is no measurement of its accuracy."""
+    pairs, motion = [], summary.get("motion_consistency")
+    if summary.get("stated_sigma_median_m") is not None:
+        median_m, p95_m = summary["stated_sigma_median_m"], summary["stated_sigma_p95_m"]
+        pairs.append(("stated sigma (not measured)", f"median {median_m:.2f} m, 95 % below {p95_m:.2f} m"))
+    if motion is not None:
+        text = f"median {motion['median_m']:.2f} m, 95 % below {motion['p95_m']:.2f} m off the velocity"
+        pairs.append((f"from fix to fix ({motion['steps']} steps)", text))
+    return pairs
 
 
 def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:

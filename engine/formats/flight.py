@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from engine.formats.frames import VIDEO_SUFFIXES, FrameSource, VideoFile, open_f
 from engine.formats.geotiff import write_geotiff
 from engine.formats.logs.readers import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
 from engine.formats.photos import photo_telemetry
-from engine.formats.resampling import telemetry_at
+from engine.formats.resampling import rows_and_sources_at
 from engine.formats.ros.bags import BagFrames, is_bag
 from engine.formats.telemetry import TelemetryRow, open_telemetry, write_telemetry
 from engine.formats.truth import write_truth
@@ -53,7 +54,7 @@ class Flight:
     Attributes:
         source: source of the images.
         rows: the telemetry, one row per frame; empty where there is none.
-        heights: where a log or photographs were read, the number of rows whose height comes from each source.
+        height_sources: where a log or photographs were read, the source of each row's height, or empty.
         names: names of the frames, in order.
         unused: number of images without a row of telemetry.
         has_gimbal: whether the attitude is that of a gimbal, and says by itself where the camera looks.
@@ -62,7 +63,7 @@ class Flight:
 
     source: FrameSource
     rows: list[TelemetryRow]
-    heights: Mapping[str, int] = field(default_factory=dict)
+    height_sources: Sequence[str] = ()
     has_gimbal: bool = False
     remarks: Sequence[str] = ()
     names: list[str] = field(init=False)
@@ -71,6 +72,17 @@ class Flight:
     def __post_init__(self) -> None:
         self.names = [row.frame for row in self.rows] or list(self.source.names)
         self.unused = len(set(self.source.names) - set(self.names))
+
+    @property
+    def heights(self) -> dict[str, int]:
+        """The number of frames whose height comes from each source."""
+        return dict(Counter(source for source in self.height_sources if source))
+
+    def every(self, step: int) -> Flight:
+        """Every ``step``-th frame of these, from the first on, each with its own telemetry."""
+        part = replace(self, rows=self.rows[::step], height_sources=self.height_sources[::step])
+        part.names, part.unused = self.names[::step], self.unused
+        return part
 
     def __len__(self) -> int:
         return len(self.names)
@@ -116,6 +128,7 @@ def open_flight(
     clock: LogClock = AS_LOGGED,
     image_topic: str | None = None,
     columns: Mapping[str, str] = {},
+    odometry_topic: str | None = None,
 ) -> Flight:
     """Open a flight and check up front that its parts belong together.
 
@@ -128,6 +141,7 @@ def open_flight(
         clock: capture times of the frames, where the telemetry is a log.
         image_topic: topic of a bag's images; None where there is only one.
         columns: what a telemetry.csv calls a column, by its name in :data:`engine.formats.telemetry.COLUMNS`.
+        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
 
     Returns:
         The flight; no image but the first has been read.
@@ -141,12 +155,12 @@ def open_flight(
         telemetry = frames
     if telemetry is None:
         telemetry = subtitles_beside(frames)
-    heights: dict[str, int] = {}
+    height_sources: list[str] = []
     remarks: list[str] = []
     of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"
     if telemetry is not None and is_log(telemetry):
-        log = open_log(telemetry)
-        rows, heights = telemetry_at(log, *stamp_frames(source, log, clock))
+        log = open_log(telemetry, odometry_topic)
+        rows, height_sources = rows_and_sources_at(log, *stamp_frames(source, log, clock))
     elif telemetry is not None:
         _check_is_table(Path(telemetry))
         table = open_telemetry(telemetry, source, source.description, columns)
@@ -155,9 +169,9 @@ def open_flight(
         rows = []
     else:
         rows, remarks = photo_telemetry([source.path / name for name in source.names])
-        heights = {"take-off": sum(row.height_agl_m is not None for row in rows)}
+        height_sources = ["" if row.height_agl_m is None else "take-off" for row in rows]
     has_gimbal = of_gimbal and any(row.roll_deg is not None for row in rows)
-    flight = Flight(source, rows, {name: n for name, n in heights.items() if n}, has_gimbal, remarks)
+    flight = Flight(source, rows, height_sources, has_gimbal, remarks)
     if camera is not None:
         camera.check_size(source.read(flight.names[0]).shape)
     return flight

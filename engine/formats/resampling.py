@@ -33,7 +33,7 @@ HEIGHT_SOURCES = ("rangefinder", "terrain", "take-off")
 _ANGLES = ("heading_deg", "roll_deg", "lon_deg")
 _COLUMNS = (
     "alt_amsl_m", "heading_deg", "heading_sigma_deg", "roll_deg", "pitch_deg", "tilt_sigma_deg",
-    "east_velocity_mps", "north_velocity_mps",
+    "east_velocity_mps", "north_velocity_mps", "velocity_sigma_mps",
 )  # fmt: skip
 _POSITION = ("lat_deg", "lon_deg", "sigma_m")
 
@@ -203,6 +203,14 @@ def telemetry_at(
     Raises:
         TelemetryError: no frame lies within the log, or UTC cannot be converted to the log's clock.
     """
+    rows, sources = rows_and_sources_at(log, stamps_ns, names)
+    return rows, dict(Counter(source for source in sources if source))
+
+
+def rows_and_sources_at(
+    log: FlightLog, stamps_ns: Sequence[int], names: Sequence[str]
+) -> tuple[list[TelemetryRow], list[str]]:
+    """As :func:`telemetry_at`, with the source of each row's height; empty where it is unknown."""
     times_ns = np.asarray(stamps_ns, np.int64) + log.clock_shift_ns(int(stamps_ns[0]))
     start_ns, end_ns = log.span_ns
     if not ((times_ns >= start_ns - END_HOLD_NS) & (times_ns <= end_ns + END_HOLD_NS)).any():
@@ -224,7 +232,7 @@ def telemetry_at(
         TelemetryRow(timestamp_ns=int(stamp_ns), frame=name, **row)
         for stamp_ns, name, row in zip(stamps_ns, names, values, strict=True)
     ]
-    return rows, dict(Counter(source for source in sources if source))
+    return rows, sources
 
 
 def _column(log: FlightLog, name: str, times_ns: Stamps) -> Floats:

@@ -153,8 +153,9 @@ def summarise(
 
     Returns:
         ``frames``, ``fixes``, ``availability``, ``status``, ``reasons``, ``method``, ``methods``,
-        ``latency_ms`` and ``deadlines_missed``; with truth also ``frames_without_truth``, ``scored_fixes``,
-        ``rms_m``, ``median_m``, ``r95_m``, ``max_m``, ``wrong_over_10m``, ``false_fixes``,
+        ``latency_ms``, ``deadlines_missed``, ``stated_sigma_median_m`` and ``stated_sigma_p95_m`` (over the fixes,
+        of the larger sigma that each states of itself); with truth also ``frames_without_truth``,
+        ``scored_fixes``, ``rms_m``, ``median_m``, ``r95_m``, ``max_m``, ``wrong_over_10m``, ``false_fixes``,
         ``within_1_sigma``, ``within_2_sigma`` and ``within_3_sigma`` (shares of the fixes, 0.393, 0.865 and 0.989
         where the covariance is consistent), ``beyond_3_sigma``, ``nees_mean``, ``height_rms_m`` and
         ``height_bias_m``.
@@ -171,6 +172,7 @@ def summarise(
         "methods": _counts(methods.elements()),
         "latency_ms": _latency([row.latency_ms for row in rows if row.latency_ms is not None]),
         "deadlines_missed": sum(row.deadline_met is False for row in rows),
+        **_stated(rows),
     }
     if truth:
         frame = frame or LocalFrame(truth[0].lat_deg, truth[0].lon_deg)
@@ -182,6 +184,16 @@ def summarise(
 def _counts(values: Any) -> dict[str, int]:
     """Number of occurrences of each value, most frequent first, ties by name."""
     return dict(sorted(Counter(values).items(), key=lambda item: (-item[1], item[0])))
+
+
+def _stated(rows: Sequence[TrackRow]) -> dict[str, float | None]:
+    sigmas_m = [
+        max(row.sigma_east_m, row.sigma_north_m)
+        for row in rows
+        if row.sigma_east_m is not None and row.sigma_north_m is not None
+    ]
+    median_m, p95_m = map(float, np.percentile(sigmas_m, [50, 95])) if sigmas_m else (None, None)
+    return {"stated_sigma_median_m": median_m, "stated_sigma_p95_m": p95_m}
 
 
 def _latency(values: list[float]) -> dict[str, float | None]:

@@ -20,7 +20,8 @@ from engine.values import Reason
 
 _FACTS = {
     "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
-    "frames": "frames", "image_topic": "image topic", "telemetry": "telemetry", "frame_stamps": "frame stamps",
+    "frames": "frames", "every": "one frame in", "image_topic": "image topic", "telemetry": "telemetry",
+    "odometry_topic": "velocity from", "frame_stamps": "frame stamps",
     "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
     "device": "device", "start": "start", "budget_ms": "budget (ms)",
 }  # fmt: skip
@@ -54,7 +55,15 @@ def draw_tiles(track: FinishedTrack) -> list[tuple[str, str]]:
                 ("NEES: 2 is consistent, less cautious, more overconfident", f"{summary['nees_mean']:.2f}"),
             ]
     elif (sigma_m := median_sigma_m(track.rows)) is not None:
-        tiles.append(("median of the stated sigmas", metres(sigma_m)))
+        tiles.append(("stated by the fixes, not measured: median sigma", metres(sigma_m)))
+        if (p95_m := summary.get("stated_sigma_p95_m")) is not None:
+            tiles.append(("stated, not measured: 95 % of the sigmas below", metres(p95_m)))
+        if (motion := summary.get("motion_consistency")) is not None:
+            every = f"{motion['steps']} steps of {motion['interval_s']:.2g} s"
+            tiles += [
+                (f"off the telemetry's velocity from fix to fix, median of {every}", metres(motion["median_m"])),
+                ("95 % of these steps below; an offset that stays does not show", metres(motion["p95_m"])),
+            ]
     if summary.get("height_rms_m") is not None:
         tiles.append(("RMS error of height", metres(summary["height_rms_m"])))
     for name, key in (("latency, median", "p50"), ("latency, 95 % below", "p95")):

@@ -114,6 +114,16 @@ def check_above(name: str, value: float | None, low: float, most: float) -> None
         raise OptionError(f"{name}: expected a number above {low:g} and at most {most:g}, got {value:g}")
 
 
+def check_every(every: int) -> None:
+    """Refuse a share of the frames that is none.
+
+    Raises:
+        OptionError: one frame in less than one is asked for, or in a fraction.
+    """
+    if not (isinstance(every, int) and every >= 1):
+        raise OptionError(f"every: expected a whole number of 1 or more, got {every}")
+
+
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Refuse a word that is not one of the choices.
 

@@ -12,7 +12,7 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.formats.flight import open_flight
 from engine.formats.frames import VIDEO_SUFFIXES
-from engine.runs.arguments import check_unused
+from engine.runs.arguments import check_every, check_unused
 from engine.runs.cameras import CameraFiles
 from engine.runs.folders import StrPath
 from engine.runs.progress import SILENT, Progress
@@ -26,13 +26,14 @@ class BridgeFiles:
 
     Attributes:
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration; None takes that of the pictures that are played, or ``hfov_deg``.
-        hfov_deg: horizontal field of view of the pictures that are played, in place of a calibration.
+        camera: calibration; None takes ``hfov_deg``, or that of the pictures that are played.
+        hfov_deg: horizontal field of view, in place of a calibration; of a camera with the size of its pictures.
         surface: surface model, a GeoTIFF of heights.
         frames: pictures that are played at their own pace, a folder or a video.
         telemetry: telemetry.csv or a log, whose stamps set that pace; None takes a video's own times.
         camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: pace of pictures without stamps; None is 10.
+        every: one of the pictures that are played in so many is used, at its own time.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
@@ -53,6 +54,7 @@ class BridgeFiles:
     telemetry: StrPath | None = None
     camera_source: str | None = None
     rate_hz: float | None = None
+    every: int = 1
     exposure_to_grab_ms: float | None = None
     map_sigma_m: float | None = None
     map_bounds: str | None = None
@@ -66,10 +68,12 @@ class BridgeFiles:
         if (self.frames is None) == (self.camera_source is None):
             raise OptionError("frames: expected either `frames` or `camera_source`")
         if self.frames is None:
-            check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz}, "frames")
+            every = None if self.every == 1 else self.every
+            check_unused({"telemetry": self.telemetry, "rate_hz": self.rate_hz, "every": every}, "frames")
             self._check_live_camera()
         else:
             check_unused({"exposure_to_grab_ms": self.exposure_to_grab_ms}, "camera_source")
+        check_every(self.every)
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
             raise OptionError(f"rate_hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
         if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MAX_GRAB_MS:
@@ -78,8 +82,10 @@ class BridgeFiles:
             )
 
     def _check_live_camera(self) -> None:
-        if self.camera is None:
-            raise OptionError("camera: expected a calibration of the camera that `camera_source` opens")
+        if self.camera is None and self.hfov_deg is None:
+            raise OptionError(
+                "camera: expected a calibration of the camera that `camera_source` opens, or `hfov_deg`"
+            )
         source = Path(self.camera_source or "")
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():  # it would be read as fast as it can
             raise OptionError(f"camera_source: expected a camera, got the video {source}; `frames` plays it")
@@ -92,7 +98,9 @@ class BridgeFiles:
         )  # fmt: skip
 
     def load_camera(self, progress: Progress = SILENT) -> Camera:
-        """The calibration, else what is said of the pictures that are played, or by them."""
+        """The calibration, else what is said of the pictures or by them, for which a camera is opened once."""
+        if self.camera_source is not None:
+            return self.camera_files().load_live(self.camera_source, progress=progress)
         if self.camera is not None or self.frames is None:
             return self.camera_files().load(None)
         flight = open_flight(self.frames, self.telemetry)
@@ -105,6 +113,7 @@ class BridgeFiles:
         """
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)
-            return replay(Path(self.frames), telemetry, rate_hz=self.rate_hz or 10.0, wait=wait)
+            rate_hz = self.rate_hz or 10.0
+            return replay(Path(self.frames), telemetry, rate_hz=rate_hz, every=self.every, wait=wait)
         assert self.camera_source is not None  # one of the two is given
         return capture(self.camera_source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)

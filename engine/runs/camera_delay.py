@@ -13,7 +13,7 @@ import numpy as np
 
 from engine.adapters.links import parse_connection
 from engine.adapters.pictures import CapturedImage, capture
-from engine.errors import BackendError, TelemetryError, require
+from engine.errors import BackendError, OptionError, TelemetryError, require
 from engine.lag import Lag, camera_lag, turn_between
 from engine.runs.cameras import CameraFiles
 from engine.runs.folders import StrPath
@@ -36,9 +36,10 @@ class _Idle:
 
 def measure_camera_delay(
     connect: str,
-    camera: StrPath,
+    camera: StrPath | None,
     camera_source: str,
     *,
+    hfov_deg: float | None = None,
     seconds: float = 20.0,
     mount: str | None = None,
     firmware: str = "ardupilot",
@@ -51,8 +52,9 @@ def measure_camera_delay(
 
     Args:
         connect: the autopilot, as of the bridge.
-        camera: calibration.
+        camera: calibration; None is by ``hfov_deg``.
         camera_source: as of the bridge.
+        hfov_deg: horizontal field of view, in place of a calibration.
         seconds: how long pictures are taken.
         mount: how the camera is mounted, by name; None is the calibration's.
         firmware: of the autopilot, "ardupilot" or "px4".
@@ -62,6 +64,7 @@ def measure_camera_delay(
         progress: is shown what to do.
 
     Raises:
+        OptionError: neither or both of calibration and field of view are given.
         BackendError: the link cannot be opened.
         TelemetryError: the camera does not open, or what it shows does not agree with the attitude.
     """
@@ -69,7 +72,11 @@ def measure_camera_delay(
     from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions
     from engine.adapters.packets import read_key
 
-    model = CameraFiles(calibration=Path(camera), mount=mount).load(None)
+    if camera is None and hfov_deg is None:
+        raise OptionError("camera: expected a calibration, or `hfov_deg`")
+    calibration = None if camera is None else Path(camera)
+    described = CameraFiles(calibration=calibration, hfov_deg=hfov_deg, mount=mount)
+    model = described.load_live(camera_source, progress=progress)
     options, secret = MavlinkOptions(firmware=firmware), None if key is None else read_key(Path(key))
     connection = parse_connection(connect, listen_anywhere=listen_anywhere)
     try:

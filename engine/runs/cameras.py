@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from engine.adapters.pictures import first_picture
 from engine.camera import Camera, mount_rotation
 from engine.errors import CalibrationError, OptionError
 from engine.formats.frames import FrameSource, PictureFolder
@@ -80,8 +81,7 @@ class CameraFiles:
             TelemetryError: a picture cannot be read.
         """
         if self.hfov_deg is not None and frames is not None:
-            height_px, width_px = frames.read(frames.names[0]).shape[:2]
-            return self.mounted(Camera.from_fov(width_px, height_px, self.hfov_deg))
+            return self.with_field_of_view(frames.read(frames.names[0]).shape)
         if self.calibration is not None:
             camera = self._calibrated(self.calibration)
             if self.scale_calibration and frames is not None:
@@ -96,6 +96,31 @@ class CameraFiles:
         wide_deg = math.degrees(2.0 * math.atan(found.camera.width_px / (2.0 * found.camera.matrix[0, 0])))
         progress.message(f"camera, by {found.source} of the photographs: {wide_deg:.1f} degrees wide")
         return self.mounted(found.camera)
+
+    def with_field_of_view(self, shape: tuple[int, ...]) -> Camera:
+        """The camera by ``hfov_deg`` and the shape (H, W, ...) of a picture."""
+        assert self.hfov_deg is not None  # or nobody asks
+        height_px, width_px = shape[:2]
+        return self.mounted(Camera.from_fov(width_px, height_px, self.hfov_deg))
+
+    def load_live(self, camera_source: str, *, progress: Progress = SILENT) -> Camera:
+        """A camera whose pictures are still to come.
+
+        Args:
+            camera_source: as of :func:`engine.adapters.pictures.capture`; by ``hfov_deg`` it is opened until its
+                first picture says its size, and closed again.
+            progress: is told what is waited for, and what the camera then is.
+
+        Raises:
+            CalibrationError: the calibration cannot be read, or there is none.
+            TelemetryError: the camera does not open, or gives no picture.
+        """
+        if self.hfov_deg is None:
+            return self.load(None)
+        progress.message(f"waiting for a picture of {camera_source}, whose size is not known")
+        camera = self.with_field_of_view(first_picture(camera_source).shape)
+        progress.message(f"camera: {camera.width_px} x {camera.height_px}, {self.hfov_deg:g} degrees wide")
+        return camera
 
     def _calibrated(self, path: Path) -> Camera:
         return read_bag_camera(path, self.image_topic) if is_bag(path) else Camera.load(path)

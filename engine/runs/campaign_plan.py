@@ -46,6 +46,8 @@ class RecordedFlight:
         frame_stamps: with a log, a CSV with timestamp_ns and frame; without it the frames' own stamps.
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
+        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
+        every: one frame in so many is used.
         truth: truth.csv or a log.
         map_sigma_m: georeferencing accuracy of the map per axis; none is what the map states.
         map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
@@ -67,6 +69,8 @@ class RecordedFlight:
     frame_stamps: str | None = None
     log_offset_s: float = 0.0
     image_topic: str | None = None
+    odometry_topic: str | None = None
+    every: int = 1
     truth: str | None = "truth.csv"
     map_sigma_m: float | None = None
     map_bounds: str | None = None
@@ -113,6 +117,8 @@ class RecordedFlight:
                 frame_stamps=optional("frame_stamps"),
                 log_offset_s=self.log_offset_s,
                 image_topic=self.image_topic,
+                odometry_topic=self.odometry_topic,
+                every=self.every,
                 map_sigma_m=self.map_sigma_m,
                 map_bounds=self.map_bounds,
                 map_crs=self.map_crs,
@@ -286,14 +292,18 @@ def _input_hashes(files: FlightFiles) -> dict[str, str]:
     paths = {name: getattr(files, name) for name in (*FOLDER_LAYOUT, "frame_stamps")}
     hashes = {name: _content_hash(path) for name, path in paths.items() if path is not None}
     values = {name: getattr(files, name) for name in _VALUES}
-    values["log_offset_s"], values["scale_calibration"] = (
-        files.log_offset_s or None,
-        files.scale_calibration or None,
-    )
+    values |= {
+        "log_offset_s": files.log_offset_s or None,
+        "scale_calibration": files.scale_calibration or None,
+        "every": files.every if files.every > 1 else None,
+    }
     return hashes | {name: repr(value) for name, value in values.items() if value is not None}
 
 
-_VALUES = ("image_topic", "map_sigma_m", "map_bounds", "map_crs", "hfov_deg", "mount", "camera_pitch_deg")
+_VALUES = (
+    "image_topic", "odometry_topic", "map_sigma_m", "map_bounds", "map_crs", "hfov_deg", "mount",
+    "camera_pitch_deg",
+)  # fmt: skip
 
 
 @cache

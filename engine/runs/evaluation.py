@@ -123,6 +123,8 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         frame_stamps=record.frame_stamps,
         log_offset_s=record.log_offset_s or 0.0,
         image_topic=record.image_topic,
+        odometry_topic=record.odometry_topic,
+        every=record.every or 1,
         hfov_deg=record.hfov_deg,
         mount=record.mount,
         camera_pitch_deg=record.camera_pitch_deg,

@@ -15,7 +15,7 @@ from engine.formats.frames import VIDEO_SUFFIXES
 from engine.formats.logs.readers import LogClock, is_log, is_photographs, open_truth
 from engine.formats.ros.bags import is_bag
 from engine.orthomap import OrthoMap
-from engine.runs.arguments import is_in_degrees, parse_bounds, parse_position
+from engine.runs.arguments import check_every, is_in_degrees, parse_bounds, parse_position
 from engine.runs.cameras import CameraFiles
 from engine.runs.checks import (
     check_gimbal,
@@ -58,6 +58,8 @@ class FlightFiles:
         frame_stamps: with a log, a CSV with timestamp_ns and frame.
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
+        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
+        every: one frame in so many is used, from the first on.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of the outer edges of a picture, in degrees or in ``map_crs``; None is the
             file's own.
@@ -81,6 +83,8 @@ class FlightFiles:
     frame_stamps: Path | None
     log_offset_s: float
     image_topic: str | None
+    odometry_topic: str | None
+    every: int
     map_sigma_m: float | None
     map_bounds: str | None
     map_crs: str | None
@@ -102,6 +106,8 @@ class FlightFiles:
         frame_stamps: StrPath | None = None,
         log_offset_s: float = 0.0,
         image_topic: str | None = None,
+        odometry_topic: str | None = None,
+        every: int = 1,
         map_sigma_m: float | None = None,
         map_bounds: str | None = None,
         map_crs: str | None = None,
@@ -124,15 +130,18 @@ class FlightFiles:
             raise OptionError(f"frame_stamps, log_offset_s: expected a log as telemetry, got {telemetry}")
         if image_topic is not None and not is_bag(frames):
             raise OptionError(f"image_topic: expected a bag as frames, got {frames}")
+        if odometry_topic is not None and not is_bag(telemetry or frames):
+            raise OptionError(f"odometry_topic: expected a bag as telemetry, got {telemetry or frames}")
+        check_every(every)
         paths = {
             "map": map, "frames": frames, "camera": camera, "surface": surface,
             "telemetry": telemetry, "truth": truth, "frame_stamps": frame_stamps,
         }  # fmt: skip
         for name, path in paths.items():
             object.__setattr__(self, name, None if path is None else Path(path))
-        object.__setattr__(self, "log_offset_s", log_offset_s)
-        object.__setattr__(self, "image_topic", image_topic)
         values = {
+            "log_offset_s": log_offset_s, "image_topic": image_topic, "odometry_topic": odometry_topic,
+            "every": every,
             "map_sigma_m": map_sigma_m, "map_bounds": map_bounds, "map_crs": map_crs, "hfov_deg": hfov_deg,
             "mount": mount, "camera_pitch_deg": camera_pitch_deg, "scale_calibration": scale_calibration,
             "corrections": corrections or Corrections(),
@@ -194,11 +203,12 @@ class FlightFiles:
         if columns and (self.telemetry is None or is_log(self.telemetry)):
             raise OptionError(f"telemetry_columns: expected a table as telemetry, got {self.telemetry}")
         flight = open_flight(
-            self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic, columns=columns
-        )
-        if self.corrections.changes_nothing:
-            return flight
-        return replace(flight, rows=self.corrections.applied(flight.rows))
+            self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic, columns=columns,
+            odometry_topic=self.odometry_topic,
+        )  # fmt: skip
+        if not self.corrections.changes_nothing:  # before frames are left out: they interpolate between rows
+            flight = replace(flight, rows=self.corrections.applied(flight.rows))
+        return flight.every(self.every)
 
     def find_truth(self) -> Path | None:
         """The truth that was named, else ``truth.csv`` beside the telemetry where there is one."""
@@ -246,6 +256,8 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
             check_position(str(files.telemetry or files.frames), first, site, TelemetryError)
             check_start(first, site)
     check_pictures(flight, camera, progress)
+    if files.every > 1:
+        progress.message(f"one frame in {files.every} is used, {len(flight)} of all")
     if flight.unused:
         progress.message(f"frames without a row in the telemetry, left out: {flight.unused}")
     for remark in flight.remarks:

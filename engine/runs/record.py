@@ -14,8 +14,8 @@ from engine.formats.corrections import Corrections
 
 _TEXTS = ("map", "method", "profile")
 _TEXTS_OR_NONE = (
-    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "device", "start",
-    "map_bounds", "map_crs", "mount", "surface_datum",
+    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "odometry_topic",
+    "device", "start", "map_bounds", "map_crs", "mount", "surface_datum",
 )  # fmt: skip
 _NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")
 
@@ -34,6 +34,8 @@ class RunRecord:
         frame_stamps: when the frames were taken, where the telemetry is a log.
         log_offset_s: added to the frames' own stamps, in the same case.
         image_topic: of the pictures, where the frames are a bag.
+        odometry_topic: that the velocity was taken from, where the telemetry is a bag.
+        every: one frame in so many was used; None is all.
         map_sigma_m: georeferencing accuracy of the map, where it was given, as are the next five.
         map_bounds: of a picture, as typed.
         map_crs: of a map that names none.
@@ -70,6 +72,8 @@ class RunRecord:
     frame_stamps: str | None = None
     log_offset_s: float | None = None
     image_topic: str | None = None
+    odometry_topic: str | None = None
+    every: int | None = None
     map_sigma_m: float | None = None
     map_bounds: str | None = None
     map_crs: str | None = None
@@ -98,6 +102,7 @@ class RunRecord:
         self._check(_TEXTS_OR_NONE, "a text or null", lambda value: value is None or _is_text(value))
         self._check(("ground_m",), "a number", _is_number)
         self._check(_NUMBERS_OR_NONE, "a number or null", lambda value: value is None or _is_number(value))
+        self._check(("every",), "a whole number above 0, or null", _is_count_or_none)
         self._check(("origin",), "lat_deg and lon_deg on the Earth", _is_place)
         self._check(("heights",), "counts by source", lambda value: _is_table(value, int))
         self._check(("changed",), "settings by name", lambda value: _is_table(value, object))
@@ -156,6 +161,10 @@ def _is_text(value: object) -> bool:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_count_or_none(value: object) -> bool:
+    return value is None or (isinstance(value, int) and not isinstance(value, bool) and value >= 1)
 
 
 def _is_place(value: object) -> bool:

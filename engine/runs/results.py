@@ -13,6 +13,7 @@ from engine.formats.notes import read_notes
 from engine.formats.track import TrackRow
 from engine.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
+from engine.report.consistency import motion_consistency
 from engine.report.explain import choose_frames, explain_frames
 from engine.report.figures import draw_figures
 from engine.report.finished_track import FinishedTrack
@@ -60,7 +61,9 @@ def write_results(
     """
     summary = summarise(rows, truth, frame=site.frame, ground=ground)
     segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
-    summary |= segments | {"settings": record.facts()}
+    telemetry = None if frames.flight is None else frames.flight.rows
+    motion = {"motion_consistency": motion_consistency(rows, telemetry, site.frame)}
+    summary |= segments | motion | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         progress.message(f"no fix is scored: {record.truth} says nothing of the times of this flight")
     (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

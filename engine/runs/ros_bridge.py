@@ -10,7 +10,7 @@ from engine.adapters.ros_out import RosOptions
 from engine.adapters.vehicle import NedOrigin
 from engine.camera import Camera
 from engine.errors import BackendError, OptionError
-from engine.formats.ros.messages import camera_from_message
+from engine.formats.ros.messages import camera_from_message, image_from_message
 from engine.matcher import SceneMatcher
 from engine.realtime import set_realtime
 from engine.runs.arguments import parse_position
@@ -34,7 +34,8 @@ class RosSettings:
         version: 1 for rospy, 2 for rclpy.
         map: GeoTIFF, a picture with a world file, or a folder of tiles.
         surface: surface model, a GeoTIFF of heights.
-        camera: calibration; None takes the topic's, of a nadir camera.
+        camera: calibration; None takes ``hfov_deg``, else the topic's, of a nadir camera.
+        hfov_deg: horizontal field of view, in place of a calibration; with the size of the first picture.
         topics: that are heard.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
@@ -52,6 +53,7 @@ class RosSettings:
     map: StrPath
     surface: StrPath | None = None
     camera: StrPath | None = None
+    hfov_deg: float | None = None
     topics: RosTopics = field(default_factory=RosTopics)
     map_sigma_m: float | None = None
     map_bounds: str | None = None
@@ -76,7 +78,10 @@ class RosSettings:
     def camera_files(self) -> CameraFiles:
         """What is said of the camera."""
         calibration = None if self.camera is None else Path(self.camera)
-        return CameraFiles(calibration=calibration, mount=self.mount, camera_pitch_deg=self.camera_pitch_deg)
+        return CameraFiles(
+            calibration=calibration, hfov_deg=self.hfov_deg, mount=self.mount,
+            camera_pitch_deg=self.camera_pitch_deg,
+        )  # fmt: skip
 
     def options(self) -> RosOptions:
         """What is published.
@@ -121,10 +126,9 @@ def run_ros_bridge(
     )
     check_position("start", start, site, OptionError)
     check_position("origin", parse_position("origin", ros.origin), site, OptionError)
-    described = ros.camera_files()
-    camera = None if ros.camera is None else described.load(None)
+    camera = None if ros.camera is None else ros.camera_files().load(None)
     node = node or _node(ros.version, ros.arguments)
-    camera = camera or described.mounted(_published_camera(node, ros.topics.camera_info, progress))
+    camera = camera or _heard_camera(node, ros, progress)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
     matcher.warmup()
 
@@ -156,6 +160,20 @@ def _node(version: int, arguments: tuple[str, ...]) -> RosNode:
 
         return ros2.Node("scenematch", arguments)
     raise OptionError(f"version: expected 1 or 2, got {version}")
+
+
+def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera:
+    """The camera by its field of view and a picture of it, else the calibration that is published."""
+    described, topics = ros.camera_files(), ros.topics
+    if ros.hfov_deg is None:
+        return described.mounted(_published_camera(node, topics.camera_info, progress))
+    progress.message(f"waiting for a picture on {topics.image}, whose size is not known")
+    message = node.wait_for(topics.image, topics.image_type, _CAMERA_INFO_TIMEOUT_S)
+    if message is None:
+        raise BackendError(
+            f"image_topic: expected a picture on {topics.image} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
+        )
+    return described.with_field_of_view(image_from_message(message).shape)
 
 
 def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:

@@ -135,6 +135,8 @@ def _record(
         frame_stamps=absolute(files.frame_stamps),
         log_offset_s=files.log_offset_s if files.has_clock else None,
         image_topic=files.image_topic,
+        odometry_topic=files.odometry_topic,
+        every=files.every if files.every > 1 else None,
         map_sigma_m=files.map_sigma_m,
         map_bounds=files.map_bounds,
         map_crs=files.map_crs,

@@ -875,6 +875,11 @@ def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
     first, second = (captured_ns for _, captured_ns in replay(tmp_path, None, rate_hz=50.0, wait=wait))
     assert [first >= told for told in told_ns] == [True]
     assert second - first == 20_000_000
+    for index in (2, 3):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((8, 8), index, np.uint8))
+    played = list(replay(tmp_path, None, rate_hz=50.0, every=2))  # one in two, each at its own time
+    assert [picture.max() for picture, _ in played] == [0, 2]
+    assert played[1][1] - played[0][1] == 40_000_000
 
 
 def test_a_flight_that_is_played_is_read_before_its_first_picture_is_asked_for(tmp_path):

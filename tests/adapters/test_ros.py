@@ -16,7 +16,8 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from engine.adapters.ros import OUTPUTS, RosBridge, RosTelemetry, RosTopics
+from engine.adapters.ros import OUTPUTS, RosBridge
+from engine.adapters.ros_in import RosTelemetry, RosTopics
 from engine.adapters.ros_out import FIRMWARES, RosOptions, diagnostics, pose, window_picture
 from engine.adapters.vehicle import NedOrigin, VehicleState
 from engine.camera import Camera
@@ -27,6 +28,7 @@ from engine.formats.ros.messages import (
     NO_POSITION,
     MessageFactory,
     attitude_from_message,
+    body_velocity_from_message,
     camera_from_message,
     image_from_message,
     position_from_message,
@@ -37,6 +39,7 @@ from engine.formats.ros.messages import (
 from engine.live import LiveOptions
 from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.support.ground import body_axes
+from tests.support.odometries import odometry_message
 from tests.support.towns import drawn_town
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
@@ -300,6 +303,62 @@ def test_a_time_that_goes_back_begins_again():
     heard.height(70.0, NOW_NS - 60_000_000_000)
     assert heard.vehicle(NOW_NS - 60_000_000_000).height_agl_m == 70.0
     assert heard.vehicle(NOW_NS).height_agl_m is None
+
+
+@pytest.mark.parametrize("child", ["base_link", "", "odom"])
+def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, child):
+    """Wherever the odometry has its own north, and along whichever of the two frames its twist is."""
+    rng = np.random.default_rng(5)
+    for roll_deg, pitch_deg, heading_deg in random_angles(20):
+        enu_mps, yaw_deg = rng.normal(0.0, 8.0, 3), rng.uniform(-180.0, 180.0)
+        angles = (roll_deg, pitch_deg, heading_deg)
+        message = wired(ros, odometry_message(maker, NOW_NS, angles, enu_mps, yaw_deg=yaw_deg, child=child))
+        heard = RosTelemetry()
+        heard.odometry(message, 0)
+        assert heard.vehicle(NOW_NS).east_velocity_mps is None  # towards nobody knows where
+        heard.imu(maker.imu(NOW_NS, "", *angles))
+        now = heard.vehicle(NOW_NS)
+        assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
+        assert now.velocity_sigma_mps is None  # zeros state nothing
+
+
+@pytest.mark.parametrize(
+    ("variances", "told_mps"),
+    [
+        ((0.04, 0.09, 0.01), math.hypot(0.3, math.radians(1.0) * 10.0)),  # the heading is off by a degree
+        ((1e-12, 1e-12, 1e-12), math.radians(1.0) * 10.0),
+        ((0.0, 0.0, 0.0), 0.0),
+        ((-1.0, 9.0, 9.0), 0.0),  # not stated, by its first element
+        ((math.nan, 0.04, 0.04), 0.0),
+        ((0.04, 30.0, 0.04), None),  # lost
+    ],
+)
+def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, told_mps):
+    message = odometry_message(maker, NOW_NS, (0.0, 0.0, 90.0), (10.0, 0.0, 0.0), variances=variances)
+    told = body_velocity_from_message(wired(ros, message))
+    if told_mps is None:
+        assert told is None
+    else:
+        assert told == pytest.approx((10.0, 0.0, 0.0, told_mps), abs=1e-9)
+        heard = RosTelemetry()
+        heard.odometry(message, 0)
+        heard.imu(maker.imu(NOW_NS, "", 0.0, 0.0, 90.0))
+        frame = heard.vehicle(NOW_NS).frame(np.zeros((4, 6), np.uint8), NOW_NS)
+        assert frame.velocity_sigma_mps == (pytest.approx(told_mps) if told_mps else None)
+
+
+def test_an_odometry_that_says_nothing(maker):
+    angles = (0.0, 0.0, 0.0)
+    for velocity in ((math.nan, 0.0, 0.0), (0.0, 1e4, 0.0)):
+        assert body_velocity_from_message(odometry_message(maker, NOW_NS, angles, velocity)) is None
+    message = odometry_message(maker, NOW_NS, angles, (1.0, 2.0, 3.0), child="odom")
+    message.pose.pose.orientation.w = 5.0  # no turn, which a twist along the pose's frame needs
+    assert body_velocity_from_message(message) is None
+    heard = RosTelemetry()
+    heard.imu(maker.imu(NOW_NS, "", *angles))
+    heard.odometry(odometry_message(maker, 0, angles, (1.0, 2.0, 3.0)), NOW_NS)  # without a stamp it is of now
+    assert heard.vehicle(NOW_NS).north_velocity_mps == pytest.approx(2.0)
+    assert heard.vehicle(NOW_NS + 600_000_000).north_velocity_mps is None
 
 
 # ---------------------------------------------------------------------------------------------------- poses
@@ -624,8 +683,11 @@ def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
         handlers[RosTopics().height][1](maker.float64(42.0))
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
+        instead = bridge.handlers(RosTopics(odometry="/vio/odometry"))
     assert "" not in kinds
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
+    assert instead["/vio/odometry"][0] == "nav_msgs/msg/Odometry"
+    assert RosTopics().velocity not in instead
     assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
 
@@ -780,6 +842,44 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
     assert rospy.subscribed[RosTopics().image] == {"queue_size": 1, "buff_size": 2**24}
     with pytest.raises(BackendError, match="expected a ROS master at http://here"):
         ros1.Node("again")
+
+
+def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp_path, monkeypatch):
+    """Of its field of view; nothing but the picture's topic is waited for."""
+    from engine.runs.ros_bridge import RosSettings, run_ros_bridge
+    from engine.runs.simulation import write_flight
+    from engine.sim import plan_flight
+
+    class Spun(StandIn):
+        asked, picture = [], an_image(maker, NOW_NS, (30, 40, 3))
+
+        def wait_for(self, topic, msgtype, timeout_s):
+            self.asked.append((topic, msgtype))
+            return self.picture
+
+        def spin(self, handlers, every_second, seconds):
+            pass
+
+    class LoadedError(Exception):
+        """Ends the run where the camera is known."""
+
+    def matcher(site, camera, *_):
+        raise LoadedError(camera)
+
+    monkeypatch.setattr("engine.runs.ros_bridge.SceneMatcher", matcher)
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+    settings = RosSettings(map=tmp_path / "map.tif", hfov_deg=90.0, topics=RosTopics(image="/down"))
+    node = Spun(maker)
+    with pytest.raises(LoadedError) as ended:
+        run_ros_bridge(settings, node=node)
+    (camera,) = ended.value.args
+    assert node.asked == [("/down", "sensor_msgs/msg/Image")]
+    assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (40, 30, pytest.approx(20.0))
+    Spun.picture = None
+    with pytest.raises(BackendError, match=r"image_topic: expected a picture on /down within 30 s, got none"):
+        run_ros_bridge(settings, node=node)
+    with pytest.raises(OptionError, match="hfov_deg: expected without `camera`"):
+        RosSettings(map="m.tif", hfov_deg=90.0, camera="c.yaml")
 
 
 def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):

@@ -45,6 +45,7 @@ def said(capsys, arguments, code=2):
             for command in (PLAYED, ROS)
             for value in ("x", "-1", "99999")
         ),
+        *((command, "--every", value) for command in (TRACK, PLAYED) for value in ("0", "-3")),
         (LOCATE, "--near", "48,16,1e200"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
@@ -68,6 +69,7 @@ def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, t
     [
         ([*LIVE, "--telemetry=t.csv"], "--telemetry", "--frames"),
         ([*LIVE, "--rate-hz=3"], "--rate-hz", "--frames"),
+        ([*LIVE, "--every=3"], "--every", "--frames"),
         ([*PLAYED, "--exposure-to-grab-ms=3"], "--exposure-to-grab-ms", "--camera-source"),
         ([*PLAYED, "--nice=-5"], "--nice", "--realtime"),
         ([*ROS, "--cores=0"], "--cores", "--realtime"),

@@ -26,6 +26,7 @@ from engine.formats.ros.bag_writer import BAG_KINDS, write_bag
 from engine.formats.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
 from engine.formats.ros.messages import MessageFactory
 from engine.values import Frame, Prior, Truth
+from tests.support.odometries import odometry_message
 from tests.support.towns import drawn_town
 
 STEP_NS = 100_000_000
@@ -206,6 +207,59 @@ def test_the_heading_with_a_stamp_precedes_the_one_without(tmp_path, maker):
     assert read_bag(written(tmp_path / "one.bag", one)).series["heading_deg"].values == pytest.approx(100.0)
     raw = {"/imu/data": imu, "/mavros/global_position/compass_hdg": compass}
     assert read_bag(written(tmp_path / "raw.bag", raw)).series["heading_deg"].values == pytest.approx(110.0)
+
+
+def a_bag_with_odometry(path, maker, *, variances=None, **left_out):
+    """A turn of 60 degrees a second by attitude and odometry, and by a velocity of another source."""
+    moments = [(k * STEP_NS, (10.0, -5.0, 20.0 + 6.0 * k), (0.5 * k, -3.0, 0.25)) for k in range(1, 12)]
+    topics = {
+        IMAGE: [(t, maker.image(t, "", np.zeros((4, 6), np.uint8))) for t, _, _ in moments[::5]],
+        "/imu/data": [(t, maker.imu(t, "", *angles)) for t, angles, _ in moments],
+        "/uav/velocity_local": [(t, maker.velocity(t, "map", 50.0, 50.0)) for t, _, _ in moments],
+        "/vio/odometry": [
+            (t + 7, odometry_message(maker, t, angles, enu_mps, yaw_deg=77.0, variances=variances))
+            for t, angles, enu_mps in moments
+        ],
+    }
+    return written(path, {name: each for name, each in topics.items() if name not in left_out.get("without", ())})
+
+
+def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, maker):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker, variances=(0.16, 0.04, 0.04))
+    for item in open_flight(path):
+        assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
+    flight = open_flight(path, odometry_topic="/vio/odometry")
+    for k, item in zip((1, 6, 11), flight, strict=True):
+        told = item.frame.east_velocity_mps, item.frame.north_velocity_mps
+        assert told == pytest.approx((0.5 * k, -3.0), abs=1e-9)
+        speed_mps = np.linalg.norm((0.5 * k, -3.0, 0.25))
+        assert item.frame.velocity_sigma_mps == pytest.approx(np.hypot(0.4, np.radians(1.0) * speed_mps))
+    unstated = a_bag_with_odometry(tmp_path / "zeros.bag", maker)
+    frames = [item.frame for item in open_flight(unstated, odometry_topic="/vio/odometry")]
+    assert [frame.velocity_sigma_mps for frame in frames] == [None] * 3
+    assert frames[1].east_velocity_mps == pytest.approx(3.0, abs=1e-9)
+
+
+def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker)
+    with pytest.raises(TelemetryError, match=r"expected nav_msgs/msg/Odometry on /odom, got /vio/odometry"):
+        read_bag(path, odometry_topic="/odom")
+    with pytest.raises(TelemetryError, match=r"expected nav_msgs/msg/Odometry on /imu/data, got /vio/odometry"):
+        read_bag(path, odometry_topic="/imu/data")
+    path = a_bag_with_odometry(tmp_path / "blind.bag", maker, without=("/imu/data",))
+    with pytest.raises(TelemetryError, match="expected a heading at the times of /vio/odometry, got none"):
+        read_bag(path, odometry_topic="/vio/odometry")
+    path = a_bag_with_odometry(tmp_path / "lost.bag", maker, variances=(100.0,) * 3)
+    with pytest.raises(TelemetryError, match="expected a velocity that can be used on /vio/odometry, got none"):
+        read_bag(path, odometry_topic="/vio/odometry")
+
+
+def test_an_odometrys_topic_needs_a_bag(tmp_path, capsys):
+    for command in ("track", "check", "compare"):
+        given = ["--map", "m.tif", "--frames", "f", "--telemetry", "t.csv", "--odometry-topic", "/vio"]
+        out = [] if command == "check" else ["--out", str(tmp_path / "out")]
+        assert main([command, *given, *out]) == 2
+        assert "--odometry-topic: expected a bag as telemetry, got t.csv" in capsys.readouterr().err
 
 
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):

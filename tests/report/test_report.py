@@ -68,6 +68,8 @@ def test_counts_without_truth():
         "methods": {"ncc": 2, "sift": 1},
         "latency_ms": {"p50": 25.0, "p95": pytest.approx(123.5), "p99": pytest.approx(136.7), "max": 140.0},
         "deadlines_missed": 2,
+        "stated_sigma_median_m": 1.0,
+        "stated_sigma_p95_m": 1.0,
     }
 
 

@@ -1,5 +1,7 @@
 """Inputs of a run that no file was written for: pictures with corners, lenses by their field of view, mounts."""
 
+import shlex
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -9,7 +11,8 @@ from PIL import Image
 
 from engine.camera import Camera, mount_rotation
 from engine.cli.app import run
-from engine.errors import CalibrationError, MapError, OptionError
+from engine.errors import CalibrationError, MapError, OptionError, TelemetryError
+from engine.formats.corrections import Corrections
 from engine.formats.flight import camera_info
 from engine.formats.geotiff import write_geotiff
 from engine.runs import BridgeFiles, FlightFiles
@@ -173,8 +176,9 @@ def test_pictures_without_exif_need_a_camera(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "camera: expected a calibration of the camera that `camera_source` opens"),
-        ({"hfov_deg": 64.0}, "camera: expected a calibration of the camera that `camera_source` opens"),
+        ({}, "camera: expected a calibration of the camera that `camera_source` opens, or `hfov_deg`"),
+        ({"hfov_deg": 64.0}, r"camera_source: expected a camera, got the video .*\.mp4; `frames` plays it"),
+        ({"hfov_deg": 64.0, "camera": "c.yaml"}, "hfov_deg: expected without `camera`"),
         ({"camera": "c.yaml"}, r"camera_source: expected a camera, got the video .*\.mp4; `frames` plays it"),
     ],
 )
@@ -183,6 +187,34 @@ def test_a_bridge_refuses_a_camera_without_a_calibration_and_a_video_as_one(tmp_
     video.touch()
     with pytest.raises(OptionError, match=words):
         BridgeFiles(map="m.tif", camera_source=str(video), **options)
+
+
+def test_a_live_camera_by_its_field_of_view_has_the_size_of_its_first_picture(tmp_path):
+    picture, messages = tmp_path / "1.jpg", []
+    Image.fromarray(noise()).save(picture)
+    source = f"exec:{shlex.join(['cat', str(picture)])}"
+    files = BridgeFiles(map="m.tif", camera_source=source, hfov_deg=90.0, mount="nadir-tail")
+    camera = files.load_camera(SimpleNamespace(message=messages.append))
+    assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (80, 60, pytest.approx(40.0))
+    assert np.array_equal(camera.mount, mount_rotation("nadir-tail"))
+    assert messages[-1] == "camera: 80 x 60, 90 degrees wide"
+    silent = BridgeFiles(map="m.tif", camera_source="exec:true", hfov_deg=90.0)
+    with pytest.raises(TelemetryError, match="camera_source: expected pictures, got none"):
+        silent.load_camera()
+
+
+def test_a_live_camera_that_gives_no_picture_is_not_waited_for_without_end(monkeypatch):
+    monkeypatch.setattr("engine.adapters.pictures._FIRST_PICTURE_S", 0.1)
+    files = BridgeFiles(map="m.tif", camera_source="exec:sleep 60", hfov_deg=90.0)
+    with pytest.raises(TelemetryError, match=r"camera_source: expected a picture within 0\.1 s, got none"):
+        files.load_camera()
+
+
+def test_the_delay_of_a_camera_needs_to_know_its_lens(capsys):
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    command = ["bridge", "camera-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
+    assert run(command) == 2
+    assert "--camera: expected a calibration, or --hfov-deg" in capsys.readouterr().err
 
 
 def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_path):
@@ -207,6 +239,36 @@ def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
     assert load(files).width_px == 64
 
 
+def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
+    """Of a video with a log: pictures, stamps, heights and corrections are those of the frames that are left."""
+    path = tmp_path / "DJI_0002.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    for k in range(8):
+        writer.write(np.full((48, 64, 3), 30 * k, np.uint8))
+    writer.release()
+    cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: {h}]\n\n"
+    cues = (cue.format(n=k + 1, ms=40 * k, h=80.0 + k * k) for k in range(8))
+    (tmp_path / "DJI_0002.SRT").write_text("".join(cues))
+    late = Corrections(offset_s=0.04)  # by one frame, which only all of the rows can say
+    named = {"map": "m.tif", "frames": path, "hfov_deg": 70.0}
+    whole, part = FlightFiles(**named), FlightFiles(**named, every=3, corrections=late)
+    assert len(whole.open_flight()) == 8
+    flight = part.open_flight()
+    assert (flight.names, flight.heights, flight.unused) == (["0", "3", "6"], {"take-off": 3}, 0)
+    assert [item.frame.timestamp_ns for item in flight] == [0, 120_000_000, 240_000_000]
+    assert [item.frame.height_agl_m for item in flight] == pytest.approx([80.0, 84.0, 105.0])
+    assert [item.frame.image.mean() for item in flight] == pytest.approx([0.0, 90.0, 180.0], abs=3.0)
+    unstamped = FlightFiles(map="m.tif", frames=path.rename(tmp_path / "bare.avi"), hfov_deg=70.0, every=3)
+    assert [item.name for item in unstamped.open_flight()] == ["0", "3", "6"]
+
+
+@pytest.mark.parametrize("every", [0, -2, 1.5])
+def test_one_frame_in_none_is_refused(every):
+    for files in (FlightFiles, BridgeFiles):
+        with pytest.raises(OptionError, match=f"every: expected a whole number of 1 or more, got {every}"):
+            files(map="m.tif", frames="f", every=every)
+
+
 def test_a_record_gives_the_same_files(photos):
     files = FlightFiles(map="/m.tif", frames=photos, hfov_deg=70.0, mount="nadir-left", camera_pitch_deg=-80.0)
     record = RunRecord(
@@ -215,6 +277,11 @@ def test_a_record_gives_the_same_files(photos):
         ground_m=0.0, ground_amsl_m=None,
     )  # fmt: skip
     assert _recorded_files(record) == files
+    some = replace(record, frames="/f.bag", camera="/f.bag", hfov_deg=None, odometry_topic="/vio", every=3)
+    files = FlightFiles(
+        map="/m.tif", frames="/f.bag", odometry_topic="/vio", every=3, mount="nadir-left", camera_pitch_deg=-80.0
+    )
+    assert _recorded_files(some) == files
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ NAMES = [each.name for each in fields(RunRecord) if each.name != "more"]
 WRONG = (5, True, [1], "x", {"a": None}, float("nan"))
 FITTING = {
     "heights": {dict}, "changed": {dict}, "attitude": {dict}, "origin": set(), "ground_m": {int},
-    "corrections": set(), "diagnosis": set(), "scale_calibration": {bool},
+    "every": {int}, "corrections": set(), "diagnosis": set(), "scale_calibration": {bool},
     **{
         name: {int}
         for name in ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")

@@ -13,6 +13,7 @@ from engine import OptionError
 from engine.errors import BackendError, MissingExtraError, require
 from engine.features import sift
 from engine.formats.ros.bags import import_rosbags
+from engine.formats.track import read_track
 from engine.runs import (
     BridgeFiles,
     BridgeSettings,
@@ -23,6 +24,7 @@ from engine.runs import (
     TrackSettings,
     WorldSettings,
     compare,
+    evaluate,
     export_track,
     run_demo,
     run_mavlink_bridge,
@@ -31,6 +33,7 @@ from engine.runs import (
     write_parameter_file,
 )
 from engine.runs.executors import on_ray
+from engine.runs.inputs import FOLDER_LAYOUT
 
 FRAMES = 3
 
@@ -67,6 +70,19 @@ def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_p
     assert summary["rms_m"] < 5.0
     assert {"track.csv", "summary.json", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
     assert capfd.readouterr() == ("", "")
+
+
+def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
+    progress, names = Recorded(), ["000000.jpg", "000002.jpg"]
+    paths = {name: flight / file for name, file in FOLDER_LAYOUT.items()}
+    files = FlightFiles(**paths, every=2)
+    track(files, tmp_path / "out", progress=progress)
+    assert [row.frame for row in read_track(tmp_path / "out" / "track.csv")] == names
+    assert progress.messages == ["one frame in 2 is used, 2 of all"]
+    page = (tmp_path / "out" / "report.html").read_bytes()
+    summary = evaluate(tmp_path / "out")
+    assert (summary["settings"]["every"], summary["frames_without_truth"]) == (2, 0)
+    assert (tmp_path / "out" / "report.html").read_bytes() == page  # with the pictures of the same frames
 
 
 def test_progress_is_shown_what_a_run_does(flight, tmp_path):

@@ -11,11 +11,11 @@ import typer
 from engine.cli import console
 from engine.cli.options import (
     BridgeDeadlineOption,
-    CameraOption,
     CameraPitchOption,
     CoresOption,
     DeadlineOption,
     DeviceOption,
+    EveryOption,
     FirmwareOption,
     HfovOption,
     JsonOption,
@@ -77,6 +77,7 @@ def mavlink(
         float | None,
         typer.Option("--rate-hz", metavar="HZ", help="The pace of pictures without stamps; 10 unless given."),
     ] = None,
+    every: EveryOption = 1,
     camera_source: Annotated[
         str | None,
         typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
@@ -142,7 +143,7 @@ def mavlink(
     use_threads(threads)
     files = BridgeFiles(
         map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry,
-        camera_source=camera_source, rate_hz=rate_hz, exposure_to_grab_ms=exposure_to_grab_ms,
+        camera_source=camera_source, rate_hz=rate_hz, every=every, exposure_to_grab_ms=exposure_to_grab_ms,
         map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
         camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
     )  # fmt: skip
@@ -172,11 +173,12 @@ def camera_delay(
         str,
         typer.Option("--connect", metavar="LINK", help="The autopilot, as of bridge mavlink."),
     ],
-    camera: CameraOption,
     camera_source: Annotated[
         str,
         typer.Option("--camera-source", metavar="N|URL|exec:CMD", help="A camera, or a command for JPEGs."),
     ],
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
     seconds: Annotated[
         float, typer.Option("--seconds", min=5.0, metavar="S", help="How long pictures are taken.")
     ] = 20.0,
@@ -195,13 +197,14 @@ def camera_delay(
     from engine.runs.camera_delay import measure_camera_delay
 
     found = measure_camera_delay(
-        connect, camera, camera_source, seconds=seconds, mount=mount, firmware=firmware, system_id=system_id,
-        key=key, listen_anywhere=listen_anywhere, progress=console.PROGRESS,
+        connect, camera, camera_source, hfov_deg=hfov_deg, seconds=seconds, mount=mount,
+        firmware=firmware, system_id=system_id, key=key, listen_anywhere=listen_anywhere,
+        progress=console.PROGRESS,
     )  # fmt: skip
     values = {"exposure_to_grab_ms": round(1e3 * found.delay_s), "correlation": found.correlation}
     console.facts(values, as_json, title=f"camera {camera_source}")
     late = console.options(
-        connect=connect, camera=camera, camera_source=camera_source,
+        connect=connect, camera=camera, hfov_deg=hfov_deg, camera_source=camera_source,
         exposure_to_grab_ms=values["exposure_to_grab_ms"],
     )  # fmt: skip
     console.next_step(f"bridge mavlink --map MAP {late}", as_json=as_json)
@@ -269,6 +272,7 @@ def ros(
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it the topic's, of a nadir camera."),
     ] = None,
+    hfov_deg: HfovOption = None,
     mount: MountOption = None,
     camera_pitch_deg: CameraPitchOption = None,
     image: Annotated[
@@ -292,6 +296,9 @@ def ros(
     velocity: Annotated[
         str, typer.Option("--velocity-topic", metavar="NAME", help="geometry_msgs/TwistStamped, east and north.")
     ] = "/mavros/local_position/velocity_local",
+    odometry_topic: Annotated[
+        str, typer.Option("--odometry-topic", metavar="NAME", help="nav_msgs/Odometry; outranks the velocity.")
+    ] = "",
     firmware: Annotated[
         str,
         typer.Option("--firmware", metavar="none|ardupilot|px4", help="For whom the poses are, behind MAVROS."),
@@ -328,16 +335,16 @@ def ros(
     use_threads(threads)
     topics = RosTopics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
-        velocity=velocity,
+        velocity=velocity, odometry=odometry_topic,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
         seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     ros_settings = RosSettings(
-        map=map_path, surface=surface, camera=camera, topics=topics, map_sigma_m=map_sigma_m, version=version,
-        firmware=firmware, origin=origin, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
-        camera_pitch_deg=camera_pitch_deg, arguments=tuple(ros_arguments or ()),
+        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, topics=topics,
+        map_sigma_m=map_sigma_m, version=version, firmware=firmware, origin=origin, map_bounds=map_bounds,
+        map_crs=map_crs, mount=mount, camera_pitch_deg=camera_pitch_deg, arguments=tuple(ros_arguments or ()),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)

@@ -26,6 +26,7 @@ from engine.cli.options import (
     MapOption,
     MapSigmaOption,
     MountOption,
+    OdometryTopicOption,
     OptionalCameraOption,
     ScaleCalibrationOption,
     SettingsOption,
@@ -48,6 +49,7 @@ def check(
     scale_calibration: ScaleCalibrationOption = False,
     telemetry: Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help="As of track.")] = None,
     image_topic: ImageTopicOption = None,
+    odometry_topic: OdometryTopicOption = None,
     frame_stamps: FrameStampsOption = None,
     log_offset_s: LogOffsetOption = 0.0,
     angles: AnglesOption = "degrees",
@@ -79,8 +81,9 @@ def check(
     use_threads(threads)
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
-        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
-        map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic,
+        odometry_topic=odometry_topic, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
+        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
         scale_calibration=scale_calibration,
         corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip

@@ -11,6 +11,7 @@ from engine.cli import console, tables
 from engine.cli.options import (
     BudgetOption,
     CameraPitchOption,
+    EveryOption,
     ForceOption,
     FramesOption,
     FrameStampsOption,
@@ -23,6 +24,7 @@ from engine.cli.options import (
     MapOption,
     MapSigmaOption,
     MountOption,
+    OdometryTopicOption,
     OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
@@ -47,7 +49,9 @@ def compare(
     telemetry: Annotated[
         Path | None, typer.Option("--telemetry", metavar="FILE", help="telemetry.csv, or a log; without it EXIF.")
     ] = None,
+    every: EveryOption = 1,
     image_topic: ImageTopicOption = None,
+    odometry_topic: OdometryTopicOption = None,
     frame_stamps: FrameStampsOption = None,
     log_offset_s: LogOffsetOption = 0.0,
     surface: SurfaceOption = None,
@@ -83,8 +87,9 @@ def compare(
     settings = parse_runs(runs or [], weights=weights or (), start=start, device=device, budget_ms=budget_ms)
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
-        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
-        map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic,
+        odometry_topic=odometry_topic, every=every, map_sigma_m=map_sigma_m, map_bounds=map_bounds,
+        map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
         scale_calibration=scale_calibration,
     )  # fmt: skip
     results = compare_runs(files, out, settings, force=force, progress=console.PROGRESS)

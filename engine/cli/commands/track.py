@@ -13,6 +13,7 @@ from engine.cli.options import (
     BudgetOption,
     CameraPitchOption,
     ColumnOption,
+    EveryOption,
     ForceOption,
     FramesOption,
     FrameStampsOption,
@@ -28,6 +29,7 @@ from engine.cli.options import (
     MapSigmaOption,
     MountOption,
     OdometryOption,
+    OdometryTopicOption,
     OptionalCameraOption,
     OptionalDeviceOption,
     OutOption,
@@ -62,7 +64,9 @@ def track(
             help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; else a video's .SRT, or EXIF.",
         ),
     ] = None,
+    every: EveryOption = 1,
     image_topic: ImageTopicOption = None,
+    odometry_topic: OdometryTopicOption = None,
     frame_stamps: FrameStampsOption = None,
     log_offset_s: LogOffsetOption = 0.0,
     angles: AnglesOption = "degrees",
@@ -115,8 +119,9 @@ def track(
     use_threads(threads)
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
-        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic, map_sigma_m=map_sigma_m,
-        map_bounds=map_bounds, map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic,
+        odometry_topic=odometry_topic, every=every, map_sigma_m=map_sigma_m, map_bounds=map_bounds,
+        map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
         scale_calibration=scale_calibration,
         corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip

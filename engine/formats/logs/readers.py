@@ -63,8 +63,12 @@ def is_photographs(path: str | Path) -> bool:
     return Path(path).is_dir() and not is_bag(path)
 
 
-def open_log(path: str | Path) -> FlightLog:
+def open_log(path: str | Path, odometry_topic: str | None = None) -> FlightLog:
     """Read a flight log: ArduPilot's DataFlash (.BIN), PX4's ULog (.ulg), DJI's subtitles (.SRT), or a bag of ROS.
+
+    Args:
+        path: the file.
+        odometry_topic: of a bag, that has the velocity by another camera's odometry.
 
     Raises:
         TelemetryError: the file cannot be read, is none of these, or has no usable series.
@@ -72,7 +76,7 @@ def open_log(path: str | Path) -> FlightLog:
     path = Path(path)
     try:
         if is_bag(path):
-            return read_bag(path)
+            return read_bag(path, odometry_topic=odometry_topic)
         if path.stat().st_size == 0:
             raise TelemetryError(f"{path}: expected a flight log, got an empty file")
         return _READERS[path.suffix.lower()](path)

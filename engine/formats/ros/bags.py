@@ -8,7 +8,7 @@ Convention:
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -24,18 +24,21 @@ from engine.formats.resampling import (
     Floats,
     Stamps,
     TimeSeries,
+    interpolate,
     make_log,
     make_position_series,
     make_series,
 )
 from engine.formats.ros.messages import (
     attitude_from_message,
+    body_velocity_from_message,
     camera_from_message,
     image_from_message,
     position_from_message,
     range_from_message,
     stamp_ns,
 )
+from engine.geo import enu_from_body
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of bag files, in lower or upper case; a folder is a bag where it contains metadata.yaml."""
@@ -49,6 +52,7 @@ TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FLOAT, _CALIBRATION = "std_msgs/msg/Float64", "sensor_msgs/msg/CameraInfo"
+_ODOMETRY = "nav_msgs/msg/Odometry"
 
 Sample = tuple[int, tuple[float | None, ...]]
 """Stamp in nanoseconds, and values; None where one is unknown."""
@@ -162,7 +166,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
         raise CalibrationError(f"{path}: {error}") from None
 
 
-def read_bag(path: Path, *, truth: bool = False) -> FlightLog:
+def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = None) -> FlightLog:
     """Read the telemetry of a bag.
 
     ==========================  ===========================================================================
@@ -170,21 +174,25 @@ def read_bag(path: Path, *, truth: bool = False) -> FlightLog:
     sensor_msgs/Imu             roll_deg, pitch_deg
     sensor_msgs/Range           height along the body's down axis
     ``.../rel_alt``             height above take-off
-    ``.../velocity_local``      east and north velocity
+    ``.../velocity_local``      east and north velocity; without ``odometry_topic``
+    nav_msgs/Odometry           the velocity along the body, turned by the attitude above
     sensor_msgs/NavSatFix       the prior
     ==========================  ===========================================================================
 
     Args:
         path: the bag.
         truth: whether the ``/truth`` topics replace these, where the bag has them.
+        odometry_topic: of another camera's odometry, whose velocity and its accuracy are used.
 
     Raises:
-        TelemetryError: the bag cannot be read, or has no usable series.
+        TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
     """
     with _opened(path) as reader:
         has_truth = truth and _topic(reader, _TAKEN["place"][0], (TRUTH,)) is not None
         suffixes = _TRUTH_SUFFIXES if has_truth else _SUFFIXES
         found = {name: _topic(reader, _TAKEN[name][0], options) for name, options in suffixes.items()}
+        if odometry_topic is not None:
+            found["odometry"] = _odometry_topic(path, reader, odometry_topic)
         names = {topic: name for name, topic in found.items() if topic is not None}
         known: dict[str, list[Sample]] = {name: [] for name in names.values()}
         kinds = {_TAKEN[name][0] for name in known}
@@ -206,6 +214,8 @@ def read_bag(path: Path, *, truth: bool = False) -> FlightLog:
         "sigma_m": make_series(*column("place", 2)),
         **make_position_series(position_ns, lat_deg, lon_deg),
     }
+    if odometry_topic is not None:
+        series |= _odometry_series(path, odometry_topic, known["odometry"], series)
     heights = {"rangefinder": make_series(*column("range", 0)), "take-off": make_series(*column("height", 0))}
     return make_log(path, series, heights)
 
@@ -218,6 +228,7 @@ _TAKEN: dict[str, tuple[str, Callable[[Any], tuple[float | None, ...] | None]]] 
     "altitude": (_FLOAT, lambda message: (message.data,)),
     "velocity": ("geometry_msgs/msg/TwistStamped", lambda m: (m.twist.linear.x, m.twist.linear.y)),
     "place": ("sensor_msgs/msg/NavSatFix", position_from_message),
+    "odometry": (_ODOMETRY, body_velocity_from_message),
 }
 """Message type of each quantity, and the function that extracts its values; None where a message has none."""
 _SUFFIXES = {
@@ -234,6 +245,40 @@ _TRUTH_SUFFIXES = {
     "altitude": (TRUTH_ALTITUDE,),
     "place": (TRUTH,),
 }
+
+
+def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
+    names = _topic_names(reader, (_ODOMETRY,))
+    if topic not in names:
+        raise TelemetryError(f"{path}: expected {_ODOMETRY} on {topic}, got {', '.join(names) or 'none'}")
+    return topic
+
+
+def _odometry_series(
+    path: Path, topic: str, samples: list[Sample], series: Mapping[str, TimeSeries | None]
+) -> dict[str, TimeSeries | None]:
+    """East and north velocity and its accuracy: what is along the body, turned by the attitude at that time."""
+    stamps_ns = np.array([time_ns for time_ns, _ in samples], np.int64)
+
+    def angle_deg(name: str) -> Floats:
+        found = series[name]
+        unknown = np.full(len(stamps_ns), np.nan)
+        return unknown if found is None else interpolate(found, stamps_ns, is_angle=name != "pitch_deg")
+
+    # Without roll and pitch the vehicle counts as level, as a picture's does.
+    roll_deg, pitch_deg = np.nan_to_num(angle_deg("roll_deg")), np.nan_to_num(angle_deg("pitch_deg"))
+    attitudes = zip(roll_deg, pitch_deg, angle_deg("heading_deg"), strict=True)
+    along_body = np.array([values for _, values in samples], np.float64).reshape(-1, 4)
+    turned = [enu_from_body(*angles) @ each for angles, each in zip(attitudes, along_body[:, :3], strict=True)]
+    enu_mps = np.array(turned, np.float64).reshape(-1, 3)
+    if not np.isfinite(enu_mps).all(axis=1).any():
+        lacks = "a heading at the times of" if len(samples) else "a velocity that can be used on"
+        raise TelemetryError(f"{path}: expected {lacks} {topic}, got none")
+    return {
+        "east_velocity_mps": make_series(stamps_ns, enu_mps[:, 0]),
+        "north_velocity_mps": make_series(stamps_ns, enu_mps[:, 1]),
+        "velocity_sigma_mps": make_series(stamps_ns, along_body[:, 3], along_body[:, 3] > 0.0),
+    }
 
 
 def _is_same_mavros(imu: str | None, compass: str | None) -> bool:

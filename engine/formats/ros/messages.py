@@ -1,4 +1,4 @@
-"""ROS messages: conversion of images, calibrations, attitude, heights and positions from and to messages.
+"""ROS messages: conversion of images, calibrations, attitude, heights, velocities and positions.
 
 Convention:
     Frames follow REP-103: the world is east-north-up, the body forward-left-up, quaternions are x, y, z, w and
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from engine.camera import DISTORTION_MODELS, Camera
 from engine.errors import CalibrationError, TelemetryError
+from engine.formats.velocities import velocity_sigma_mps
 from engine.geo import Array, attitude_from_rotation, enu_from_body
 
 CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
@@ -32,6 +33,7 @@ _WHITE_PERCENTILE = 99.9  # of a deep picture: few pixels are brighter, and the 
 _ANY_SENSOR_M = (0.0, 1000.0)  # that MAVROS' rangefinder states of every sensor, whatever it reaches
 _FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])  # its own inverse
 _NORM_TOLERANCE = 0.01  # of the squared norm of a quaternion
+_NOT_STATED = -1.0  # first element of a covariance
 _COVARIANCE_KNOWN = 3  # NavSatFix.COVARIANCE_TYPE_KNOWN
 NO_POSITION = -1
 """NavSatStatus.status of a receiver without a fix."""
@@ -137,19 +139,53 @@ def camera_from_message(message: Any) -> Camera:
 
 def attitude_from_message(message: Any) -> tuple[float, float, float] | None:
     """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None where it has no orientation."""
-    q = message.orientation
+    rotation = _rotation(message.orientation)
+    if message.orientation_covariance[0] == _NOT_STATED or rotation is None:
+        return None
+    return attitude_from_rotation(rotation @ _FLU_FROM_FRD)
+
+
+def body_velocity_from_message(message: Any) -> tuple[float, float, float, float] | None:
+    """Velocity along the body (forward, right, down) in m/s of a nav_msgs/Odometry, and its standard deviation.
+
+    By its definition the twist is along the axes of ``child_frame_id``, the body's (forward-left-up). Where that
+    is the frame of the pose as well, as some odometries publish it, the pose's orientation turns the twist back
+    into the body: where that frame has its north does not matter.
+
+    Returns:
+        None where the message has no velocity that counts, by
+        :func:`engine.formats.velocities.velocity_sigma_mps`, or no orientation where one is needed. The standard
+        deviation is per axis, and 0 where the covariance is not stated: zeros, -1 or not finite.
+    """
+    linear = message.twist.twist.linear
+    velocity = np.array([linear.x, linear.y, linear.z], np.float64)
+    covariance = np.asarray(message.twist.covariance, np.float64)
+    unknown = covariance[0] == _NOT_STATED
+    sigma_mps = velocity_sigma_mps(velocity, (0.0,) * 3 if unknown else covariance[0:15:7].tolist(), turned=True)
+    if sigma_mps is None:
+        return None
+    if message.child_frame_id and message.child_frame_id == message.header.frame_id:
+        rotation = _rotation(message.pose.pose.orientation)
+        if rotation is None:
+            return None
+        velocity = rotation.T @ velocity
+    forward, right, down = (float(v) for v in _FLU_FROM_FRD @ velocity)
+    return forward, right, down, sigma_mps
+
+
+def _rotation(q: Any) -> Array | None:
+    """(3, 3) of a geometry_msgs/Quaternion, from the body (forward-left-up) to the world; None if it is none."""
     x, y, z, w = (float(v) for v in (q.x, q.y, q.z, q.w))
     square = x * x + y * y + z * z + w * w
-    if message.orientation_covariance[0] == -1.0 or not abs(square - 1.0) < _NORM_TOLERANCE:
+    if not abs(square - 1.0) < _NORM_TOLERANCE:
         return None
-    rotation = np.array(
+    return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return attitude_from_rotation(rotation @ _FLU_FROM_FRD)
 
 
 def range_from_message(message: Any) -> float | None:

@@ -18,11 +18,12 @@ def settings_of(node):
     topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in RosTopics.__slots__}
     if text["map"] is None:
         raise OptionError("map: expected a file, got nothing; -p map:=site.tif gives it")
-    map_sigma_m = node.parameter("map_sigma_m", 0.0)
+    map_sigma_m, hfov_deg = node.parameter("map_sigma_m", 0.0), node.parameter("hfov_deg", 0.0)
     ros = RosSettings(
         map=text["map"],
         surface=text["surface"],
         camera=text["camera"],
+        hfov_deg=hfov_deg or None,
         mount=text["mount"],
         origin=text["origin"],
         map_sigma_m=map_sigma_m or None,
