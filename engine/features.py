@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.sift import loops
 from engine.sift.descriptors import describe, dominant_angle
 from engine.sift.keypoints import Points, find_points, strongest
 from engine.sift.matching import match
@@ -115,6 +114,8 @@ def _by_loops(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Fea
 
 def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, options: _SiftOptions) -> tuple[Floats, ...]:
     """Positions, scales, angles in degrees and descriptors of the keypoints of one picture (H, W)."""
+    from engine.sift import loops  # numba takes a while to import
+
     plan = loops.plan_loops(*image.shape, options.upsample)
     gaussians, keypoints = loops.detect(image, plan, options.contrast_threshold)
     keypoints = loops.strongest(keypoints, plan, mask, options.max_keypoints, options.spread)
@@ -152,6 +153,8 @@ def prepare_plans(sides_px: Iterable[int], device: torch.device) -> None:
         sides_px: of the pictures.
         device: where they will be.
     """
+    from engine.sift import loops  # numba takes a while to import
+
     for side_px, upsample in itertools.product(sides_px, (1, 2)):
         if device.type == "cpu":
             loops.plan_loops(side_px, side_px, upsample)
@@ -161,6 +164,8 @@ def prepare_plans(sides_px: Iterable[int], device: torch.device) -> None:
 
 def plans_created() -> int:
     """Number of filters computed so far, by length of a picture's side; a flight of one camera needs a few."""
+    from engine.sift import loops  # numba takes a while to import
+
     return loops.filters.cache_info().misses + band.cache_info().misses
 
 

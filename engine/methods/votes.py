@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels import clusters
-
 Array = NDArray[np.float64]
 
 TURNS_DEG = (0.0, -6.0, 6.0)
@@ -62,6 +60,8 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
     Returns:
         Vote | None: None without a match. Of equal ones the first, so that a turn needs more votes than none.
     """
+    from engine.kernels import clusters  # numba takes a while to import
+
     best: tuple[int, float, float, NDArray[np.bool_], Array] | None = None
     for turn_deg, scale in itertools.product(TURNS_DEG, SCALES):
         shifts = map_px - photo_px @ similarity(turn_deg, scale).T
@@ -91,6 +91,8 @@ def _log10_nfa(
     the share of these that agree on the translation is the probability p of a vote by chance. Every match proposes
     a translation in every turn and scale, and the others agree by a binomial law.
     """
+    from engine.kernels import clusters  # numba takes a while to import
+
     total, votes = len(map_px), int(np.count_nonzero(voters))
     if votes < 2:
         return math.log10(total * len(TURNS_DEG) * len(SCALES))

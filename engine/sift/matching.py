@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.kernels import nearest as loops
 from engine.sift.values import Features, Matches
 from engine.tensors import Tensor, torch
 
@@ -119,6 +118,8 @@ def _two_nearest_by_loops(
     query: Features, train: Features, limits: _Limits
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """:func:`_two_nearest` on the CPU."""
+    from engine.kernels import nearest  # numba takes a while to import
+
     rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
     count, slots = max(len(query.valid), len(train.valid)), query.valid.shape[1]
     first, second = np.empty((2, count, slots), np.float32)
@@ -129,7 +130,7 @@ def _two_nearest_by_loops(
     own, other = _angles_and_scales(query, rotation_deg, scale), _angles_and_scales(train, 0.0, 1.0)
     for n, table in enumerate(cosine):
         pair = (own[:, min(n, len(query.valid) - 1)], other[:, min(n, len(train.valid) - 1)])
-        loops.two_nearest(table, *pair, np.float32(least_cos), most_log, first[n], index[n], second[n])
+        nearest.two_nearest(table, *pair, np.float32(least_cos), most_log, first[n], index[n], second[n])
         if table.size:
             is_mutual[n] = first[n] == table.max(axis=1)[index[n]]
     of_slots = (first, index.astype(np.int64), second, is_mutual)
