@@ -106,7 +106,7 @@ def _stages_section(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> 
         "`SceneMatcher.locate` of a tracked flight, one thread: a refined and verified pose with its covariance. "
         "OpenCV's step (grey, enhance, warp, match; no check and no refinement, 1.1 to 1.3 m off) has the same "
         "frames in turns of twenty. *Before* is the engine before poses were refined from the coarsest level, "
-        "measured likewise."
+        "measured likewise on another machine: compare the ratios."
     )
     return [
         "## A frame of a tracked flight",
