@@ -1,4 +1,4 @@
-"""Local features as tensor ops: a batched SIFT that detects, describes and matches on any torch device.
+"""Local features: a batched SIFT that detects, describes and matches tensors on any torch device.
 
 The detector is Lowe's: extrema of differences of Gaussians over position and scale, refined by a quadratic.
 The descriptor is Lowe's 4 x 4 cells of 8 orientations. Where the usual loops run over levels and keypoints, the
@@ -31,12 +31,14 @@ from engine.errors import DtypeError, OptionError, ShapeError
 from engine.sift.descriptors import describe, dominant_angle
 from engine.sift.keypoints import Points, find_points, strongest
 from engine.sift.matching import match
-from engine.sift.scale_space import band, gaussian_levels, make_plan
+from engine.sift.scale_space import band, gaussian_levels, make_plan, octaves_of
 from engine.sift.values import Features, Matches
 from engine.tensors import Tensor, torch
 from engine.threads import in_parallel
 
 Floats = NDArray[np.float32]
+_FARTHEST = 1e6  # of a pixel's value
+_MAX_SPREAD = 1000
 __all__ = ["Features", "Matches", "match", "plans_created", "prepare_plans", "sift"]
 
 
@@ -76,9 +78,12 @@ def sift(
     """
     _check_images(images, mask)
     _check_options(max_keypoints, upsample, contrast_threshold, spread)
+    if not math.isfinite(up_deg):
+        raise OptionError(f"up_deg: expected a finite number, got {up_deg}")
     up_rad = math.radians(up_deg) if upright else None
     options = _SiftOptions(max_keypoints, up_rad, int(upsample), contrast_threshold, root, spread)
-    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0)
+    # Sums of what is not near [0, 1] may overflow, and the loops index by them.
+    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0).clamp(-_FARTHEST, _FARTHEST)
     return (_by_loops if images.device.type == "cpu" else _by_tensors)(pictures, mask, options)
 
 
@@ -100,7 +105,7 @@ def _by_loops(images: Tensor, mask: Tensor | None, options: _SiftOptions) -> Fea
         np.zeros((len(images), options.max_keypoints, *shape), np.float32) for shape in ((2,), (), (), (128,))
     ]
     valid = np.zeros((len(images), options.max_keypoints), np.bool_)
-    pictures, allowed = images.contiguous().numpy(), None if mask is None else mask.numpy()
+    pictures, allowed = images.detach().contiguous().numpy(), None if mask is None else mask.numpy()
 
     def work(image: int) -> None:
         found = _of_picture(pictures[image], None if allowed is None else allowed[image, 0], options)
@@ -156,10 +161,11 @@ def prepare_plans(sides_px: Iterable[int], device: torch.device) -> None:
     from engine.sift import loops  # numba takes a while to import
 
     for side_px, upsample in itertools.product(sides_px, (1, 2)):
-        if device.type == "cpu":
-            loops.plan_loops(side_px, side_px, upsample)
-        else:
-            make_plan(side_px, side_px, 1, upsample, device).prepare()
+        for octave in octaves_of(side_px, side_px, 1, upsample):
+            if device.type == "cpu":
+                loops.filters_of(octave, octave.source[0])
+            else:
+                band(octave.source[0], octave.sigmas, octave.up, device)
 
 
 def plans_created() -> int:
@@ -187,8 +193,8 @@ def _check_options(max_keypoints: int, upsample: int, contrast_threshold: float,
         raise OptionError(f"upsample: expected 1 or 2, got {upsample}")
     if not contrast_threshold >= 0:
         raise OptionError(f"contrast_threshold: expected a number from 0 up, got {contrast_threshold}")
-    if spread < 1:
-        raise OptionError(f"spread: expected at least 1, got {spread}")
+    if not 1 <= spread <= _MAX_SPREAD:
+        raise OptionError(f"spread: expected 1 to {_MAX_SPREAD}, got {spread}")
 
 
 def _to_slots(points: Points, angle: Tensor, descriptors: Tensor, filled: Tensor, batch: int) -> Features:

@@ -20,6 +20,7 @@ WGS84_A_M = 6378137.0
 """Semi-major axis of the WGS84 ellipsoid (NIMA TR8350.2)."""
 WGS84_E2 = 6.69437999014e-3
 """First eccentricity squared of the WGS84 ellipsoid."""
+_SINGULAR = 1e-12  # a determinant over that of the diagonal, below which rounding makes the difference
 
 
 def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
@@ -247,9 +248,9 @@ def chi_square(difference: Array, covariance: Array) -> float:
     (a, b), (c, d) = covariance.tolist()  # a tenth of the time of NumPy's solver
     x, y = difference.tolist()
     across, determinant = d * x * x - (b + c) * x * y + a * y * y, a * d - b * c
-    if determinant <= 0.0:  # singular: what lies along the one direction that it allows, if any
+    if determinant <= _SINGULAR * a * d:  # what lies along the one direction that it allows, if any
         allowed, squared = a + d, x * x + y * y
-        if across > 0.0 or squared > 0.0 >= allowed:
+        if across > _SINGULAR * allowed * squared or squared > 0.0 >= allowed:
             return math.inf
         return float(squared / allowed) if allowed > 0.0 else 0.0
     return float(across / determinant)

@@ -355,7 +355,7 @@ def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
     square = options.reprojection_px**2
     own = slice(None, None, -(-total // _PAIRED))
     some = fit.view.projected[:, own]
-    near = clusters.count_near_pairs(*some, *problem.pixels, options.reprojection_px)
+    near = clusters.count_near_pairs(*map(np.ascontiguousarray, (*some, *problem.pixels)), options.reprojection_px)
     agree = near - int(np.count_nonzero(fit.inliers[own]))
     extent = np.ptp(problem.pixels, axis=1) + 1
     uniform = math.pi * square / float(extent[0] * extent[1])

@@ -9,7 +9,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -81,14 +81,22 @@ def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
     left = iter(range(len(pieces)))
 
     def take() -> None:
-        for number in left:
-            done[number] = work(pieces[number])
+        try:
+            for number in left:
+                done[number] = work(pieces[number])
+        except BaseException:
+            for _ in left:  # nothing more is begun
+                pass
+            raise
 
     waiting = [_workers(count()).submit(take) for _ in range(helpers)]
-    take()  # the calling thread works, too, and waits for no worker that has not woken before all is taken
-    for worker in waiting:
-        if not worker.cancel():
-            worker.result()
+    try:
+        take()  # the calling thread works, too, and waits for no worker that has not woken before all is taken
+    finally:  # nobody writes any more where the caller goes on
+        begun = [worker for worker in waiting if not worker.cancel()]
+        wait(begun)
+    for worker in begun:
+        worker.result()
     return [done[number] for number in range(len(pieces))]
 
 

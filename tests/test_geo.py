@@ -202,6 +202,14 @@ def test_chi_square_of_a_singular_covariance_is_the_limit_of_regular_ones(direct
         assert chi_square(difference, singular + 1e-9 * np.eye(2)) > 900.0
 
 
+def test_chi_square_along_any_direction_that_a_singular_covariance_allows_is_finite():
+    rng = np.random.default_rng(5)
+    for along in rng.normal(size=(2000, 2)) * 10.0 ** rng.uniform(-6, 6, (2000, 1)):
+        covariance = 4.0 * np.outer(along, along)
+        assert chi_square(3.0 * along, covariance) == pytest.approx(2.25, rel=1e-6)
+        assert chi_square(along + 1e-3 * np.array([-along[1], along[0]]), covariance) == math.inf
+
+
 def test_chi_square_without_any_spread_is_nothing_or_infinite():
     assert chi_square(np.zeros(2), np.zeros((2, 2))) == 0.0
     assert chi_square(np.array([0.0, 1e-9]), np.zeros((2, 2))) == math.inf

@@ -2,9 +2,9 @@
 
 Tests compare every kernel of NCC with :mod:`engine.kernels.reference`, which is slow, float64 and obvious.
 
-Loops compiled by numba (SIFT, dense refinement, surfaces and the georeference of maps) are imported where they are
-called, since numba takes a while to import. Tests compare SIFT's with the equivalent tensor ops, the others with
-OpenCV, NumPy and difference quotients.
+Loops compiled by numba (SIFT from picture to votes, dense refinement, surfaces and the georeference of maps) are
+imported where they are called, since numba takes a while to import. Tests compare SIFT's with the equivalent
+tensor ops, the others with OpenCV, NumPy and difference quotients.
 """
 
 from __future__ import annotations

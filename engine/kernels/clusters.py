@@ -69,7 +69,8 @@ def _place_of_fullest_cells(points, radius):
     margin = 2 * _REACH
     sums = np.zeros((rows + margin, columns + margin), np.int32)
     for n in range(len(points)):  # each point counts for the cells about its own
-        row, column = int((points[n, 1] - top) / cell), int((points[n, 0] - left) / cell)
+        row = min(int((points[n, 1] - top) / cell), rows - 1)
+        column = min(int((points[n, 0] - left) / cell), columns - 1)
         for i in range(margin + 1):
             for j in range(margin + 1):
                 sums[row + i, column + j] += 1

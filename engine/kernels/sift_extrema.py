@@ -24,7 +24,7 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
             gain times the sum over k of ``weights[l, p, k] source[m + k - reach[l]]``, zero beyond the edges.
         down: filters of the columns.
         buffer: (N,) float32 that the levels are written to.
-        layout: (offset, stride of a level, stride of a row).
+        layout: (height, width, offset, stride of a level, stride of a row) of the octave.
         rows: (first, end) of the rows that are searched; their neighbours are written too.
         border: rows and columns along the edge that are not searched.
         threshold: lower bound on |DoG| of an extremum.
@@ -32,7 +32,7 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
     Returns:
         (M, 3) int64 level, y, x of the voxels where |DoG| is the maximum of its 3 x 3 x 3.
     """
-    height, width = down[2].shape[1], across[2].shape[1]
+    height, width, offset, per_level, per_row = layout
     up, dogs = across[0].shape[1], len(down[1]) - 1
     first, end = max(rows[0] - 1, 0), min(rows[1] + 1, height)
     tall, start = _between_zeros(source, down[1], first // up, (end - 1) // up + 1)
@@ -42,13 +42,13 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
     found, count = np.empty((256, 3), np.int64), np.int64(0)  # by a literal 0, the callee compiles twice
     for y in range(first, end):
         for level in range(dogs + 1):
-            at = layout[0] + level * layout[1] + y * layout[2]
+            at = offset + level * per_level + y * per_row
             out = buffer[at : at + width]
             if y % up == 0 or y == first:
                 _down_rows(lines[level], tall, y // up - start, source.shape[1], level, down, _padding(across[1]))
-            _across_row(out, lines[level, y % up], level, across, down[2][level, y])
+            _across_row(out, lines[level, y % up], level, across, _gain_of(down[2], level, y, height))
             if level > 0:
-                finer, size = buffer[at - layout[1] : at - layout[1] + width], sizes[y % 3, level - 1]
+                finer, size = buffer[at - per_level : at - per_level + width], sizes[y % 3, level - 1]
                 for x in range(width):
                     size[x] = abs(out[x] - finer[x])
         middle = y - 1
@@ -110,14 +110,23 @@ def _across_row(out, line, level, across, gain):
         _slide(out, line, start, 1, weights[level, 0], taps)
     else:
         _slide_double(out, line, start, weights[level, 0], weights[level, 1], taps)
-    edge = min(width, up * (reach[level] + 1))
+    edge = gains.shape[2]
     for x in range(edge):
-        out[x] *= gains[level, x]
+        out[x] *= gains[0, level, x]
     for x in range(max(edge, width - edge), width):
-        out[x] *= gains[level, x]
+        out[x] *= gains[1, level, x - width + edge]
     if gain != 1:
         for x in range(width):
             out[x] *= gain
+
+
+@compiled
+def _gain_of(gains, level, y, height):
+    """The gain of one output along an axis, of the first and the last of which they are kept."""
+    edge = gains.shape[2]
+    if y < edge:
+        return gains[0, level, y]
+    return gains[1, level, y - height + edge] if y >= height - edge else np.float32(1)
 
 
 @compiled

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
-from engine.align import MAX_PICTURE_PX, SIDE_STEP_PX
+from engine.align import SIDE_STEP_PX
 from engine.device import Device
 from engine.features import prepare_plans
 from engine.indexes.landmarks import LandmarkMap
@@ -47,7 +46,7 @@ class Sift(Method):
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
         # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
-        longest_px = min(3 * max(query.gray.shape), math.isqrt(MAX_PICTURE_PX))
+        longest_px = 3 * max(query.gray.shape)
         prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), torch.device(query.device))
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed("sift", work_px):

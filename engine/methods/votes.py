@@ -97,7 +97,8 @@ def _log10_nfa(
     if votes < 2:
         return math.log10(total * len(TURNS_DEG) * len(SCALES))
     some = slice(None, None, -(-total // _PAIRED))
-    near = clusters.count_near_pairs(*(photo_px[some] + shift_px).T, *map_px.T, radius_px)
+    columns = (*(photo_px[some] + shift_px).T, *map_px.T)
+    near = clusters.count_near_pairs(*map(np.ascontiguousarray, columns), radius_px)
     agree = near - int(np.count_nonzero(voters[some]))
     extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
     uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])

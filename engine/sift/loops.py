@@ -5,7 +5,7 @@ contrast, level, octave.
 """
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -65,21 +65,18 @@ def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
     octaves = octaves_of(height, width, 1, upsample)
     filtered = []
     for octave in octaves:
-        (rows, columns), reach = octave.source, tuple(map(reach_px, octave.sigmas))
-        across, down = (filters(n, octave.sigmas, reach, octave.up) for n in (columns, rows))
+        down, across = (filters_of(octave, length) for length in octave.source)
         filtered.append((octave, across, down))
     table = np.array([(o.height, o.width, o.offset, o.per_level, o.shape[3]) for o in octaves])
     return LoopPlan(tuple(filtered), table, octaves[-1].end, upsample)
 
 
-def prepare_sides(sides_px: Iterable[int]) -> None:
-    """Compute the filters of pictures whose sides are among these, so that none is computed in flight."""
-    for side_px in sides_px:
-        for upsample in (1, 2):
-            plan_loops(side_px, side_px, upsample)
+def filters_of(octave: Octave, length: int) -> Filters:
+    """The filters of an octave along an axis of its source; see :func:`filters`."""
+    return filters(length, octave.sigmas, tuple(map(reach_px, octave.sigmas)), octave.up)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=4096)  # two kilobytes each; a camera of 1280 px has 1,400
 def filters(inputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> Filters:
     """Gaussian filters of all levels along one axis.
 
@@ -90,8 +87,22 @@ def filters(inputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: 
         up: outputs per input, 1 or 2.
 
     Returns:
-        Weights (levels, up, taps), reach (levels,) and gains (levels, outputs) that make up for the edges.
+        Weights (levels, up, taps), reach (levels,) and the gains (2, levels, E) of the first and of the last E
+        outputs, which make up for what a filter misses beyond an edge; all others have 1.
     """
+    weights, below = _weights(sigmas, reach, up)
+    near, outputs = np.array(reach), up * (inputs - 1) + 1
+    edge = min(outputs, up * (max(reach) + 1))
+    index = np.array([np.arange(edge), np.arange(outputs - edge, outputs)])[:, None]  # (2, 1, E)
+    taps, level = below.shape[2] - 1, np.arange(len(near))[:, None]
+    first, end = (np.clip(limit + near[:, None] - index // up, 0, taps) for limit in (0, inputs))
+    gains = 1.0 / (below[level, index % up, end] - below[level, index % up, first])
+    return weights, near, gains.astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _weights(sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> tuple[Floats, NDArray[np.float64]]:
+    """Weights (levels, up, taps), and the sums (levels, up, taps + 1) of those before a tap."""
     near = np.array(reach)
     taps = -(-(2 * near.max() + up) // TAPS) * TAPS
     offsets = np.arange(taps) - near[:, None, None]  # (levels, 1, taps)
@@ -99,12 +110,8 @@ def filters(inputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: 
     weights = np.exp(-0.5 * ((offsets - phase) / np.maximum(np.array(sigmas), 1e-3).reshape(-1, 1, 1)) ** 2)
     weights *= offsets < near[:, None, None] + up
     weights /= weights.sum(-1, keepdims=True)
-    below = np.concatenate([np.zeros_like(weights[..., :1]), weights.cumsum(-1)], axis=-1)  # of the taps before
-    index = np.arange(up * (inputs - 1) + 1)
-    first, end = (np.clip(edge + near[:, None] - index // up, 0, taps) for edge in (0, inputs))
-    level = np.arange(len(near))[:, None]
-    gains = 1.0 / (below[level, index % up, end] - below[level, index % up, first])
-    return weights.astype(np.float32), near, gains.astype(np.float32)
+    below = np.concatenate([np.zeros_like(weights[..., :1]), weights.cumsum(-1)], axis=-1)
+    return weights.astype(np.float32), below
 
 
 def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Floats, Floats]:
@@ -122,13 +129,13 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     threshold = contrast_threshold / SCALES
     limits = (SCALES, MOVES, threshold, MAX_SHIFT, EDGE_RATIO)
     for number, (octave, across, down) in enumerate(plan.octaves):
-        layout = (octave.offset, octave.per_level, octave.shape[3])
+        layout = (octave.height, octave.width, octave.offset, octave.per_level, octave.shape[3])
         early = np.float32(EARLY * threshold)
         voxels = _in_parts(
             lambda part: find_extrema(source, across, down, buffer, layout, part, BORDER, early),  # noqa: B023
             threads.parts(octave.height, octave.height * octave.width // _PART_PX),
         )
-        found.append(refine_extrema(buffer, (octave.height, octave.width, *layout), voxels, limits, number))
+        found.append(refine_extrema(buffer, layout, voxels, limits, number))
         start = octave.offset + SCALES * octave.per_level
         level = buffer[start : start + octave.per_level].reshape(-1, octave.shape[3])
         source = np.ascontiguousarray(level[: octave.height : 2, : octave.width : 2])

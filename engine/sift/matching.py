@@ -126,8 +126,10 @@ def _two_nearest_by_loops(
     index, is_mutual = np.zeros((count, slots), np.int32), np.zeros((count, slots), np.bool_)
     least_cos = -2.0 if max_angle_diff_deg is None else math.cos(math.radians(min(max_angle_diff_deg, 180.0)))
     most_log = np.float32(math.inf if max_scale_factor is None else math.log(max_scale_factor))
-    cosine = (train.descriptors @ query.descriptors.mT).numpy()
-    own, other = _angles_and_scales(query, rotation_deg, scale), _angles_and_scales(train, 0.0, 1.0)
+    cosine = (train.descriptors @ query.descriptors.mT).float().numpy()
+    is_limited = max_scale_factor is not None
+    own = _angles_and_scales(query, rotation_deg, scale, is_limited)
+    other = _angles_and_scales(train, 0.0, 1.0, is_limited)
     for n, table in enumerate(cosine):
         pair = (own[:, min(n, len(query.valid) - 1)], other[:, min(n, len(train.valid) - 1)])
         nearest.two_nearest(table, *pair, np.float32(least_cos), most_log, first[n], index[n], second[n])
@@ -137,11 +139,12 @@ def _two_nearest_by_loops(
     return tuple(map(torch.from_numpy, of_slots))  # type: ignore[return-value]
 
 
-def _angles_and_scales(features: Features, rotation_deg: float, scale: float) -> Floats:
-    """(3, B, N) logarithm of scale, NaN where there is no keypoint, and cosine and sine of the angle."""
-    sizes, angle = features.scale_px.numpy(), np.deg2rad(features.angle_deg.numpy() + np.float32(rotation_deg))
+def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:
+    """(3, B, N) logarithm of scale where that counts, NaN without a keypoint; cosine and sine of the angle."""
+    sizes = features.scale_px.float().numpy() if is_limited else np.ones(features.valid.shape, np.float32)
+    angle = np.deg2rad(features.angle_deg.float().numpy() + np.float32(rotation_deg))
     log = np.log(np.where(features.valid.numpy(), np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
-    return np.stack([log, np.cos(angle), np.sin(angle)])
+    return np.stack([log, np.cos(angle), np.sin(angle)]).astype(np.float32)
 
 
 def _two_nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -39,20 +39,21 @@ def reach_px(sigma: float) -> int:
     return math.ceil(_TRUNCATE * sigma)
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=4096)
 def band(inputs: int, sigmas: tuple[float, ...], up: int, device: torch.device) -> _Band:
     """Return G[l, i, j] ~ exp(-(i / up - j)^2 / (2 sigma_l^2)), rows summing to 1 also at the edges."""
     outputs = _outputs(inputs, up)
     reach = reach_px(max(sigmas)) + up - 1
     rows = _BLOCK * up
     count = math.ceil(outputs / rows)
-    out = np.arange(count * rows).reshape(count, 1, rows, 1)
-    source = (np.arange(count)[:, None] * _BLOCK + np.arange(-reach, _BLOCK + reach)).reshape(count, 1, 1, -1)
-    spread = np.maximum(np.array(sigmas), 1e-3).reshape(1, -1, 1, 1)
-    near = np.array([reach_px(s) for s in sigmas]).reshape(1, -1, 1, 1)
-    weights = np.exp(-0.5 * ((out / up - source) / spread) ** 2)
-    weights *= (source - out // up >= -near) & (source - out // up < near + up)
-    weights *= (source >= 0) & (source < inputs) & (out < outputs)
+    out, source = np.arange(rows)[:, None], np.arange(-reach, _BLOCK + reach)  # of the first block
+    spread = np.maximum(np.array(sigmas), 1e-3).reshape(-1, 1, 1)
+    near = np.array([reach_px(s) for s in sigmas]).reshape(-1, 1, 1)
+    shape = np.exp(-0.5 * ((out / up - source) / spread) ** 2)  # (levels, rows, inputs), the same in every block
+    shape *= (source - out // up >= -near) & (source - out // up < near + up)
+    block = np.arange(count).reshape(-1, 1, 1, 1)
+    inside = (source + block * _BLOCK >= 0) & (source + block * _BLOCK < inputs) & (out + block * rows < outputs)
+    weights = shape * inside
     weights /= np.maximum(weights.sum(-1, keepdims=True), 1e-30)
     return _Band(torch.from_numpy(weights.astype(np.float32)).to(device), reach)
 
@@ -103,12 +104,6 @@ class ScaleSpacePlan:
     octaves: tuple[Octave, ...]
     gaussian_size: int
     table: Tensor  # (octaves, 6) int64: height, width, offset, and the strides of level, row and image
-
-    def prepare(self) -> None:
-        """Compute the filters of its octaves, which other pictures of its sides share."""
-        for octave in self.octaves:
-            for length in octave.source:
-                band(length, octave.sigmas, octave.up, self.table.device)
 
     @property
     def index(self) -> torch.dtype:

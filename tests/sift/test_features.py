@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.features import Features, match, sift
+from engine.features import Features, match, plans_created, prepare_plans, sift
+from engine.sift import loops
 from engine.sift.descriptors import _orient, normalise
 
 LEVEL_RATIO = 2 ** (1 / 3)
@@ -380,7 +381,7 @@ def test_known_rotation_and_scale_leave_out_contradictions():
         ),
         (torch.zeros(1, 1, 9, 9), {"max_keypoints": 0}, OptionError, "max_keypoints: expected at least 1, got 0"),
         (torch.zeros(1, 1, 9, 9), {"upsample": 3}, OptionError, "upsample: expected 1 or 2, got 3"),
-        (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected at least 1, got 0"),
+        (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected 1 to 1000, got 0"),
         (torch.zeros(1, 1, 9, 9), {"contrast_threshold": -1}, OptionError, "contrast_threshold"),
         (
             torch.zeros(1, 1, 9, 9),
@@ -400,3 +401,27 @@ def test_wrong_arguments_are_named(images, options, error, text):
 def test_a_wrong_ratio_is_named(pair):
     with pytest.raises(OptionError, match="ratio"):
         match(*pair, ratio=1.5)
+
+
+def test_a_picture_that_requires_a_gradient_has_the_same_features():
+    image = torch.rand(1, 1, 60, 70, generator=torch.Generator().manual_seed(4))
+    expected, found = sift(image), sift(image.clone().requires_grad_())
+    assert torch.equal(found.descriptors, expected.descriptors)
+
+
+@pytest.mark.parametrize("value", [3e38, -3e38, torch.inf, -torch.inf, torch.nan])
+def test_pixels_of_absurd_values_spoil_nothing_else(value):
+    image = torch.rand(1, 1, 90, 90, generator=torch.Generator().manual_seed(5))
+    image[0, 0, 40, 40] = value
+    found = sift(image)
+    assert all(values.isfinite().all() for values in (found.xy_px, found.angle_deg, found.descriptors))
+
+
+def test_after_preparation_no_rectangle_lacks_a_filter():
+    """Of a camera of 1280 px: the sides of an orthophoto reach three times as far."""
+    prepare_plans(range(16, 3 * 1280 + 1, 16), torch.device("cpu"))
+    before = plans_created()
+    for height, width in np.random.default_rng(6).integers(1, 241, (300, 2)) * 16:
+        for upsample in (1, 2):
+            loops.plan_loops(int(height), int(width), upsample)
+    assert plans_created() == before

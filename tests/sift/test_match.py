@@ -1,5 +1,7 @@
 """Matching a frame's descriptors with many of the map: in chunks as in one piece, and as written down plainly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -74,6 +76,25 @@ def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
     two = expected[2] > -2.0
     torch.testing.assert_close(got[2][two], expected[2][two])
     assert (got[2][~two] < -2.0).all()
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.float16])
+def test_features_of_another_precision_match_likewise(kind):
+    query = described(50, 3)
+    train = described(90, 4, like=query)
+    expected = match(query, train, ratio=0.9).pairs()
+    assert len(expected) > 10
+    cast = (replace(f, descriptors=f.descriptors.to(kind), scale_px=f.scale_px.to(kind)) for f in (query, train))
+    found = match(*cast, ratio=0.9).pairs()
+    assert len({tuple(p) for p in found.tolist()} ^ {tuple(p) for p in expected.tolist()}) <= 1
+
+
+def test_unknown_scales_count_only_where_they_are_limited():
+    query = described(50, 3)
+    train = described(90, 4, like=query)
+    unknown = replace(query, scale_px=query.scale_px * torch.nan)
+    assert torch.equal(match(unknown, train, ratio=0.9).pairs(), match(query, train, ratio=0.9).pairs())
+    assert not match(unknown, train, ratio=0.9, max_scale_factor=1.5).valid.any()
 
 
 def test_nothing_matches_a_map_without_features():
