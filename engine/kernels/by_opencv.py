@@ -58,7 +58,7 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
         _check_finite("search", energy)
         _check_finite("templates", sum(energy for _, energy in models))
         inverse_norms = surface_loops.inverse_norms(windows[b], mean, energy, h, w, zero_mean)
-        _correlate(out[b], windows[b], (mean, energy), inverse_norms, [model for model, _ in models])
+        correlate(out[b], windows[b], (mean, energy), inverse_norms, [model for model, _ in models])
 
     in_parallel(one_pair if ny == nx == T == 1 else one_window, range(B))
     return out
@@ -96,7 +96,7 @@ def prepared_surface(image: FloatImage, inverse_norms: FloatImage, templates: Fl
     """
     out = np.empty((len(templates), *inverse_norms.shape), np.float32)
     models = [surface_loops.unit(picture, False)[0] for picture in np.ascontiguousarray(templates)]
-    _correlate(out, image, surface_loops.moments(image, False), inverse_norms, models)
+    correlate(out, image, surface_loops.moments(image, False), inverse_norms, models)
     return out
 
 
@@ -109,7 +109,7 @@ class _Block(NamedTuple):
     columns: slice
 
 
-def _correlate(
+def correlate(
     out: FloatImage,
     window: FloatImage,
     moments: tuple[float, float],
@@ -175,7 +175,7 @@ def _finish_pair(
     products = _scratch("products", packed.shape[:2])
     cv2.dft(packed, packed)
     surface_loops.packed_product(products, packed)
-    _transform(products, cv2.DFT_INVERSE, out.shape[0])
+    transform(products, cv2.DFT_INVERSE, out.shape[0])
     surface_loops.normalise(out, products, inverse_norms, np.float32(math.sqrt(energy) / products.size))
 
 
@@ -186,14 +186,14 @@ def _is_weak(energy: float, largest: float) -> bool:
 
 def _write_exactly(out: FloatImage, window: FloatImage, model: FloatImage, inverse_norms: FloatImage) -> None:
     """By transforms in float64; OpenCV's ``matchTemplate`` is no more exact than float32 on small templates."""
-    size = _side(window.shape[0]), _side(window.shape[1])
+    size = fast_side(window.shape[0]), fast_side(window.shape[1])
     values, spectrum = np.zeros(size), np.zeros(size)
     values[: window.shape[0], : window.shape[1]] = window
     spectrum[: model.shape[0], : model.shape[1]] = model
-    _transform(values, 0, window.shape[0])
-    _transform(spectrum, 0, model.shape[0])
+    transform(values, 0, window.shape[0])
+    transform(spectrum, 0, model.shape[0])
     cv2.mulSpectrums(values, spectrum, 0, values, True)
-    _transform(values, cv2.DFT_INVERSE, out.shape[0])
+    transform(values, cv2.DFT_INVERSE, out.shape[0])
     products = (values[: out.shape[0], : out.shape[1]] / values.size).astype(np.float32)
     surface_loops.normalise(out, products, inverse_norms, np.float32(1.0))
 
@@ -201,13 +201,13 @@ def _write_exactly(out: FloatImage, window: FloatImage, model: FloatImage, inver
 @lru_cache(maxsize=1024)
 def _division(count: int, model: int) -> tuple[int, int]:
     """Number and side of the blocks along an axis that give ``count`` scores at the least cost."""
-    sides = [_side(-(-count // n) + model - 1) for n in range(1, _MAX_BLOCKS + 1)]
+    sides = [fast_side(-(-count // n) + model - 1) for n in range(1, _MAX_BLOCKS + 1)]
     costs = [n * side * (1 if side <= _CACHED_SIDE else 2) for n, side in enumerate(sides, 1)]
     best = costs.index(min(costs))
     return -(-count // (sides[best] - model + 1)), sides[best]
 
 
-def _side(n: int) -> int:
+def fast_side(n: int) -> int:
     """The next side that is transformed fast: without prime factors above 5, and even, for the packed orders."""
     step = 16 if n >= 64 else 2
     return step * fast_length(-(-n // step))
@@ -221,14 +221,14 @@ def _block(
     energy = surface_loops.centre(values, window, mean)
     if _is_weak(energy, float(inverse_norms.max())):
         return _Block(values[: window.shape[0], : window.shape[1]], False, *part)
-    _transform(values, 0, window.shape[0])
+    transform(values, 0, window.shape[0])
     return _Block(values, True, *part)
 
 
 def _spectrum(model: FloatImage, size: tuple[int, int]) -> FloatImage:
     values = np.zeros(size, np.float32)
     values[: model.shape[0], : model.shape[1]] = model
-    _transform(values, 0, model.shape[0])
+    transform(values, 0, model.shape[0])
     return values
 
 
@@ -238,7 +238,7 @@ def _write_scores(
     if block.is_spectrum:
         products = _scratch("products", block.values.shape)
         cv2.mulSpectrums(block.values, spectrum, 0, products, True)
-        _transform(products, cv2.DFT_INVERSE, out.shape[0])
+        transform(products, cv2.DFT_INVERSE, out.shape[0])
         surface_loops.normalise(out, products, inverse_norms, np.float32(1.0 / products.size))
     else:
         _write_exactly(out, block.values, model, inverse_norms)
@@ -258,7 +258,7 @@ def _scratch(name: str, shape: tuple[int, ...]) -> FloatImage:
     return memory[:count].reshape(shape)
 
 
-def _transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
+def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
     """In place, of which only so many rows are not zero, or wanted.
 
     OpenCV hands whole pictures to IPP where it is built with it, which is three to four times as fast as its own

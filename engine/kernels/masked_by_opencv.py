@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.kernels import masked_whole
 from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
 
 Array = NDArray[np.float64]
@@ -33,6 +34,9 @@ def ncc_surface(
     size = (2 * fast_length(-(-H // 2)), 2 * fast_length(-(-W // 2)))  # even, for the packed order
     out = np.empty((*templates.shape[:2], H - h + 1, W - w + 1))
     for b, (window, valid) in enumerate(zip(search, search_valid, strict=True)):
+        if templates_valid[b].all():
+            out[b] = masked_whole.surfaces(window, valid, templates[b], min_overlap)
+            continue
         of_window = _spectra(window, valid, size)
         for t, (template, shown) in enumerate(zip(templates[b], templates_valid[b], strict=True)):
             least = min_overlap * max(1, int(shown.sum()))

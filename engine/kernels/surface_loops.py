@@ -252,3 +252,40 @@ def normalise(out, products, inverse, factor):
         for x in range(out.shape[1]):
             score = numerators[x] * (norms[x] * factor)
             to[x] = min(max(score, np.float32(-1.0)), np.float32(1.0))
+
+
+@compiled
+def masked_scores(out, asked, sums, boxes, model, floors):
+    """Write the scores of a template that is whole at the places of a block that are asked for.
+
+    Args:
+        out: (H', W') float32 or float64, written to.
+        asked: (H', W') bool.
+        sums: (3, rows, columns) float64, at least (H', W'), not divided by their size: correlations of the picture
+            with the template about its mean, of the mask with it, and of the mask with its square.
+        boxes: integral images of the picture, 0 where invalid, with that of its square, (2, H+1, W+1) float64, and
+            of the mask, (H+1, W+1) int32.
+        model: rows and columns of the template.
+        floors: sums of squares of picture and template that are rounding.
+    """
+    products, of_mask, of_squares = sums[0], sums[1], sums[2]
+    (integrals, counts), (h, w) = boxes, model
+    scale = 1.0 / products.size
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            if not asked[y, x]:
+                continue
+            count = counts[y + h, x + w] - counts[y, x + w] - counts[y + h, x] + counts[y, x]
+            total, square = _box(integrals[0], y, x, h, w), _box(integrals[1], y, x, h, w)
+            of_model = of_mask[y, x] * scale
+            spread = square - total * total / count
+            model_spread = of_squares[y, x] * scale - of_model * of_model / count
+            score = 0.0
+            if spread > floors[0] and model_spread > floors[1]:
+                score = (products[y, x] * scale - total * of_model / count) / math.sqrt(spread * model_spread)
+            out[y, x] = min(max(score, -1.0), 1.0)
+
+
+@compiled
+def _box(sums, y, x, h, w):
+    return sums[y + h, x + w] - sums[y, x + w] - sums[y + h, x] + sums[y, x]

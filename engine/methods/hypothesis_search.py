@@ -172,13 +172,14 @@ def _coarse(
 def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.float32]) -> Iterator[Picture]:
     """One surface (H', W') after the other, of which only a few are in memory."""
     area_px = region.window.width_px * region.window.height_px
+    group = max(_MIN_GROUP, _MAX_GROUP_PX // area_px)
     if region.valid is None:
-        own, group = placed(templates, correlator.query.device), max(_MIN_GROUP, _MAX_GROUP_PX // area_px)
+        own = placed(templates, correlator.query.device)
         for several in surfaces(region.search, own, group=group):
             yield from several
     else:
-        for template in templates:
-            yield correlator.masked_scores(region, template[None])[0]
+        for first in range(0, len(templates), group):
+            yield from correlator.masked_scores(region, templates[first : first + group])
 
 
 def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]]:

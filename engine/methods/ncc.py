@@ -187,8 +187,14 @@ class Ncc(Method):
         """The correlation surface of a window at the frame's own height and heading."""
         return explain_correlation(self._correlator(query), window)
 
-    def find(self, query: Query, *, coarser: int = 0) -> PeakCandidate | NoFix:
-        """The highest peak of one frame, or a refusal where there is none; see :meth:`correlate`."""
+    def find(self, query: Query, *, coarser: int = 0, min_confidence: float = 0.0) -> PeakCandidate | NoFix:
+        """The highest peak of one frame, or a refusal where there is none.
+
+        Args:
+            query: the frame.
+            coarser: see :meth:`correlate`.
+            min_confidence: see :func:`engine.methods.peak_evidence.with_confidence`.
+        """
         refusal = self._refuse_unusable(query)
         if refusal is not None:
             return refusal
@@ -219,7 +225,7 @@ class Ncc(Method):
         fix = fix_of(correlator, aligned, peak, window, searched=searched)
         found = PeakCandidate(peak, aligned, fix, None, searched)
         no_features = searched or wide or query.prior is None
-        return found if no_features else with_confidence(correlator, found)
+        return found if no_features else with_confidence(correlator, found, min_confidence)
 
     def _over_its_ground(
         self, correlator: Correlator, aligned: Aligned, window: Window, peak: Peak | None
@@ -281,7 +287,7 @@ class Ncc(Method):
                 query, frame=replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
             )
             with query.scheduler.costed("ncc", work):
-                found = self.find(turned, coarser=coarser)
+                found = self.find(turned, coarser=coarser, min_confidence=_MIN_CONFIDENCE_TURNED)
             if isinstance(found, NoFix) or judge_peak(
                 found.peak, found.aligned.template.size, found.features, found.fix.confidence, rule
             ):

@@ -34,12 +34,19 @@ class PeakCandidate:
     searched: bool
 
 
-def with_confidence(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
-    """The candidate with its probability; one that is not high must also beat the null hypothesis."""
+def with_confidence(correlator: Correlator, found: PeakCandidate, min_confidence: float = 0.0) -> PeakCandidate:
+    """The candidate with its probability; one that is not high must also beat the null hypothesis.
+
+    Args:
+        correlator: of the frame.
+        found: at one heading and height.
+        min_confidence: the null hypothesis only lowers a probability, and is not asked about one below this, which
+            suffices for nothing.
+    """
     query, peak, aligned = correlator.query, found.peak, found.aligned
     features = features_of(query, aligned, peak, found.fix)
     confidence = probability(features)
-    if confidence < correlator.options.rule.null_test_below:
+    if min_confidence <= confidence < correlator.options.rule.null_test_below:
         null_score = _null_score(correlator, aligned, found.fix.window)
         peak = replace(peak, second_score=max(peak.second_score, null_score))
         features = features_of(query, aligned, peak, found.fix)

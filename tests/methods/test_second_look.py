@@ -10,6 +10,7 @@ import pytest
 from engine import Fix, Frame, MatcherOptions, NoFix, SceneMatcher
 from engine.acceptance import PeakRule, judge_second_look
 from engine.confidence import SECOND_LOOK_MODEL, PeakFeatures, PriorAgreement, probability
+from engine.methods import ncc
 from engine.methods.options import NccOptions
 from engine.scores import orientation
 from engine.values import Peak, Reason
@@ -112,3 +113,27 @@ def test_no_heading_makes_another_place_look_right(ground, camera):
     for heading_deg in (36.0, 40.0, 44.0):
         told = replace(mirrored, heading_deg=heading_deg)
         assert isinstance(SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR)), NoFix)
+
+
+@pytest.mark.parametrize("turn_deg", [-4.0, 0.0, 4.5])
+@pytest.mark.parametrize("contrast", [0.04, 0.08, 0.25])
+def test_a_heading_that_is_improbable_without_the_null_hypothesis_need_not_beat_it(
+    ground, camera, monkeypatch, turn_deg, contrast
+):
+    """The null hypothesis only lowers a probability: the answers are those of asking about every heading."""
+    frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
+    noise = np.random.default_rng(5).normal(0, 14, frame.image.shape)
+    image = np.clip(contrast * frame.image + 90 + noise, 0, 255).astype(np.uint8)
+    told = replace(frame, image=image, heading_deg=40.0 + turn_deg)
+    quick = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR))
+    find = ncc.Ncc.find
+    monkeypatch.setattr(ncc.Ncc, "find", lambda self, query, *, coarser=0, **_: find(self, query, coarser=coarser))
+    thorough = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR))
+    assert type(quick) is type(thorough)
+    if isinstance(quick, Fix):
+        assert (quick.east_m, quick.north_m, quick.confidence) == (
+            thorough.east_m, thorough.north_m, thorough.confidence,
+        )  # fmt: skip
+    else:
+        assert quick.detail == thorough.detail
+        assert [fix.confidence for fix in quick.candidates] == [fix.confidence for fix in thorough.candidates]

@@ -1,0 +1,155 @@
+"""Masked NCC on the CPU of templates that are whole: what lies wholly on valid pixels is scored without a mask.
+
+Only where a template reaches over the mask's edge are the sums of :mod:`engine.kernels.masked` needed. Of their
+six correlations a template without a mask leaves three; the others are sums over boxes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.kernels import by_opencv, surface_loops
+from engine.kernels.by_opencv import fast_side, transform
+from engine.kernels.sums import integrals
+from engine.kernels.transform_sizes import FLAT_SHARE
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SMALL_PX = 1 << 17  # windows up to this size are scored in one way
+_DIVISIONS = (1, 2, 3, 4, 6, 8, 12, 16)  # of a surface along each axis
+_SHARED = 0.4  # of the transforms of a block: those of the template, and the memory that is touched
+_MAX_CACHED_PX = 1 << 21  # transforms of more cost half as much again per pixel
+
+
+class _Model(NamedTuple):
+    """A template about its mean in float64, its sum of squares, and transforms of both that the blocks share."""
+
+    energy: float
+    values: Array
+    squares: Array
+
+
+def surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_overlap: float) -> NDArray[Any]:
+    """Zero-mean NCC over the valid pixels.
+
+    Args:
+        window: (H, W).
+        valid: (H, W) bool.
+        templates: (T, h, w).
+        min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
+
+    Returns:
+        (T, H-h+1, W-w+1) in [-1, 1]: float32 where both pictures are, else float64.
+    """
+    h, w = templates.shape[1:]
+    common = _inside(valid, h, w)
+    is_single = window.dtype == templates.dtype == np.float32
+    out = np.zeros((len(templates), *common.shape), np.float32 if is_single else np.float64)
+    enough = common >= max(min_overlap * (h * w), 1.0)
+    mean = float(window.mean(dtype=np.float64, where=valid)) if valid.any() else 0.0
+    asked = enough
+    if is_single and window.size > _SMALL_PX:
+        whole = common == h * w
+        asked = enough & ~whole
+        if whole.any():
+            centred = np.where(valid, window - np.float64(mean), 0.0).astype(np.float32)
+            _score_whole(out, centred, np.ascontiguousarray(templates), whole)
+    if asked.any():
+        _score_partial(out, (window, valid, mean), templates, asked)
+    out[:, ~enough] = -1.0
+    return out
+
+
+def _inside(valid: Mask, h: int, w: int) -> NDArray[np.int32]:
+    """Number of valid pixels under the template (H', W')."""
+    sums = cv2.integral(valid.view(np.uint8))
+    return np.asarray(sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w])
+
+
+def _score_whole(
+    out: NDArray[np.float32], centred: NDArray[np.float32], templates: NDArray[np.float32], whole: Mask
+) -> None:
+    """Write the scores of places without an invalid pixel, and 0 elsewhere."""
+    moments = surface_loops.moments(centred, True)
+    models = [surface_loops.unit(template, True)[0] for template in templates]
+    inverse_norms = surface_loops.inverse_norms(centred, *moments, *templates.shape[1:], True)
+    inverse_norms[~whole] = 0.0
+    by_opencv.correlate(out, centred, moments, inverse_norms, models)
+
+
+def _score_partial(
+    out: NDArray[Any], picture: tuple[NDArray[Any], Mask, float], templates: NDArray[Any], asked: Mask
+) -> None:
+    """Write the scores of the places that are asked for, in float64, in blocks of which many have none."""
+    h, w = templates.shape[1:]
+    (rows, columns), corners = _blocks(asked, h, w)
+    size = fast_side(rows + h - 1), fast_side(columns + w - 1)
+    models = [_model(template, size) for template in templates]
+    window, valid, mean = picture
+    floor = FLAT_SHARE * _energy(window, valid, mean)
+    # Kept from block to block: fresh pages of memory cost as much as a transform.
+    spectra, products = np.empty((2, *size)), np.empty((3, *size))
+    for y, x in corners:
+        part = np.s_[y : y + rows, x : x + columns]
+        inner = np.s_[y : y + rows + h - 1, x : x + columns + w - 1]
+        mask = valid[inner].astype(np.float32)
+        values = np.where(valid[inner], window[inner] - np.float64(mean), 0.0)
+        boxes = integrals(values), cv2.integral(valid[inner].astype(np.uint8))
+        for spectrum, shown in zip(spectra, (values, mask), strict=True):
+            _write_spectrum(spectrum, shown)
+        for t, model in enumerate(models):
+            pairs = (spectra[0], model.values), (spectra[1], model.values), (spectra[1], model.squares)
+            for product, (one, other) in zip(products, pairs, strict=True):
+                cv2.mulSpectrums(one, other, 0, product, True)
+                transform(product, cv2.DFT_INVERSE, rows)
+            floors = floor, FLAT_SHARE * model.energy
+            surface_loops.masked_scores(out[t][part], asked[part], products, boxes, (h, w), floors)
+
+
+def _energy(window: NDArray[Any], valid: Mask, mean: float) -> float:
+    """Sum of squares about the mean."""
+    shown = window[valid] - np.float64(mean)
+    return float(np.dot(shown, shown))
+
+
+def _blocks(asked: Mask, h: int, w: int) -> tuple[tuple[int, int], list[tuple[int, int]]]:
+    """Rows and columns of the blocks that cost least, and the corners of those with a place to score."""
+    height, width = asked.shape
+    sums, best = cv2.integral(asked.view(np.uint8)), (np.inf, (height, width), [(0, 0)])
+    for n in _DIVISIONS if asked.size > _SMALL_PX else (1,):
+        rows, columns = -(-height // n), -(-width // n)
+        y, x = np.arange(0, height, rows), np.arange(0, width, columns)
+        below, right = np.minimum(y + rows, height), np.minimum(x + columns, width)
+        inside = sums[np.ix_(below, right)] - sums[np.ix_(y, right)] - sums[np.ix_(below, x)] + sums[np.ix_(y, x)]
+        j, i = np.nonzero(inside)
+        area_px = fast_side(rows + h - 1) * fast_side(columns + w - 1)
+        cost = (len(j) + _SHARED) * area_px * (1.0 if area_px <= _MAX_CACHED_PX else 1.5)
+        if cost < best[0]:
+            best = cost, (rows, columns), list(zip(y[j].tolist(), x[i].tolist(), strict=True))
+    return best[1:]
+
+
+def _model(template: NDArray[Any], size: tuple[int, int]) -> _Model:
+    values = template.astype(np.float64)
+    values -= values[0, 0]  # of one level are exact zeros
+    values -= values.mean()
+    squares = values * values
+    return _Model(float(squares.sum()), _spectrum(values, size), _spectrum(squares, size))
+
+
+def _spectrum(values: Array, size: tuple[int, int]) -> Array:
+    out = np.empty(size)
+    _write_spectrum(out, values)
+    return out
+
+
+def _write_spectrum(out: Array, values: NDArray[Any]) -> None:
+    height, width = values.shape
+    out[:height, :width] = values
+    out[:height, width:], out[height:] = 0.0, 0.0
+    transform(out, 0, height)

@@ -1,0 +1,104 @@
+"""Masked NCC of whole templates: sums over the whole window in float64 are the reference."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from engine.kernels import masked, masked_whole
+from engine.ncc_fft import ncc
+
+KINDS = ("border", "slanted", "holes", "speckles", "half", "nearly nothing")
+
+
+def mask_of(kind, shape, rng):
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    valid = np.ones(shape, bool)
+    if kind == "border":
+        valid[:9], valid[-4:], valid[:, :13] = False, False, False
+    elif kind == "slanted":
+        valid = (y > 0.05 * shape[0] + 0.1 * x) & (x < 0.97 * shape[1] - 0.03 * y)
+    elif kind == "holes":
+        for _ in range(4):
+            j, i = (int(rng.integers(0, n - 10)) for n in shape)
+            valid[j : j + 12, i : i + 25] = False
+    elif kind == "speckles":
+        valid = rng.random(shape) < 0.97
+    elif kind == "half":
+        valid[:, : shape[1] // 2] = False
+    else:
+        valid[:] = False
+        valid[: shape[0] // 3, -shape[1] // 3 :] = True
+    return valid
+
+
+def drawn(kind, size, model, count=2, mean=0.0):
+    """A window with nodata, and templates of which the first is from it, under noise."""
+    rng = np.random.default_rng([len(kind), *size, *model])
+    window = cv2.GaussianBlur(rng.normal(0.0, 5.0, size), (0, 0), 1.5) + rng.normal(0.0, 0.3, size) + mean
+    templates = rng.normal(0.0, 1.0, (count, *model)) + mean
+    y, x = ((n - m) // 2 for n, m in zip(size, model, strict=True))
+    templates[0] += window[y : y + model[0], x : x + model[1]] - mean
+    return window, mask_of(kind, size, rng), templates
+
+
+def reference(window, valid, templates, min_overlap):
+    tensors = torch.from_numpy(window)[None], torch.from_numpy(valid)[None], torch.from_numpy(templates)[None]
+    shown = torch.ones_like(tensors[2]).bool()
+    return masked.ncc_surface(*tensors, shown, min_overlap=min_overlap)[0].numpy()
+
+
+@pytest.mark.parametrize("small_px", [0, 1 << 17])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("min_overlap", [0.3001, 0.8999])
+@pytest.mark.parametrize(("size", "model"), [((230, 317), (48, 61)), ((400, 260), (21, 20)), ((97, 90), (90, 90))])
+def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, small_px, monkeypatch):
+    monkeypatch.setattr(masked_whole, "_SMALL_PX", small_px)
+    window, valid, templates = drawn(kind, size, model)
+    for dtype, tolerance in ((np.float64, 1e-9), (np.float32, 1e-6)):
+        picture, patches = window.astype(dtype), templates.astype(dtype)
+        expected = reference(picture.astype(np.float64), valid, patches.astype(np.float64), min_overlap)
+        scores = ncc(picture[None], patches[None], search_valid=valid[None], min_overlap=min_overlap)[0]
+        assert scores.dtype == dtype
+        np.testing.assert_array_equal(scores == -1.0, expected == -1.0)
+        np.testing.assert_allclose(scores, expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_division_changes_no_score(kind, monkeypatch):
+    window, valid, templates = drawn(kind, (230, 317), (48, 61), mean=40.0)
+    found = []
+    monkeypatch.setattr(masked_whole, "_SMALL_PX", 0)
+    for divisions in ((1,), (3,), (16,)):
+        monkeypatch.setattr(masked_whole, "_DIVISIONS", divisions)
+        found.append(masked_whole.surfaces(window, valid, templates, 0.5))
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], rtol=0, atol=1e-10)
+
+
+def test_what_is_wholly_valid_is_scored_as_without_a_mask():
+    window, valid, templates = (v.astype(np.float32) for v in drawn("holes", (230, 317), (48, 61)))
+    valid = valid.astype(bool)
+    scores = ncc(window[None], templates[None], search_valid=valid[None])[0]
+    plain = ncc(window[None], templates[None])[0]
+    whole = (
+        cv2.erode(valid.astype(np.uint8), np.ones((48, 61), np.uint8), anchor=(0, 0))[: 230 - 47, : 317 - 60] > 0
+    )
+    assert whole.any()
+    assert not whole.all()
+    np.testing.assert_allclose(scores[:, whole], plain[:, whole], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("level", [0.1, 77.0, -3.3])
+def test_flat_templates_and_flat_ground_score_zero_also_across_an_edge(level):
+    window, valid, templates = drawn("border", (120, 130), (30, 31))
+    for dtype in (np.float32, np.float64):
+        flat = np.full((1, 30, 31), level, dtype)
+        scores = masked_whole.surfaces(window.astype(dtype), valid, flat, 0.5)
+        assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6
+        half = window.astype(dtype)
+        half[:, :80] = level
+        scores = masked_whole.surfaces(half, valid, templates.astype(dtype), 0.5)[:, :, : 80 - 31]
+        assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6
