@@ -116,7 +116,15 @@ def correlate(
     inverse_norms: FloatImage,
     models: list[FloatImage],
 ) -> None:
-    """Write the scores of all templates to ``out`` (T, H-h+1, W-w+1)."""
+    """Write the scores of all templates.
+
+    Args:
+        out: (T, H-h+1, W-w+1) takes the scores.
+        window: (H, W).
+        moments: its mean and its sum of squares about it.
+        inverse_norms: (H-h+1, W-w+1) reciprocal norm of every patch; 0 makes its score 0.
+        models: T templates (h, w) of norm 1, about their means where the scores are.
+    """
     (height, width), (h, w) = out.shape[1:], models[0].shape
     (ny, rows), (nx, columns) = _division(height, h), _division(width, w)
     size, mean = (rows, columns), moments[0]
@@ -259,10 +267,15 @@ def _scratch(name: str, shape: tuple[int, ...]) -> FloatImage:
 
 
 def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
-    """In place, of which only so many rows are not zero, or wanted.
+    """Transform in place.
 
     OpenCV hands whole pictures to IPP where it is built with it, which is three to four times as fast as its own
     transform of a part of the rows.
+
+    Args:
+        values: (H, W) float32 or float64, or (H, W, 2) complex numbers.
+        flags: of ``cv2.dft``.
+        rows: how many are not zero, or of an inverse are wanted.
     """
     cv2.dft(values, values, flags, 0 if _uses_ipp() else rows)
 
