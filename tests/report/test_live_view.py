@@ -34,8 +34,8 @@ from rosbags.typesys import Stores, get_typestore
 from engine.report import live_view
 from engine.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 
-FRAMES = 5
-DARK = 3  # a frame that shows nothing
+FRAMES = 8
+DARK = 5  # a frame that shows nothing
 
 
 def rows_of(recording):
