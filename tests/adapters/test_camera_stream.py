@@ -6,12 +6,12 @@ import shlex
 import sys
 import time
 
-import cv2
 import numpy as np
 import pytest
 
 from engine.adapters.camera_stream import CameraStream, capture
 from engine.errors import TelemetryError
+from tests.support.videos import write_video
 
 WRITER = """
 import sys, time, cv2, numpy as np
@@ -83,10 +83,7 @@ def test_a_picture_that_repeats_is_none(command):
 
 def test_a_video_is_read_and_begins_again(tmp_path):
     path = str(tmp_path / "flight.avi")
-    video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
-    for k in range(5):
-        video.write(np.full((48, 64, 3), 40 * k, np.uint8))
-    video.release()
+    write_video(path, [40 * k for k in range(5)], rate_hz=10.0)
     assert count(taken(path, lambda found: count(found) >= 2)) == 2
 
 

@@ -36,6 +36,7 @@ from engine.formats.truth import interpolate_truth, read_truth, write_truth
 from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
 from tests.support.paths import SHARED
 from tests.support.photos import photograph
+from tests.support.videos import write_video
 
 FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
 
@@ -81,10 +82,7 @@ def folder(tmp_path):
 def video(tmp_path_factory):
     """Twelve frames; frame i is a flat picture of about 20 i."""
     path = tmp_path_factory.mktemp("video") / "flight.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
-    for index in range(12):
-        writer.write(np.full((48, 64, 3), 20 * index, np.uint8))
-    writer.release()
+    write_video(path, [20 * k for k in range(12)], rate_hz=10.0)
     return path
 
 

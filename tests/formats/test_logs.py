@@ -32,6 +32,7 @@ from engine.formats.truth import interpolate_truth, read_truth
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.towns import drawn_town
+from tests.support.videos import write_video
 
 
 def at(log, *seconds):
@@ -265,10 +266,7 @@ def test_a_list_of_frames_stamps_them(pictures, tmp_path):
 
 def test_a_video_has_its_own_times(tmp_path):
     path = tmp_path / "v.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 4.0, (32, 32))
-    for k in range(9):
-        writer.write(np.full((32, 32, 3), 20 * k, np.uint8))
-    writer.release()
+    write_video(path, [20 * k for k in range(9)], size=(32, 32), rate_hz=4.0)
     text = "".join(NEW.replace("{longitude}", "longitude").format(k=k, yaw=20.0 * k) for k in range(3))
     (tmp_path / "v.SRT").write_text(text)
     rows = open_flight(path, tmp_path / "v.SRT").rows
@@ -309,10 +307,7 @@ def extracted(folder, names):
 @pytest.mark.parametrize("ending", ["SRT", "srt"])
 def test_subtitles_beside_a_video_are_taken(tmp_path, ending):
     path = tmp_path / "DJI_0001.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (32, 32))
-    for k in range(5):
-        writer.write(np.full((32, 32, 3), 40 * k, np.uint8))
-    writer.release()
+    write_video(path, [40 * k for k in range(5)], size=(32, 32), codec="mp4v")
     assert not open_flight(path).rows
     subtitles(tmp_path / f"DJI_0001.{ending}", gimbal="[gb_yaw: 20.0 gb_pitch: -90.0 gb_roll: 0.0]")
     flight = open_flight(path)

@@ -21,6 +21,7 @@ from engine.runs.evaluation import _recorded_files
 from engine.runs.inputs import open_map
 from engine.runs.record import RunRecord
 from tests.support.photos import gimbal, photograph
+from tests.support.videos import write_video
 
 UTM, WEST, NORTH = "EPSG:32633", 598_000.0, 5_342_000.0
 FOCAL_35MM = 0xA405
@@ -227,10 +228,7 @@ def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_pat
 
 def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
     path = tmp_path / "DJI_0001.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (64, 48))
-    for k in range(3):
-        writer.write(np.full((48, 64, 3), 40 * k, np.uint8))
-    writer.release()
+    write_video(path, [40 * k for k in range(3)], codec="mp4v")
     cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: 80.0]\n\n"
     (tmp_path / "DJI_0001.SRT").write_text("".join(cue.format(n=k + 1, ms=40 * k) for k in range(3)))
     files = FlightFiles(map="m.tif", frames=path, hfov_deg=70.0)
@@ -242,10 +240,7 @@ def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
 def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     """Of a video with a log: pictures, stamps, heights and corrections are those of the frames that are left."""
     path = tmp_path / "DJI_0002.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
-    for k in range(8):
-        writer.write(np.full((48, 64, 3), 30 * k, np.uint8))
-    writer.release()
+    write_video(path, [30 * k for k in range(8)])
     cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: {h}]\n\n"
     cues = (cue.format(n=k + 1, ms=40 * k, h=80.0 + k * k) for k in range(8))
     (tmp_path / "DJI_0002.SRT").write_text("".join(cues))
