@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError, TelemetryError
+from engine.geo import wrap_heading_deg
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -120,7 +121,7 @@ class Frame:
         """The attitude with unknown roll and pitch as 0, or None where the heading is unknown."""
         if self.heading_deg is None:
             return None
-        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.heading_deg % 360.0 % 360.0)
+        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, wrap_heading_deg(self.heading_deg))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +151,7 @@ class GridPose:
         """The attitude about grid north, unknown roll and pitch taken as level; None without a heading."""
         if self.grid_heading_deg is None:
             return None
-        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, self.grid_heading_deg % 360.0 % 360.0)
+        return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, wrap_heading_deg(self.grid_heading_deg))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

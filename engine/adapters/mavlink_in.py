@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from engine.adapters.gimbal import body_behind, from_device, from_mount
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
 from engine.adapters.vision_in import has_failed, vision_velocity
+from engine.geo import wrap_heading_deg
 from engine.values import Attitude
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
@@ -205,7 +206,7 @@ class MavlinkTelemetry:
             return VehicleState(
                 roll_deg=roll,
                 pitch_deg=pitch,
-                heading_deg=None if heading is None else heading % 360.0 % 360.0,
+                heading_deg=None if heading is None else wrap_heading_deg(heading),
                 east_velocity_mps=east,
                 north_velocity_mps=north,
                 up_velocity_mps=up,
@@ -218,7 +219,7 @@ class MavlinkTelemetry:
 
     def _holder_at(self, time_ns: int) -> Attitude | None:
         held = self._holder.at(time_ns)
-        return None if held is None else Attitude(held[0], held[1], held[2] % 360.0 % 360.0)
+        return None if held is None else Attitude(held[0], held[1], wrap_heading_deg(held[2]))
 
     def _down_m(self, time_ns: int) -> float | None:
         """Distance below the origin; without a position ArduPilot states only the height above home.

@@ -15,7 +15,7 @@ from engine.formats.ros.messages import (
     range_from_message,
     stamp_ns,
 )
-from engine.geo import enu_from_body
+from engine.geo import enu_from_body, wrap_heading_deg
 
 __all__ = ["RESTART_NS", "RosTelemetry", "RosTopics"]
 
@@ -121,7 +121,7 @@ class RosTelemetry:
         return VehicleState(
             roll_deg=roll_deg,
             pitch_deg=pitch_deg,
-            heading_deg=None if heading_deg is None else heading_deg % 360.0 % 360.0,
+            heading_deg=None if heading_deg is None else wrap_heading_deg(heading_deg),
             east_velocity_mps=east_mps,
             north_velocity_mps=north_mps,
             velocity_sigma_mps=sigma_mps,
