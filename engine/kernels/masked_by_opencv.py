@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import masked_whole
+from engine.kernels.by_opencv import transform
 from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ def _scores(of_window: list[Array], of_template: list[Array], shape: tuple[int, 
 
     def sums(a: Array, b: Array) -> Array:
         product = cv2.mulSpectrums(a, b, 0, conjB=True)
-        cv2.dft(product, product, cv2.DFT_INVERSE | cv2.DFT_SCALE, shape[0])
+        transform(product, cv2.DFT_INVERSE | cv2.DFT_SCALE, shape[0])
         return np.asarray(product[: shape[0], : shape[1]])
 
     (m, i, ii), (n, t, tt) = of_window, of_template
@@ -74,6 +75,6 @@ def _spectra(picture: NDArray[Any], valid: Mask, size: tuple[int, int]) -> list[
     for values in (valid, centred, centred * centred):
         padded = np.zeros(size)
         padded[:height, :width] = values
-        cv2.dft(padded, padded, 0, height)
+        transform(padded, 0, height)
         out.append(padded)
     return out
