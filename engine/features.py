@@ -77,9 +77,7 @@ def sift(
         OptionError: An option is out of range.
     """
     _check_images(images, mask)
-    _check_options(max_keypoints, upsample, contrast_threshold, spread)
-    if not math.isfinite(up_deg):
-        raise OptionError(f"up_deg: expected a finite number, got {up_deg}")
+    _check_options(max_keypoints, up_deg, upsample, contrast_threshold, spread)
     up_rad = math.radians(up_deg) if upright else None
     options = _SiftOptions(max_keypoints, up_rad, int(upsample), contrast_threshold, root, spread)
     # Sums of what is not near [0, 1] may overflow, and the loops index by them.
@@ -186,9 +184,13 @@ def _check_images(images: Tensor, mask: Tensor | None) -> None:
         raise DtypeError(f"mask: expected bool, got {mask.dtype}")
 
 
-def _check_options(max_keypoints: int, upsample: int, contrast_threshold: float, spread: int) -> None:
+def _check_options(
+    max_keypoints: int, up_deg: float, upsample: int, contrast_threshold: float, spread: int
+) -> None:
     if max_keypoints < 1:
         raise OptionError(f"max_keypoints: expected at least 1, got {max_keypoints}")
+    if not math.isfinite(up_deg):
+        raise OptionError(f"up_deg: expected a finite number, got {up_deg}")
     if upsample not in (1, 2):
         raise OptionError(f"upsample: expected 1 or 2, got {upsample}")
     if not contrast_threshold >= 0:

@@ -37,15 +37,18 @@ class LoopPlan:
 
     Attributes:
         octaves: layout in the buffer of Gaussian levels, the filters along x and along y.
-        table: (octaves, 5) int64: height, width, offset, and the strides of level and row.
-        size: of the buffer.
+        table: (octaves, 5) int64, the octaves' layouts.
         upsample: samples per image pixel of the first octave.
     """
 
     octaves: tuple[tuple[Octave, Filters, Filters], ...]
     table: NDArray[np.int64]
-    size: int
     upsample: int
+
+    @property
+    def size(self) -> int:
+        """Of the buffer."""
+        return self.octaves[-1][0].end
 
     @property
     def first_sigma(self) -> np.float32:
@@ -67,8 +70,7 @@ def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
     for octave in octaves:
         down, across = (filters_of(octave, length) for length in octave.source)
         filtered.append((octave, across, down))
-    table = np.array([(o.height, o.width, o.offset, o.per_level, o.shape[3]) for o in octaves])
-    return LoopPlan(tuple(filtered), table, octaves[-1].end, upsample)
+    return LoopPlan(tuple(filtered), np.array([octave.layout for octave in octaves]), upsample)
 
 
 def filters_of(octave: Octave, length: int) -> Filters:
@@ -129,7 +131,7 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     threshold = contrast_threshold / SCALES
     limits = (SCALES, MOVES, threshold, MAX_SHIFT, EDGE_RATIO)
     for number, (octave, across, down) in enumerate(plan.octaves):
-        layout = (octave.height, octave.width, octave.offset, octave.per_level, octave.shape[3])
+        layout = octave.layout
         early = np.float32(EARLY * threshold)
         voxels = _in_parts(
             lambda part: find_extrema(source, across, down, buffer, layout, part, BORDER, early),  # noqa: B023

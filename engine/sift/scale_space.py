@@ -75,6 +75,11 @@ class Octave:
     offset: int
 
     @property
+    def layout(self) -> tuple[int, int, int, int, int]:
+        """Height, width, offset, and the strides of level and row."""
+        return self.height, self.width, self.offset, self.per_level, math.prod(self.shape[2:])
+
+    @property
     def per_level(self) -> int:
         """Stride of a level."""
         return math.prod(self.shape[1:])
@@ -143,7 +148,7 @@ def octaves_of(height: int, width: int, batch: int, upsample: int) -> tuple[Octa
 def make_plan(height: int, width: int, batch: int, upsample: int, device: torch.device) -> ScaleSpacePlan:
     """Lay out the scale space of tensor ops; cached for the most recent shapes, as frames come in few sizes."""
     octaves = octaves_of(height, width, batch, upsample)
-    table = [(o.height, o.width, o.offset, o.per_level, math.prod(o.shape[2:]), o.shape[3]) for o in octaves]
+    table = [(*octave.layout, octave.shape[3]) for octave in octaves]
     return ScaleSpacePlan(upsample, octaves, octaves[-1].end, torch.tensor(table).to(device))
 
 
