@@ -108,6 +108,7 @@ class RosTelemetry:
             heading_deg = yaw_deg if heading_deg is None else heading_deg
             east_mps, north_mps = self._velocity.at(time_ns) or (None, None)
             along_body = self._odometry.at(time_ns)
+            *_, stated_mps = self._odometry.nearest(time_ns) or (0.0,)  # 0 is not stated: nothing to interpolate
             slant_m, height_m = scalar(self._range.at(time_ns)), scalar(self._height.at(time_ns))
         above_m = height_m
         if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
@@ -117,7 +118,7 @@ class RosTelemetry:
         if along_body is not None and heading_deg is not None:
             turn = enu_from_body(roll_deg or 0.0, pitch_deg or 0.0, heading_deg)
             east_mps, north_mps, _ = (float(v) for v in turn @ along_body[:3])
-            sigma_mps = along_body[3] or None
+            sigma_mps = stated_mps or None
         return VehicleState(
             roll_deg=roll_deg,
             pitch_deg=pitch_deg,

@@ -347,6 +347,17 @@ def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, 
         assert frame.velocity_sigma_mps == (pytest.approx(told_mps) if told_mps else None)
 
 
+def test_an_accuracy_that_one_odometry_states_and_the_next_does_not_is_not_mixed(maker):
+    heard, step_ns = RosTelemetry(), 100_000_000
+    for time_ns, variances in ((NOW_NS, (0.04, 0.04, 0.04)), (NOW_NS + step_ns, None)):
+        heard.imu(maker.imu(time_ns, "", 0.0, 0.0, 90.0))
+        message = odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0), variances=variances)
+        heard.odometry(message, 0)
+    stated_mps = math.hypot(0.2, math.radians(1.0))
+    assert heard.vehicle(NOW_NS + step_ns // 4).velocity_sigma_mps == pytest.approx(stated_mps)
+    assert heard.vehicle(NOW_NS + 3 * step_ns // 4).velocity_sigma_mps is None
+
+
 def test_an_odometry_that_says_nothing(maker):
     angles = (0.0, 0.0, 0.0)
     for velocity in ((math.nan, 0.0, 0.0), (0.0, 1e4, 0.0)):
