@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,8 @@ next windows of a flight fall in the same region."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
 MAX_REGION_PX = 6 << 20
-"""Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 27 bytes."""
+"""Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 27 bytes, 31 with
+nodata."""
 _HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
 
 
@@ -81,7 +82,7 @@ class PreparedMap:
         search = region.search.crop(i, j, aligned.width_px, aligned.height_px)
         part = np.s_[j : j + aligned.height_px, i : i + aligned.width_px]
         if region.valid is None or region.mask is None or region.mask[part].all():
-            return Region(aligned, search, None)
+            return Region(aligned, replace(search, counts=None), None)
         return Region(aligned, search, region.valid[part], region.mask[part])
 
     def _region(self, window: Window, level: int) -> Region:
@@ -142,7 +143,7 @@ class PreparedMap:
         if mask is None or mask[inner].all():
             return Region(window, prepare(image), None)
         own = np.ascontiguousarray(mask[inner])
-        return Region(window, prepare(image), placed(own, self._device), own)
+        return Region(window, prepare(image, valid=own), placed(own, self._device), own)
 
 
 def _contains(region: Window, window: Window) -> bool:

@@ -15,12 +15,14 @@ import numpy as np
 from engine.device import Picture
 from engine.kernels import sums
 from engine.kernels.local import LocalScores
+from engine.kernels.sums import counts
 
 if TYPE_CHECKING:
     from engine.tensors import Tensor
 
 __all__ = [
     "LocalScores",
+    "counts",
     "halved",
     "integrals",
     "inverse_norm",

@@ -52,3 +52,8 @@ def check_finite(**arrays: NDArray[Any]) -> None:
     for name, array in arrays.items():
         if not (math.isfinite(array.sum(dtype=np.float64)) or np.isfinite(array).all()):
             raise OptionError(f"{name}: expected finite values, got NaN or infinity")
+
+
+def counts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Running sums (H+1, W+1) of the valid pixels of a mask (H, W); the first row and column are 0."""
+    return np.asarray(cv2.integral(np.ascontiguousarray(valid).view(np.uint8)))

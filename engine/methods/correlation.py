@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engine import coarse_to_fine
 from engine.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
+from engine.coarse_to_fine import QuickLook
 from engine.device import Picture, placed
 from engine.indexes.prepared import PreparedMap, Region
 from engine.methods.oblique import is_oblique, oblique_patch
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
+from engine.methods.scheduler import OutOfTime
 from engine.ncc_fft import match_template, ncc
-from engine.peaks import find_peak
+from engine.peaks import best_positions, find_peak
 from engine.scores import enhance
 from engine.values import GridPose, NoFix, Peak, Reason, Window
 from engine.window import SPREAD_SIGMAS, level_crop
@@ -24,6 +28,7 @@ Array = NDArray[np.float64]
 METHOD = "ncc"
 _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
 _MIN_SIDE_PX = 24  # of what is correlated there
+_EVERY_PLACE = "every place of a wide window"  # a step
 _GROUND_SHARE = 0.3  # of the height: within this distance of a frame's middle its ground is taken for a plane
 _SPREAD_SIGMAS = 2.0  # and within so many sigmas of the prior, where the position is less certain
 
@@ -155,8 +160,14 @@ class Correlator:
         """The prepared map under a window of full-resolution pixels."""
         return self.prepared.cut(level_crop(self.query.site, window, level), level)
 
-    def search(self, aligned: Aligned, window: Window) -> Peak | None:
-        """The peak in a window, in pixels of the aligned level; None where the template is nowhere on the map."""
+    def search(self, aligned: Aligned, window: Window, quick: QuickLook | None = None) -> Peak | None:
+        """The peak in a window, in pixels of the aligned level; None where the template is nowhere on the map.
+
+        Args:
+            aligned: the hypothesis.
+            window: in full-resolution map pixels.
+            quick: what is kept in a wide window although not every place was scored.
+        """
         query, options = self.query, self.options
         height, width = aligned.template.shape
         with query.scheduler.stage("map"):
@@ -164,21 +175,78 @@ class Correlator:
         if region.window.width_px < width or region.window.height_px < height:
             return None
         exclusion_px = options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
-        with query.scheduler.stage("match"):
-            if region.valid is None:
-                peak = match_template(
-                    region.search,
-                    placed(aligned.template, query.device),
-                    exclusion_px=exclusion_px,
-                    exhaustive=options.exhaustive,
-                )
-            else:
-                scores = self.masked_scores(region, aligned.template[None])
-                peak = find_peak(scores[0], exclusion_px=exclusion_px)
-                if peak.score <= -1.0:
-                    return None
-        x, y = peak.x + region.window.x0, peak.y + region.window.y0
-        return Peak(x, y, peak.score, peak.second_score, peak.curvature)
+        quick = None if quick is None else _about(quick, region.window)
+        peak = self._peak(region, aligned.template, exclusion_px, quick)
+        return None if peak.score <= -1.0 and region.valid is not None else _moved(peak, region.window)
+
+    def _peak(
+        self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
+    ) -> Peak:
+        """The peak coarse to fine where that suffices, else of every place, if there is time for it."""
+        scheduler, search = self.query.scheduler, region.search
+        with scheduler.stage("match"):
+            found = self._coarse_to_fine(region, template, exclusion_px, quick)
+            if found is not None:
+                return found
+            if not coarse_to_fine.is_wide(search):
+                return self._of_every_place(region, template, exclusion_px)
+        work_px = float(math.prod(search.image.shape))
+        if not scheduler.can_afford(_EVERY_PLACE, work_px):
+            scheduler.note_refusal(_EVERY_PLACE)
+            raise OutOfTime
+        with scheduler.costed(_EVERY_PLACE, work_px), scheduler.stage("match"):
+            return self._of_every_place(region, template, exclusion_px)
+
+    def _coarse_to_fine(
+        self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
+    ) -> Peak | None:
+        if not self._has_coarse_levels(region):
+            return None
+        least = self.options.min_valid_share
+        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=least, quick=quick)
+
+    def _has_coarse_levels(self, region: Region) -> bool:
+        """Whether places are scored at half resolution: on the CPU, and where pixels are about 0, as nodata is."""
+        on_cpu = isinstance(region.search.image, np.ndarray)
+        return on_cpu and not self.options.exhaustive and (region.valid is None or self.is_centred)
+
+    def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
+        if region.valid is not None:
+            return find_peak(self.masked_scores(region, template[None])[0], exclusion_px=exclusion_px)
+        own = placed(template, self.query.device)
+        return match_template(region.search, own, exclusion_px=exclusion_px, exhaustive=True)
+
+    @property
+    def is_centred(self) -> bool:
+        """Whether enhanced pixels lie about 0, which nodata is on a coarse level."""
+        return self.options.score != "grey" and self.options.enhance_radius_px > 0
+
+    def best_places(
+        self, aligned: Aligned, window: Window, separation_px: int, count: int
+    ) -> tuple[list[tuple[int, int, float]], Array] | None:
+        """The highest places of a window that are apart from each other.
+
+        Args:
+            aligned: the hypothesis.
+            window: in full-resolution map pixels; of a wide one on the CPU coarse to fine.
+            separation_px: places are more than this apart in x or in y.
+            count: upper bound on their number.
+
+        Returns:
+            Places (x, y, score) in falling order of the score, and the place (2,) that they count from, as
+            :meth:`surface`.
+        """
+        region, (height, width) = self.cut(window, aligned.level), aligned.template.shape
+        if region.window.width_px < width or region.window.height_px < height:
+            return None
+        if coarse_to_fine.is_wide(region.search) and self._has_coarse_levels(region):
+            places = coarse_to_fine.best_places(
+                region.search, aligned.template, separation_px, count, min_overlap=self.options.min_valid_share
+            )
+            if places is not None:
+                return places, np.array([region.window.x0, region.window.y0], np.float64)
+        surface = self.surface(aligned, window)
+        return None if surface is None else (best_positions(surface[0], separation_px, count), surface[1])
 
     def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
         """The whole surface that :meth:`search` finds its peak on, for reports.
@@ -213,6 +281,19 @@ class Correlator:
         """The camera's nadir (2,) in map pixels, from where its patch was found."""
         place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
         return self.query.site.full_from_level(place, aligned.level)
+
+
+def _moved(peak: Peak, window: Window) -> Peak:
+    """A peak of a window's surface, in pixels of the level."""
+    return replace(peak, x=peak.x + window.x0, y=peak.y + window.y0)
+
+
+def _about(quick: QuickLook, window: Window) -> QuickLook:
+    """A quick look at peaks of a window's surface, by one at peaks in pixels of the level."""
+    return QuickLook(
+        is_clear=lambda peak: quick.is_clear(_moved(peak, window)),
+        is_hopeless=lambda peak: quick.is_hopeless(_moved(peak, window)),
+    )
 
 
 def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:

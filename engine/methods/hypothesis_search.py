@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.coarse_to_fine import surfaces_over_nodata
 from engine.device import Picture, placed
 from engine.indexes.prepared import Region
 from engine.methods.correlation import Aligned, Correlator
@@ -177,6 +178,9 @@ def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.floa
         own = placed(templates, correlator.query.device)
         for several in surfaces(region.search, own, group=group):
             yield from several
+    elif region.search.counts is not None and correlator.is_centred:
+        least = correlator.options.min_valid_share
+        yield from surfaces_over_nodata(region.search, templates, min_overlap=least, group=group)
     else:
         for first in range(0, len(templates), group):
             yield from correlator.masked_scores(region, templates[first : first + group])

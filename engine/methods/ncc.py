@@ -19,13 +19,20 @@ from engine.methods.explanation import Explanation, explain_correlation
 from engine.methods.method import Method
 from engine.methods.oblique import is_ground_below, is_oblique
 from engine.methods.options import MatcherOptions
-from engine.methods.peak_evidence import PeakCandidate, agreement_of, features_of, fix_of, with_confidence
+from engine.methods.peak_evidence import (
+    PeakCandidate,
+    agreement_of,
+    features_of,
+    fix_of,
+    is_hopeless,
+    quick_look,
+    with_confidence,
+)
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.scheduler import OutOfTime
-from engine.methods.second_look import second_look
+from engine.methods.second_look import on_coarser_level, second_look
 from engine.orthomap import OrthoMap
-from engine.peaks import best_positions
 from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
@@ -214,7 +221,7 @@ class Ncc(Method):
         if searched or wide or query.prior is None:
             peak, aligned = hypothesis_search.search(correlator, aligned, window)
         else:
-            peak = correlator.search(aligned, window)
+            peak = correlator.search(aligned, window, quick_look(correlator, aligned, window, min_confidence))
             peak, aligned = self._over_its_ground(correlator, aligned, window, peak)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
@@ -256,14 +263,14 @@ class Ncc(Method):
         if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
             return ()
         correlator, aligned = self._correlator(query), found.aligned
-        with query.scheduler.stage("candidates"):
-            surface = correlator.surface(aligned, found.fix.window)
-        if surface is None:
-            return (found.fix,)
-        scores, corner_px = surface
         exclusion_px = self.options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
-        fixes = [found.fix]
-        for x, y, score in best_positions(scores, max(2, round(exclusion_px)), _MAX_CANDIDATES)[1:]:
+        apart_px = max(2, round(exclusion_px))
+        with query.scheduler.stage("candidates"):
+            best = correlator.best_places(aligned, found.fix.window, apart_px, _MAX_CANDIDATES)
+        if best is None:
+            return (found.fix,)
+        (places, corner_px), fixes = best, [found.fix]
+        for x, y, score in places[1:]:
             place = corner_px + np.array([x, y])
             peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
             fix = fix_of(correlator, aligned, peak, found.fix.window, searched=False)
@@ -328,18 +335,29 @@ class Ncc(Method):
             found: at the first look.
             window: that is looked at; None takes that of the first look, which the fix names in any case.
         """
-        correlator, window = self._correlator(query), window or found.fix.window
-        looked = second_look(correlator, found.aligned, window)
+        window = window or found.fix.window
+        coarse = on_coarser_level(self._correlator(query), found.aligned, window)
+        first = None if coarse is None else self._looked_at_by(query, found, coarse, window)
+        if first is not None and is_hopeless(first.fix.confidence or 0.0, self.options.rule.min_confidence):
+            return first
+        return self._looked_at_by(query, found, found.aligned, window)
+
+    def _looked_at_by(
+        self, query: Query, found: PeakCandidate, aligned: Aligned, window: Window
+    ) -> PeakCandidate | None:
+        """The highest peak of the second look on the level of a hypothesis."""
+        correlator = self._correlator(query)
+        looked = second_look(correlator, aligned, window)
         if looked is None:
             return None
         peak = looked.peak
         if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
             elsewhere = found.peak.second_score / found.peak.score * peak.score
             peak = replace(peak, second_score=max(peak.second_score, elsewhere))
-        fix = fix_of(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
+        fix = fix_of(correlator, aligned, peak, found.fix.window, searched=found.searched)
         features = peak_features(peak, looked.chance_sigma, agreement_of(query, fix))
         fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
-        return PeakCandidate(peak, found.aligned, fix, features, found.searched)
+        return PeakCandidate(peak, aligned, fix, features, found.searched)
 
     def judge_again(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where the peak of the second look is accepted, else a refusal."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from engine.acceptance import judge_peak
+from engine.coarse_to_fine import QuickLook
 from engine.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
 from engine.covariance import misalignment_covariance_px2, ncc_covariance_m2, peak_covariance_px, score_sigma
 from engine.methods.correlation import METHOD, Aligned, Correlator
@@ -12,6 +14,8 @@ from engine.methods.query import Query
 from engine.scores import enhance
 from engine.values import Fix, Peak, Window
 
+HOPELESS_ODDS = 0.01
+"""Odds as a share of those that are asked for, below which what a quick look found is not looked at closely."""
 _EXPECTED_CHI_SQUARE = 2.0  # of two degrees of freedom
 
 
@@ -34,6 +38,39 @@ class PeakCandidate:
     searched: bool
 
 
+def quick_look(correlator: Correlator, aligned: Aligned, window: Window, min_confidence: float = 0.0) -> QuickLook:
+    """Which peaks of a wide window are kept although not every place was scored.
+
+    Args:
+        correlator: of the frame.
+        aligned: the hypothesis.
+        window: that is searched.
+        min_confidence: that is asked for, if more than the rule's.
+
+    Returns:
+        QuickLook: clear is a peak that is accepted without the null hypothesis; hopeless one whose odds are less
+        than :data:`HOPELESS_ODDS` of those that are asked for.
+    """
+    query, rule = correlator.query, correlator.options.rule
+    asked = max(rule.min_confidence, min_confidence)
+
+    def features(peak: Peak) -> PeakFeatures:
+        return features_of(query, aligned, peak, fix_of(correlator, aligned, peak, window, searched=False))
+
+    def is_clear(peak: Peak) -> bool:
+        known = features(peak)
+        confidence = probability(known)
+        refusal = judge_peak(peak, aligned.template.size, known, confidence, rule)
+        return refusal is None and confidence >= max(asked, rule.null_test_below)
+
+    return QuickLook(is_clear, lambda peak: is_hopeless(probability(features(peak)), asked))
+
+
+def is_hopeless(confidence: float, asked: float) -> bool:
+    """Whether a probability is so low that a closer look cannot be expected to bring what is asked for."""
+    return confidence * (1.0 - asked) < HOPELESS_ODDS * asked * (1.0 - confidence)
+
+
 def with_confidence(correlator: Correlator, found: PeakCandidate, min_confidence: float = 0.0) -> PeakCandidate:
     """The candidate with its probability; one that is not high must also beat the null hypothesis.
 
@@ -43,11 +80,12 @@ def with_confidence(correlator: Correlator, found: PeakCandidate, min_confidence
         min_confidence: the null hypothesis only lowers a probability, and is not asked about one below this, which
             suffices for nothing.
     """
-    query, peak, aligned = correlator.query, found.peak, found.aligned
+    query, peak, aligned, rule = correlator.query, found.peak, found.aligned, correlator.options.rule
     features = features_of(query, aligned, peak, found.fix)
     confidence = probability(features)
-    if min_confidence <= confidence < correlator.options.rule.null_test_below:
-        null_score = _null_score(correlator, aligned, found.fix.window)
+    if min_confidence <= confidence < rule.null_test_below:
+        matters = confidence >= max(rule.min_confidence, min_confidence)
+        null_score = _null_score(correlator, aligned, found.fix.window, peak.second_score, matters=matters)
         peak = replace(peak, second_score=max(peak.second_score, null_score))
         features = features_of(query, aligned, peak, found.fix)
         confidence = probability(features)
@@ -68,12 +106,26 @@ def agreement_of(query: Query, fix: Fix) -> PriorAgreement:
     return prior_agreement(fix, site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
 
 
-def _null_score(correlator: Correlator, aligned: Aligned, window: Window) -> float:
-    """The best score of the null-hypothesis templates: what this window gives to chance."""
+def _null_score(
+    correlator: Correlator, aligned: Aligned, window: Window, rival_score: float, *, matters: bool
+) -> float:
+    """The best score of the null-hypothesis templates: what this window gives to chance.
+
+    Args:
+        correlator: of the frame.
+        aligned: the hypothesis.
+        window: that was searched.
+        rival_score: of the peak's best rival: what is certainly below it does not count.
+        matters: whether the peak is accepted without it; else the best of a quick look is good enough.
+    """
     options, best = correlator.options, -1.0
+    quick = QuickLook(
+        is_clear=lambda peak: max(peak.score, peak.second_score) <= rival_score,
+        is_hopeless=lambda _: not matters,
+    )
     for patch in correlator.nowhere(aligned):
         enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
-        rival = correlator.search(replace(aligned, template=enhanced), window)
+        rival = correlator.search(replace(aligned, template=enhanced), window, quick)
         best = best if rival is None else max(best, rival.score)
     return best
 

@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.coarse_to_fine import WIDE_PX
 from engine.device import on_host, placed
 from engine.methods.correlation import Aligned, Correlator
 from engine.ncc_fft import ncc
 from engine.peaks import find_peak
 from engine.scores import enhance, orientation
+from engine.search_levels import COARSE_TEMPLATE_PX
 from engine.values import Peak, Window
 from engine.window import level_crop
 
@@ -36,6 +38,27 @@ class SecondLook:
 
     peak: Peak
     chance_sigma: float
+
+
+def on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -> Aligned | None:
+    """The same hypothesis on the coarsest level on which a wide window is looked at first.
+
+    Args:
+        correlator: of the frame.
+        aligned: the hypothesis.
+        window: in full-resolution map pixels.
+
+    Returns:
+        Aligned | None: None where the window is not wide, or the template would be too small.
+    """
+    if aligned.work_px(window) <= WIDE_PX or correlator.options.exhaustive:
+        return None
+    for above in (2, 1):
+        level = aligned.level + above
+        if level < correlator.query.site.levels and min(aligned.template.shape) >> above >= COARSE_TEMPLATE_PX:
+            found = correlator.align(aligned.pose, level)
+            return found if isinstance(found, Aligned) else None
+    return None
 
 
 def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> SecondLook | None:

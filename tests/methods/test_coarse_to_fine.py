@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from engine import ShapeError, ncc_fft
+from engine import ShapeError, coarse_to_fine, ncc_fft
 from engine.ncc_fft import match_template, prepare
 from engine.scores import enhance
 from tests.support.towns import drawn_town
@@ -89,7 +89,7 @@ def test_coarse_to_fine_finds_what_an_exhaustive_search_finds(kind, town):
         for exclusion_px in EXCLUSION_PX:
             full = match_template(search, template, exclusion_px=exclusion_px, exhaustive=True)
             assert_same_peak(match_template(search, template, exclusion_px=exclusion_px), full, search, template)
-            quick = ncc_fft._coarse_to_fine(search, template.numpy(), exclusion_px)
+            quick = coarse_to_fine.peak(search, template.numpy(), exclusion_px)
             if quick is None:  # not trusted: every place is scored
                 continue
             quicker += 1
