@@ -156,6 +156,16 @@ class Correlator:
         min_px = ((width + 4) * scale, (height + 4) * scale)
         return query.window(center, footprint, min_px, margin=self.options.margin)
 
+    def near(self, aligned: Aligned, nadir_px: Array, slack_px: int) -> Window:
+        """The window that holds the template about a nadir, and so many full-resolution pixels to each side."""
+        site, scale = self.query.site, 2**aligned.level
+        height, width = aligned.template.shape
+        x0, y0 = (int(v) - slack_px for v in np.round(nadir_px + aligned.patch.offset_px * scale))
+        x1 = min(site.width_px, x0 + width * scale + 2 * slack_px)
+        y1 = min(site.height_px, y0 + height * scale + 2 * slack_px)
+        x0, y0 = max(0, x0), max(0, y0)
+        return Window(x0, y0, max(1, x1 - x0), max(1, y1 - y0))
+
     def cut(self, window: Window, level: int) -> Region:
         """The prepared map under a window of full-resolution pixels."""
         return self.prepared.cut(level_crop(self.query.site, window, level), level)

@@ -208,13 +208,7 @@ def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -
 
 def _near(correlator: Correlator, aligned: Aligned, nadir_px: Array, level: int) -> Peak | None:
     """The peak near a nadir that was found on some level, within a few pixels of that level."""
-    site, scale, slack = correlator.query.site, 2**aligned.level, _SLACK_PX * 2**level
-    height, width = aligned.template.shape
-    x0, y0 = (int(v) - slack for v in np.round(nadir_px + aligned.patch.offset_px * scale))
-    x1 = min(site.width_px, x0 + width * scale + 2 * slack)
-    y1 = min(site.height_px, y0 + height * scale + 2 * slack)
-    x0, y0 = max(0, x0), max(0, y0)
-    return correlator.search(aligned, Window(x0, y0, max(1, x1 - x0), max(1, y1 - y0)))
+    return correlator.search(aligned, correlator.near(aligned, nadir_px, _SLACK_PX * 2**level))
 
 
 def _refined(correlator: Correlator, peak: Peak, aligned: Aligned, rounds: int) -> tuple[Peak, Aligned]:

@@ -31,7 +31,7 @@ from engine.methods.peak_evidence import (
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.scheduler import OutOfTime
-from engine.methods.second_look import on_coarser_level, second_look
+from engine.methods.second_look import SecondLook, hopeful_look, second_look
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
 
@@ -336,28 +336,25 @@ class Ncc(Method):
             window: that is looked at; None takes that of the first look, which the fix names in any case.
         """
         window = window or found.fix.window
-        coarse = on_coarser_level(self._correlator(query), found.aligned, window)
-        first = None if coarse is None else self._looked_at_by(query, found, coarse, window)
-        if first is not None and is_hopeless(first.fix.confidence or 0.0, self.options.rule.min_confidence):
-            return first
-        return self._looked_at_by(query, found, found.aligned, window)
-
-    def _looked_at_by(
-        self, query: Query, found: PeakCandidate, aligned: Aligned, window: Window
-    ) -> PeakCandidate | None:
-        """The highest peak of the second look on the level of a hypothesis."""
         correlator = self._correlator(query)
-        looked = second_look(correlator, aligned, window)
-        if looked is None:
-            return None
+        hopeful = hopeful_look(correlator, found.aligned, window)
+        if hopeful is not None:
+            best = self._candidate(correlator, found, hopeful)
+            if is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
+                return best
+        looked = second_look(correlator, found.aligned, window)
+        return None if looked is None else self._candidate(correlator, found, looked)
+
+    def _candidate(self, correlator: Correlator, found: PeakCandidate, looked: SecondLook) -> PeakCandidate:
+        """What the peak of a second look means."""
         peak = looked.peak
         if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
             elsewhere = found.peak.second_score / found.peak.score * peak.score
             peak = replace(peak, second_score=max(peak.second_score, elsewhere))
-        fix = fix_of(correlator, aligned, peak, found.fix.window, searched=found.searched)
-        features = peak_features(peak, looked.chance_sigma, agreement_of(query, fix))
+        fix = fix_of(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
+        features = peak_features(peak, looked.chance_sigma, agreement_of(correlator.query, fix))
         fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
-        return PeakCandidate(peak, aligned, fix, features, found.searched)
+        return PeakCandidate(peak, found.aligned, fix, features, found.searched)
 
     def judge_again(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where the peak of the second look is accepted, else a refusal."""

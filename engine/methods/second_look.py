@@ -18,13 +18,16 @@ from engine.coarse_to_fine import WIDE_PX
 from engine.device import on_host, placed
 from engine.methods.correlation import Aligned, Correlator
 from engine.ncc_fft import ncc
-from engine.peaks import find_peak
+from engine.peaks import best_positions, find_peak
 from engine.scores import enhance, orientation
 from engine.search_levels import COARSE_TEMPLATE_PX
 from engine.values import Peak, Window
 from engine.window import level_crop
 
 FloatImage = NDArray[np.float32]
+
+_PLACES, _APART_PX = 48, 2  # of a coarser level that are looked at closely, and how far they are apart there
+_NEAR_PX, _ABOUT_PX = 8, 32  # about such a place, and about the best of them, in pixels of the hypothesis' level
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +43,11 @@ class SecondLook:
     chance_sigma: float
 
 
-def on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -> Aligned | None:
-    """The same hypothesis on the coarsest level on which a wide window is looked at first.
+def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> SecondLook | None:
+    """What a second look at a wide window can show at best, by the places that a coarser level shows.
+
+    The best places of the coarser level are looked at on the hypothesis' own. Its rival is no more than the whole
+    window's, and chance is that about the best of them.
 
     Args:
         correlator: of the frame.
@@ -49,8 +55,33 @@ def on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -
         window: in full-resolution map pixels.
 
     Returns:
-        Aligned | None: None where the window is not wide, or the template would be too small.
+        SecondLook | None: None where the window is not wide, or its places have to be looked at one by one.
     """
+    coarse = _on_coarser_level(correlator, aligned, window)
+    scored = None if coarse is None else _scores(correlator, coarse, window, null=False)
+    if coarse is None or scored is None:
+        return None
+    site, (scores, crop) = correlator.query.site, scored
+    found: list[tuple[Peak, NDArray[np.float64]]] = []
+    for x, y, _ in best_positions(scores[0], _APART_PX, _PLACES):
+        nadir = site.full_from_level(np.array([x + crop.x0, y + crop.y0]) - coarse.patch.offset_px, coarse.level)
+        peak = _peak_of(correlator, aligned, correlator.near(aligned, nadir, _NEAR_PX << aligned.level))
+        if peak is not None:
+            found.append((peak, nadir))
+    if not found:
+        return None
+    best, nadir = max(found, key=lambda pair: pair[0].score)
+    about = second_look(correlator, aligned, correlator.near(aligned, nadir, _ABOUT_PX << aligned.level))
+    if about is None:
+        return None
+    exclusion_px = correlator.options.rule.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level)
+    rivals = [p.score for p, _ in found if np.hypot(p.x - best.x, p.y - best.y) > exclusion_px]
+    second = max([about.peak.second_score, *rivals])
+    return SecondLook(replace(about.peak, second_score=second), about.chance_sigma)
+
+
+def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -> Aligned | None:
+    """The same hypothesis on the coarsest level that serves; None where the window is not wide."""
     if aligned.work_px(window) <= WIDE_PX or correlator.options.exhaustive:
         return None
     for above in (2, 1):
@@ -59,6 +90,16 @@ def on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -
             found = correlator.align(aligned.pose, level)
             return found if isinstance(found, Aligned) else None
     return None
+
+
+def _peak_of(correlator: Correlator, aligned: Aligned, window: Window) -> Peak | None:
+    """The peak of the frame's own template, without what chance reaches; None where it is nowhere on the map."""
+    scored = _scores(correlator, aligned, window, null=False)
+    if scored is None or scored[0].max() <= -1.0:
+        return None
+    (scores, crop), exclusion_px = scored, float(max(scored[0].shape))
+    peak = find_peak(scores[0], exclusion_px=exclusion_px)
+    return replace(peak, x=peak.x + crop.x0, y=peak.y + crop.y0)
 
 
 def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> SecondLook | None:
@@ -72,6 +113,28 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
     Returns:
         SecondLook | None: None where the template is nowhere on the map.
     """
+    scored = _scores(correlator, aligned, window, null=True)
+    if scored is None:
+        return None
+    scores, crop = scored
+    chance = scores[1:][scores[1:] > -1.0]
+    if not chance.size:
+        return None
+    rule, site = correlator.options.rule, correlator.query.site
+    peak = find_peak(scores[0], exclusion_px=rule.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level))
+    peak = replace(
+        peak,
+        x=peak.x + crop.x0,
+        y=peak.y + crop.y0,
+        second_score=max(peak.second_score, float(chance.max())),
+    )
+    return SecondLook(peak, max(float(chance.std(dtype=np.float64)), 1e-3))
+
+
+def _scores(
+    correlator: Correlator, aligned: Aligned, window: Window, *, null: bool
+) -> tuple[FloatImage, Window] | None:
+    """Scores (T, H', W') of the frame, and of the null-hypothesis templates if asked for, and where they begin."""
     query, options = correlator.query, correlator.options
     crop = level_crop(query.site, window, aligned.level)
     height, width = aligned.template.shape
@@ -82,25 +145,13 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
         valid = query.site.valid(crop, aligned.level)
         valid = None if valid.all() else valid
     search = _channels(gray, options.enhance_radius_px, valid)
-    patches = [aligned.patch.gray, *correlator.nowhere(aligned)]
+    patches = [aligned.patch.gray, *(correlator.nowhere(aligned) if null else [])]
     stacked = np.stack([_channels(patch, options.enhance_radius_px, None) for patch in patches], axis=1)
     scores = on_host(ncc(placed(search, query.device), placed(stacked, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, about their mean, and costs places that are mostly on the map little.
         scores[:, _share_on_map(valid, height, width) < options.min_valid_share] = -1.0
-    chance = scores[1:][scores[1:] > -1.0]
-    if not chance.size:
-        return None
-    peak = find_peak(
-        scores[0], exclusion_px=options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
-    )
-    peak = replace(
-        peak,
-        x=peak.x + crop.x0,
-        y=peak.y + crop.y0,
-        second_score=max(peak.second_score, float(chance.max())),
-    )
-    return SecondLook(peak, max(float(chance.std(dtype=np.float64)), 1e-3))
+    return scores, crop
 
 
 def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[np.float64]:
