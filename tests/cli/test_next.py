@@ -63,6 +63,18 @@ def test_others_name_commands_that_exist(flight, tmp_path, capsys):
     assert parsed(next_of(capsys, ["dataset", "check", str(flight)])) == "track"
 
 
+def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, capsys):
+    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
+    given = ["check", *(f"--{option}={flight / name}" for option, name in names.items())]
+    for every, looked_at in ((1, 2), (2, 1)):
+        assert run([*given, f"--every={every}", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["looked_at"] == looked_at
+    words = next_of(capsys, [*given, "--every=2"])
+    assert parsed(words) == "track"
+    assert words[words.index("--every") + 1] == "2"
+    assert "--every" not in next_of(capsys, given)
+
+
 @pytest.mark.usefixtures("bare_runs")
 @pytest.mark.parametrize(("runs", "drawn"), [(["ncc"], "comparison.png"), (["ncc", "sift"], "comparison.html")])
 def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs, drawn):

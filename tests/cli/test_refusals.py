@@ -14,6 +14,7 @@ PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]
 ROS = ["bridge", "ros", "--map=m.tif"]
 SIMULATE = ["simulate", "--out=o"]
 TRACK = ["track", "--map=m.tif", "--camera=c.yaml", "--frames=f", "--out=o"]
+CHECK = ["check", "--map=m.tif", "--camera=c.yaml", "--frames=f"]
 LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
 COMMANDS = {
     "bridge": PLAYED, "ros": ROS, "simulate": [*SIMULATE, "--closed-loop"], "track": TRACK, "locate": LOCATE,
@@ -45,7 +46,7 @@ def said(capsys, arguments, code=2):
             for command in (PLAYED, ROS)
             for value in ("x", "-1", "99999")
         ),
-        *((command, "--every", value) for command in (TRACK, PLAYED) for value in ("0", "-3")),
+        *((command, "--every", value) for command in (TRACK, CHECK, PLAYED) for value in ("0", "-3")),
         (LOCATE, "--near", "48,16,1e200"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),

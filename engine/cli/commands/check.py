@@ -13,6 +13,7 @@ from engine.cli.options import (
     AnglesOption,
     CameraPitchOption,
     ColumnOption,
+    EveryOption,
     FramesOption,
     FrameStampsOption,
     HeadingOffsetOption,
@@ -48,6 +49,7 @@ def check(
     camera_pitch_deg: CameraPitchOption = None,
     scale_calibration: ScaleCalibrationOption = False,
     telemetry: Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help="As of track.")] = None,
+    every: EveryOption = 1,
     image_topic: ImageTopicOption = None,
     odometry_topic: OdometryTopicOption = None,
     frame_stamps: FrameStampsOption = None,
@@ -82,8 +84,8 @@ def check(
     files = FlightFiles(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic,
-        odometry_topic=odometry_topic, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
-        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        odometry_topic=odometry_topic, every=every, map_sigma_m=map_sigma_m, map_bounds=map_bounds,
+        map_crs=map_crs, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
         scale_calibration=scale_calibration,
         corrections=corrections(angles, columns, heading_offset_deg, height_offset_m, telemetry_offset_s),
     )  # fmt: skip
@@ -95,6 +97,7 @@ def check(
         console.print_pairs(f"check of {frames}", as_rows(found, corrected=not files.corrections.changes_nothing))
     given = console.options(
         map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, mount=mount, map_bounds=map_bounds,
-        map_crs=map_crs, frames=frames, telemetry=telemetry, settings=settings_path, start=start,
+        map_crs=map_crs, frames=frames, every=None if every == 1 else every, telemetry=telemetry,
+        settings=settings_path, start=start,
     )  # fmt: skip
     console.next_step(f"track {given} --out out", as_json=as_json)
