@@ -58,14 +58,17 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
         SecondLook | None: None where the window is not wide, or its places have to be looked at one by one.
     """
     coarse = _on_coarser_level(correlator, aligned, window)
-    scored = None if coarse is None else _scores(correlator, coarse, window, null=False)
-    if coarse is None or scored is None:
+    if coarse is None:
         return None
+    scored = _scores(correlator, coarse, window, _templates(correlator, coarse, null=False))
+    if scored is None:
+        return None
+    own = _templates(correlator, aligned, null=False)
     site, (scores, crop) = correlator.query.site, scored
     found: list[tuple[Peak, NDArray[np.float64]]] = []
     for x, y, _ in best_positions(scores[0], _APART_PX, _PLACES):
         nadir = site.full_from_level(np.array([x + crop.x0, y + crop.y0]) - coarse.patch.offset_px, coarse.level)
-        peak = _peak_of(correlator, aligned, correlator.near(aligned, nadir, _NEAR_PX << aligned.level))
+        peak = _peak_of(correlator, aligned, correlator.near(aligned, nadir, _NEAR_PX << aligned.level), own)
         if peak is not None:
             found.append((peak, nadir))
     if not found:
@@ -92,9 +95,9 @@ def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) 
     return None
 
 
-def _peak_of(correlator: Correlator, aligned: Aligned, window: Window) -> Peak | None:
+def _peak_of(correlator: Correlator, aligned: Aligned, window: Window, own: FloatImage) -> Peak | None:
     """The peak of the frame's own template, without what chance reaches; None where it is nowhere on the map."""
-    scored = _scores(correlator, aligned, window, null=False)
+    scored = _scores(correlator, aligned, window, own)
     if scored is None or scored[0].max() <= -1.0:
         return None
     (scores, crop), exclusion_px = scored, float(max(scored[0].shape))
@@ -113,7 +116,7 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
     Returns:
         SecondLook | None: None where the template is nowhere on the map.
     """
-    scored = _scores(correlator, aligned, window, null=True)
+    scored = _scores(correlator, aligned, window, _templates(correlator, aligned, null=True))
     if scored is None:
         return None
     scores, crop = scored
@@ -131,10 +134,17 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
     return SecondLook(peak, max(float(chance.std(dtype=np.float64)), 1e-3))
 
 
+def _templates(correlator: Correlator, aligned: Aligned, *, null: bool) -> FloatImage:
+    """Channels (3, T, h, w) of the frame, and of the null-hypothesis templates if asked for."""
+    patches = [aligned.patch.gray, *(correlator.nowhere(aligned) if null else [])]
+    radius_px = correlator.options.enhance_radius_px
+    return np.stack([_channels(patch, radius_px, None) for patch in patches], axis=1)
+
+
 def _scores(
-    correlator: Correlator, aligned: Aligned, window: Window, *, null: bool
+    correlator: Correlator, aligned: Aligned, window: Window, templates: FloatImage
 ) -> tuple[FloatImage, Window] | None:
-    """Scores (T, H', W') of the frame, and of the null-hypothesis templates if asked for, and where they begin."""
+    """Scores (T, H', W') of templates by all channels, and where they begin; None where these do not fit."""
     query, options = correlator.query, correlator.options
     crop = level_crop(query.site, window, aligned.level)
     height, width = aligned.template.shape
@@ -145,9 +155,7 @@ def _scores(
         valid = query.site.valid(crop, aligned.level)
         valid = None if valid.all() else valid
     search = _channels(gray, options.enhance_radius_px, valid)
-    patches = [aligned.patch.gray, *(correlator.nowhere(aligned) if null else [])]
-    stacked = np.stack([_channels(patch, options.enhance_radius_px, None) for patch in patches], axis=1)
-    scores = on_host(ncc(placed(search, query.device), placed(stacked, query.device)).mean(0))
+    scores = on_host(ncc(placed(search, query.device), placed(templates, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, about their mean, and costs places that are mostly on the map little.
         scores[:, _share_on_map(valid, height, width) < options.min_valid_share] = -1.0
