@@ -230,7 +230,8 @@ def _gathered(parts: list[NamedArrays], indices: list[NDArray[np.intp]]) -> Name
     found = {name: np.empty((ends[-1], *like.shape[1:]), like.dtype) for name, like in parts[0].items()}
     for part, index, end in zip(parts, indices, ends, strict=True):
         for name, values in part.items():
-            values.take(index, axis=0, out=found[name][end - len(index) : end], mode="clip")  # "raise" copies twice
+            out = found[name][end - len(index) : end]
+            values.take(index, axis=0, out=out, mode="clip")  # "raise" would copy twice
     return found
 
 
