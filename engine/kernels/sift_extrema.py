@@ -1,7 +1,7 @@
 """SIFT's scale space and the extrema in it for the CPU, compiled by numba.
 
 A CPU's cache holds a few rows of a picture and not all its levels, so the work goes by strips of rows and reuses
-them while they are cached. To the loops a strip is one long row, since to enter a loop costs as much as many pixels.
+them while they are cached. To the loops a strip is one long row: entering a loop costs as much as many pixels.
 ``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`.
 """
 
