@@ -1,30 +1,44 @@
-"""Fixtures that many tests use: the shared flights, a simulated town and flight, and a ground drawn ray by ray."""
+"""Fixtures that many tests use: the shared flights, a simulated town and flight, and a ground drawn ray by ray.
+
+What takes long to import is imported by the fixtures: the process that hands tests to workers runs none of them.
+"""
 
 from __future__ import annotations
 
+import gc
 import os
 
 import cv2
 import hypothesis
 import numpy as np
 import pytest
-import torch
 
 from engine import Fix
 from engine.sim import plan_flight
 from tests.support import towns
-from tests.support.ground import CAMERA, Ground
 from tests.support.paths import NO_SHARED, SHARED
-from tests.support.runs import bare_runs
 from tests.support.towns import drawn_once, drawn_town, site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Half a million objects of modules and tests stay: the collector does not look through them again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread():
     """Results do not depend on the number of cores, and test runs side by side do not fight for them."""
+    import torch
+
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
 
@@ -40,6 +54,8 @@ def _no_home_directory(tmp_path_factory):
 @pytest.fixture(name="bare_runs")
 def _bare_runs():
     """For tests of commands: see :func:`tests.support.runs.bare_runs`."""
+    from tests.support.runs import bare_runs
+
     with bare_runs():
         yield
 
@@ -94,12 +110,16 @@ def other_site():
 @pytest.fixture(scope="session")
 def camera():
     """The paper's: 300 x 300 px, 60 degrees, straight down."""
+    from tests.support.ground import CAMERA
+
     return CAMERA
 
 
 @pytest.fixture(scope="session")
 def ground():
     """Ground on the central meridian: the map's up is true north to 0.003 degrees."""
+    from tests.support.ground import Ground
+
     return Ground()
 
 

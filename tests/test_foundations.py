@@ -331,6 +331,7 @@ def test_a_matcher_takes_one_thread_unless_somebody_chose():
     """In processes of their own: the number of threads is the process's. Forks share what was imported."""
     program = """
 import numpy as np, os, torch, cv2, sys
+import engine.methods.ncc, numba, pyproj, rasterio  # what a map and a matcher load
 from engine import Camera, OrthoMap, SceneMatcher, set_threads
 for chosen in sys.argv[1:]:
     if os.fork():

@@ -32,6 +32,7 @@ EXEC = "exec:"
 
 _REOPEN_S = 1.0
 _STALL_S = 2.0  # without a picture, after which the camera is opened again
+_START_S = 15.0  # the same of a command before its first picture: it may start as slowly
 _CLOSE_S = 3.0  # that closing waits for a read in progress
 _IDLE_S = 0.5  # without a new picture, after which the caller is woken
 _READ_BYTES = 65536
@@ -160,7 +161,7 @@ class CameraStream:
         self._last: Image | None = None
         self._arrived_s = time.monotonic()
         self._number = 0  # of the present reader; an older one that still blocks is not listened to
-        self._has_read = False
+        self._has_read = self._has_started = False  # ever; since it was opened last
         self._start(self._open())
 
     def next(self, timeout_s: float) -> tuple[Image, int] | None:
@@ -204,8 +205,8 @@ class CameraStream:
         """Why the source must be opened again; None while pictures come, if only repeated ones."""
         if not self._thread.is_alive():
             return "the stream ended"
-        stalled = time.monotonic() - self._arrived_s > _STALL_S
-        return f"no picture for {_STALL_S:g} s" if stalled else None
+        limit_s = _START_S if self._name.startswith(EXEC) and not self._has_started else _STALL_S
+        return f"no picture for {limit_s:g} s" if time.monotonic() - self._arrived_s > limit_s else None
 
     def _is_repeated(self, image: Image) -> bool:
         before, self._last = self._last, image
@@ -217,7 +218,7 @@ class CameraStream:
         return _OpenCvSource(self._name)
 
     def _start(self, source: _Source) -> None:
-        self._source = source
+        self._source, self._has_started = source, False
         self._thread = threading.Thread(
             target=self._read, args=(source, self._number), name="scenematch-camera", daemon=True
         )
@@ -228,7 +229,8 @@ class CameraStream:
             while self._number == number and (picture := source.read()) is not None:
                 with self._changed:
                     if self._number == number:
-                        self._newest, self._arrived_s, self._has_read = picture, time.monotonic(), True
+                        self._newest, self._arrived_s = picture, time.monotonic()
+                        self._has_read = self._has_started = True
                         self._changed.notify_all()
         except (cv2.error, OSError, ValueError) as error:
             _log.warning("camera %s: %s", quoted(self._name), error)

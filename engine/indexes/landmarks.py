@@ -102,15 +102,8 @@ class LandmarkMap:
         keys = _keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
         self._tiles.evict(_count, self._max_landmarks, keep=len(keys))
-        low = np.array([window.x0, window.y0]) - 0.5
-        high = low + np.array([window.width_px, window.height_px])
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
-        parts = []
-        for tile in tiles:
-            xy = tile["xy_px"]
-            inside = ((xy >= low) & (xy < high)).all(axis=1) & (tile["rank"] < max_rank)
-            parts.append({name: values[inside] for name, values in tile.items()})
-        return self._to_landmarks(_concatenated(parts))
+        return self._to_landmarks(_gathered(tiles, [_inside(tile, window, max_rank) for tile in tiles]))
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
         """Describe whole levels, upright and not, and cache them in a file where the map comes from one.
@@ -221,6 +214,25 @@ def _keys(window: Window, level: int, upright: bool) -> list[_Key]:
     rows = range(window.y0 // TILE_PX, bottom // TILE_PX + 1)
     columns = range(window.x0 // TILE_PX, right // TILE_PX + 1)
     return [(level, upright, row, column) for row in rows for column in columns]
+
+
+def _inside(tile: NamedArrays, window: Window, max_rank: int) -> NDArray[np.intp]:
+    """Indices of a tile's landmarks in a window, those below a rank."""
+    x, y = tile["xy_px"].T
+    left, top = window.x0 - 0.5, window.y0 - 0.5
+    inside = (x >= left) & (x < left + window.width_px) & (y >= top) & (y < top + window.height_px)
+    return np.flatnonzero(inside & (tile["rank"] < max_rank))
+
+
+def _gathered(parts: list[NamedArrays], indices: list[NDArray[np.intp]]) -> NamedArrays:
+    """Chosen rows of all parts one after the other, copied once."""
+    ends = np.cumsum([len(index) for index in indices])
+    found = {name: np.empty((ends[-1], *like.shape[1:]), like.dtype) for name, like in parts[0].items()}
+    for part, index, end in zip(parts, indices, ends, strict=True):
+        for name, values in part.items():
+            out = found[name][end - len(index) : end]
+            values.take(index, axis=0, out=out, mode="clip")  # "raise" would copy twice
+    return found
 
 
 def _concatenated(parts: list[NamedArrays]) -> NamedArrays:

@@ -11,8 +11,8 @@ FORBIDDEN = -1e30
 
 
 @compiled
-def two_nearest(cosine, own, other, least_cos, most_log, best, index, second):
-    """For each query the largest cosine among the allowed pairs, its row, and the second largest.
+def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, second, mutual):
+    """For each query the largest cosine among the allowed pairs, its row, and the second largest, of rows so far.
 
     Args:
         cosine: (M, N) float32 of M others with N queries; those of pairs that are not allowed are overwritten.
@@ -20,14 +20,14 @@ def two_nearest(cosine, own, other, least_cos, most_log, best, index, second):
         other: (3, M) float32 likewise of the others, by the known rotation and scale.
         least_cos: of the difference of two angles; -2 allows all.
         most_log: difference of two logarithms of scale; infinite allows all.
-        best: (N,) float32 takes the largest cosine, minus infinity where there is none.
-        index: (N,) int32 takes its row, the first of equal ones.
-        second: (N,) float32 takes the second largest, minus infinity where there is one row.
+        start: of these rows among all.
+        best: (N,) float32 the largest cosine of the rows before, minus infinity where there is none; updated.
+        index: (N,) int64 its row among all, the first of equal ones; updated.
+        second: (N,) float32 the second largest, minus infinity where there is one row; updated.
+        mutual: (N,) bool whether no other query has a larger cosine with that row; updated.
     """
-    best[:] = second[:] = np.float32(-np.inf)
-    index[:] = 0
     for m in range(len(cosine)):
-        row, at = cosine[m], np.int32(m)
+        row, at = cosine[m], np.int64(start + m)
         _forbid_scales(row, own[0], other[0, m], most_log)
         if least_cos > -1:
             _forbid_angles(row, own[1], own[2], other[1, m], other[2, m], least_cos)
@@ -38,6 +38,12 @@ def two_nearest(cosine, own, other, least_cos, most_log, best, index, second):
             second[n] = rest if rest > next_best else next_best
             index[n] = at if is_best else index[n]
             best[n] = value if is_best else top
+    for n in range(best.size):
+        if index[n] >= start:
+            row, larger = cosine[index[n] - start], 0
+            for k in range(row.size):
+                larger += row[k] > best[n]
+            mutual[n] = larger == 0
 
 
 @compiled

@@ -1,7 +1,8 @@
 """SIFT's scale space and the extrema in it for the CPU, compiled by numba.
 
-A CPU's cache holds a few rows of a picture and not all its levels, so the work goes row by row and reuses rows
-while they are cached. ``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`.
+A CPU's cache holds a few rows of a picture and not all its levels, so the work goes by strips of rows and reuses
+them while they are cached. To the loops a strip is one long row: entering a loop costs as much as many pixels.
+``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`.
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ import numpy as np
 from engine.kernels.jit import compiled
 
 TAPS = 4
-"""Taps of a filter that one pass over a row applies; filters are padded with zeros to a multiple of it."""
+"""Taps of a filter that one pass over a strip applies; filters are padded with zeros to a multiple of it."""
+_STRIP = 8  # rows of the octave that are written at a time; a multiple of a word of flags and of both phases
 
 
 @compiled
 def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
-    """Write the Gaussian levels of one picture's octave row by row, and find the extrema of their differences.
+    """Write the Gaussian levels of one picture's octave, and find the extrema of their differences.
 
     Args:
         source: (H, W) float32.
@@ -32,28 +34,26 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
     Returns:
         (M, 3) int64 level, y, x of the voxels where |DoG| is the maximum of its 3 x 3 x 3.
     """
-    height, width, offset, per_level, per_row = layout
-    up, dogs = across[0].shape[1], len(down[1]) - 1
-    first, end = max(rows[0] - 1, 0), min(rows[1] + 1, height)
-    tall, start = _between_zeros(source, down[1], first // up, (end - 1) // up + 1)
-    lines = np.zeros((dogs + 1, up, source.shape[1] + 2 * _padding(across[1])), np.float32)
-    sizes = np.zeros((3, dogs, width), np.float32)  # |DoG| of the last three rows
-    work = np.empty((dogs + 1, width), np.float32), np.zeros((width + 7) // 8 * 8, np.uint8)
+    height, width, _, _, _ = layout
+    up, dogs, margin = across[0].shape[1], len(down[1]) - 1, _padding(across[1])
+    low, high = max(rows[0] - 1, 0) // up, min(rows[1], height - 1) // up + 1  # rows of the source
+    searched = max(rows[0], border), min(rows[1], height - border)
+    tall, start = _between_zeros(source, down[1], margin, low, high), low - _padding(down[1])
+    wide = source.shape[1] + 2 * margin
+    lines = np.empty((up, _STRIP // up * wide), np.float32)
+    filtered = np.empty((2, _STRIP // up * wide), np.float32)
+    sizes = np.zeros((dogs, (_STRIP + 2) * width), np.float32)  # |DoG| of a strip and of the two rows before it
+    work = np.empty((dogs + 1, _STRIP * width), np.float32), np.zeros(_STRIP * width, np.uint8)
     found, count = np.empty((256, 3), np.int64), np.int64(0)  # by a literal 0, the callee compiles twice
-    for y in range(first, end):
+    for row in range(low, high, _STRIP // up):
+        held = min(_STRIP // up, high - row)
+        strip = up * row, min(up * (row + held), height)
         for level in range(dogs + 1):
-            at = offset + level * per_level + y * per_row
-            out = buffer[at : at + width]
-            if y % up == 0 or y == first:
-                _down_rows(lines[level], tall, y // up - start, source.shape[1], level, down, _padding(across[1]))
-            _across_row(out, lines[level, y % up], level, across, _gain_of(down[2], level, y, height))
-            if level > 0:
-                finer, size = buffer[at - per_level : at - per_level + width], sizes[y % 3, level - 1]
-                for x in range(width):
-                    size[x] = abs(out[x] - finer[x])
-        middle = y - 1
-        if max(rows[0], border) <= middle < min(rows[1], height - border) and width > 2 * border:
-            found, count = _extrema_of_row(sizes, middle, border, threshold, work, found, count)
+            _filter_down(lines, held * wide, tall, (row - start) * wide, wide, level, down)
+            _filter_across(buffer, lines, held * wide, filtered, wide, strip, level, across, down, layout)
+        _differ(sizes, buffer, strip, layout)
+        if width > 2 * border:
+            found, count = _extrema_of_strip(sizes, width, strip, searched, border, threshold, work, found, count)
     return found[:count]
 
 
@@ -66,16 +66,17 @@ def _padding(reach):
 
 
 @compiled
-def _between_zeros(source, reach, first, end):
-    """Rows that the filters of rows ``first`` to ``end`` read, zeros beyond the picture; index of the first."""
+def _between_zeros(source, reach, margin, low, high):
+    """Rows that the filters of rows ``low`` to ``high`` read, flat, zeros beyond the picture and in a margin."""
     height, width = source.shape
-    start = first - _padding(reach)
-    tall = np.zeros((end + _padding(reach) - start) * width, np.float32)
-    for y in range(max(start, 0), min(end + _padding(reach), height)):
-        row = tall[(y - start) * width : (y - start + 1) * width]
+    start, wide = low - _padding(reach), width + 2 * margin
+    tall = np.zeros((high + _padding(reach) - start) * wide, np.float32)
+    for y in range(max(start, 0), min(high + _padding(reach), height)):
+        at = (y - start) * wide + margin
+        row = tall[at : at + width]
         for x in range(width):  # an assignment of slices would compile its message of unequal shapes
             row[x] = source[y, x]
-    return tall, start
+    return tall
 
 
 @compiled
@@ -85,36 +86,62 @@ def _taps(reach, up):
 
 
 @compiled
-def _down_rows(lines, tall, row, width, level, down, margin):
-    """Filter the columns about a row of the source: one line per phase, with a margin of zeros on either side."""
+def _filter_down(lines, size, tall, at, wide, level, down):
+    """Filter the columns about a strip of the source that begins at ``at``: its rows once for each phase."""
     weights, reach, _ = down
-    start, taps = (row - reach[level]) * width, _taps(reach[level], len(lines))
-    first = lines[0, margin : margin + width]
+    start, taps = at - reach[level] * wide, _taps(reach[level], len(lines))
     if len(lines) == 1:
-        _slide(first, tall, start, width, weights[level, 0], taps)
+        _slide(lines[0, :size], tall, start, wide, weights[level, 0], taps)
     else:
-        second = lines[1, margin : margin + width]
-        _slide_both(first, second, tall, start, width, weights[level, 0], weights[level, 1], taps)
+        _slide_both(
+            lines[0, :size], lines[1, :size], tall, start, wide, weights[level, 0], weights[level, 1], taps
+        )
 
 
 @compiled
-def _across_row(out, line, level, across, gain):
-    """Filter a line along itself, and apply the gains that make up for the edges."""
+def _filter_across(buffer, lines, size, filtered, wide, strip, level, across, down, layout):
+    """Filter a strip along its rows, and write it with the gains that make up for the edges."""
+    height, width, offset, per_level, per_row = layout
     weights, reach, gains = across
-    up, width = weights.shape[1], out.size
+    up = len(lines)
     start, taps = _padding(reach) - reach[level], _taps(reach[level], up)
-    if up == 1 and reach[level] == 0:
-        for x in range(width):
-            out[x] = line[start + x]
-    elif up == 1:
-        _slide(out, line, start, 1, weights[level, 0], taps)
-    else:
-        _slide_double(out, line, start, weights[level, 0], weights[level, 1], taps)
-    edge = gains.shape[2]
+    size -= 2 * _padding(reach)  # the last row's margin is only read
+    for phase in range(up):
+        if up == 1:
+            _slide(filtered[0, :size], lines[0], start, 1, weights[level, 0], taps)
+        else:
+            even, odd = weights[level, 0], weights[level, 1]
+            _slide_both(filtered[0, :size], filtered[1, :size], lines[phase], start, 1, even, odd, taps)
+        for y in range(strip[0] + phase, strip[1], up):
+            at, begin = offset + level * per_level + y * per_row, (y - strip[0]) // up * wide
+            out = buffer[at : at + width]
+            _interleave(out, filtered, begin, up)
+            _apply_gains(out, gains[:, level], _gain_of(down[2], level, y, height))
+
+
+@compiled
+def _interleave(out, filtered, begin, up):
+    if up == 1:
+        row = filtered[0, begin : begin + out.size]
+        for x in range(out.size):
+            out[x] = row[x]
+        return
+    even, odd = filtered[0, begin:], filtered[1, begin:]
+    for x in range(out.size // 2):
+        out[2 * x] = even[x]
+        out[2 * x + 1] = odd[x]
+    if out.size % 2:  # an upsampled row ends with an even place
+        out[out.size - 1] = even[out.size // 2]
+
+
+@compiled
+def _apply_gains(out, gains, gain):
+    """Apply the gains of the first and of the last columns, and that of the row."""
+    edge, width = gains.shape[1], out.size
     for x in range(edge):
-        out[x] *= gains[0, level, x]
+        out[x] *= gains[0, x]
     for x in range(max(edge, width - edge), width):
-        out[x] *= gains[1, level, x - width + edge]
+        out[x] *= gains[1, x - width + edge]
     if gain != 1:
         for x in range(width):
             out[x] *= gain
@@ -171,57 +198,48 @@ def _slide_both(first, second, values, start, stride, even, odd, taps):
 
 
 @compiled
-def _slide_double(out, values, start, even, odd, taps):
-    """out[2m + p] = sum over k of the weights of phase p[k] times values[start + k + m]."""
-    n = out.size // 2
-    for k in range(0, taps, TAPS):
-        a, b, c, d = even[k], even[k + 1], even[k + 2], even[k + 3]
-        e, f, g, h = odd[k], odd[k + 1], odd[k + 2], odd[k + 3]
-        at = start + k
-        p, q = values[at : at + n], values[at + 1 : at + 1 + n]
-        r, s = values[at + 2 : at + 2 + n], values[at + 3 : at + 3 + n]
-        if k == 0:
-            for m in range(n):
-                out[2 * m] = a * p[m] + b * q[m] + (c * r[m] + d * s[m])
-                out[2 * m + 1] = e * p[m] + f * q[m] + (g * r[m] + h * s[m])
-        else:
-            for m in range(n):
-                out[2 * m] += a * p[m] + b * q[m] + (c * r[m] + d * s[m])
-                out[2 * m + 1] += e * p[m] + f * q[m] + (g * r[m] + h * s[m])
-    if out.size % 2:  # an upsampled row ends with an even layout
-        total = np.float32(0)
-        for k in range(taps):
-            total += even[k] * values[start + k + n]
-        out[2 * n] = total
+def _differ(sizes, buffer, strip, layout):
+    """Append |DoG| of a strip to that of the two rows before it."""
+    _, width, offset, per_level, per_row = layout
+    for dog in range(len(sizes)):
+        size = sizes[dog]
+        for x in range(2 * width):
+            size[x] = size[size.size - 2 * width + x]
+        for y in range(strip[0], strip[1]):
+            at, begin = offset + dog * per_level + y * per_row, (y - strip[0] + 2) * width
+            finer, coarser = buffer[at : at + width], buffer[at + per_level : at + per_level + width]
+            row = size[begin : begin + width]
+            for x in range(width):
+                row[x] = abs(coarser[x] - finer[x])
 
 
 @compiled
-def _extrema_of_row(sizes, y, border, threshold, work, found, count):
-    """Append to ``found`` the extrema of row y, by |DoG| of three rows in ``sizes``."""
+def _extrema_of_strip(sizes, width, strip, searched, border, threshold, work, found, count):
+    """Append to ``found`` the extrema of all rows but the last of a strip, and of the last before it."""
     highest, flags = work
-    dogs, width = sizes.shape[1:]
-    inner = width - 2 * border
-    words = flags.view(np.uint64)
-    top = highest[dogs]
-    # Every loop runs over slices from 0 up: an index that might be negative would keep it from being vectorised.
-    left, centre, right = top[border - 1 :], top[border:], top[border + 1 :]
+    dogs, n = len(sizes), (strip[1] - strip[0]) * width
+    top, words = highest[dogs], flags.view(np.uint64)
     for s in range(dogs):
-        a, b, c, row = sizes[0, s], sizes[1, s], sizes[2, s], highest[s]
-        for x in range(width):
-            row[x] = max(max(a[x], b[x]), c[x])
+        above, middle, below, row = sizes[s], sizes[s, width:], sizes[s, 2 * width :], highest[s]
+        for x in range(n):
+            row[x] = max(max(above[x], middle[x]), below[x])
     for s in range(1, dogs - 1):
-        a, b, c, row = highest[s - 1], highest[s], highest[s + 1], sizes[y % 3, s, border : border + inner]
-        for x in range(width):
+        a, b, c = highest[s - 1], highest[s], highest[s + 1]
+        for x in range(n):
             top[x] = max(max(a[x], b[x]), c[x])
-        for x in range(inner):
-            flags[x] = row[x] >= max(max(left[x], centre[x]), max(right[x], threshold))
-        for w in range(words.size):
+        # Slices from 0 up: an index that might be negative would keep the loop from being vectorised. Neighbours
+        # at the ends of rows are of other rows, where nothing is searched.
+        size, flag, left, centre, right = sizes[s, width + 1 :], flags[1:], top, top[1:], top[2:]
+        for x in range(n - 2):
+            flag[x] = size[x] >= max(max(left[x], centre[x]), max(right[x], threshold))
+        for w in range((n + 7) // 8):
             if words[w] == 0:
                 continue
-            for x in range(8 * w, 8 * w + 8):
-                if flags[x]:
+            for at in range(8 * w, min(8 * w + 8, n - 1)):
+                y, x = strip[0] - 1 + at // width, at % width
+                if flags[at] and searched[0] <= y < searched[1] and border <= x < width - border:
                     if count == len(found):
                         found = np.concatenate((found, np.empty_like(found)))
-                    found[count, 0], found[count, 1], found[count, 2] = s, y, border + x
+                    found[count, 0], found[count, 1], found[count, 2] = s, y, x
                     count += 1
     return found, count

@@ -31,7 +31,7 @@ from engine.runs.inputs import open_map
 from engine.runs.last_fix import LastFix, last_fix_file
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
-from engine.runs.service import running_service
+from engine.runs.service import running_service, tell_status
 from engine.runs.settings import with_weights
 from engine.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
@@ -283,7 +283,9 @@ def _run(
         now = time.monotonic()
         if now - reported >= _MESSAGE_PERIOD_S:
             reported = now
-            progress.message(bridge.status.line())
+            line = bridge.status.line()
+            progress.message(line)
+            tell_status(line)
         if seconds is not None and now - begin >= seconds:
             return
     if count == 0:

@@ -1,4 +1,4 @@
-"""What systemd is told of a bridge that it runs: that it is ready, that its loop goes on, that it ends.
+"""What systemd is told of a bridge that it runs: that it is ready, that its loop goes on, how, that it ends.
 
 Nothing is sent where systemd does not ask for it by $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
 """
@@ -36,6 +36,11 @@ def running_service() -> Iterator[Callable[[], None]]:
         yield beat
     finally:
         _tell("STOPPING=1")
+
+
+def tell_status(line: str) -> None:
+    """Let ``systemctl status`` show a line."""
+    _tell(f"STATUS={line}")
 
 
 def _tell(state: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from engine.sift.values import Features, Matches
 from engine.tensors import Tensor, torch
 
 Floats = NDArray[np.float32]
+AnyArray = NDArray[Any]
 
 _TRAIN_CHUNK = 4096  # train slots that are compared at a time, which bounds the memory for a whole map's
 _FAR = 1e30
@@ -51,14 +53,10 @@ def match(
         OptionError: The ratio is not in (0, 1].
     """
     _check_ratio(ratio)
-    with torch.inference_mode():
-        limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
-        first, index, second, is_mutual = _nearest(query, train, limits)
-        nearest, next_nearest = _distance(first), _distance(second)
-        # Two equal distances give a ratio of 1, also where rounding puts one of them at 0.
-        quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
-        valid = nearest.isfinite() & (quotient <= ratio)
-    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+    if query.descriptors.device.type == "cpu":
+        return _by_loops(query, train, limits, ratio, mutual)
+    return _by_tensors(query, train, limits, ratio, mutual)
 
 
 def _check_ratio(ratio: float) -> None:
@@ -69,12 +67,24 @@ def _check_ratio(ratio: float) -> None:
 _Limits = tuple[float, float | None, float, float | None]  # rotation and its largest error, scale and its factor
 
 
+# -------------------------------------------------------------------------------------------------- tensor ops
+
+
+def _by_tensors(query: Features, train: Features, limits: _Limits, ratio: float, mutual: bool) -> Matches:
+    with torch.inference_mode():
+        first, index, second, is_mutual = _nearest(query, train, limits)
+        nearest, next_nearest = _distance(first), _distance(second)
+        # Two equal distances give a ratio of 1, also where rounding puts one of them at 0.
+        quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
+        valid = nearest.isfinite() & (quotient <= ratio)
+    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+
+
 def _nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """:func:`_two_nearest` over all train slots, by chunks that bound the memory."""
-    two_nearest = _two_nearest_by_loops if query.descriptors.device.type == "cpu" else _two_nearest
     found = []
     for start in range(0, max(1, train.valid.shape[1]), _TRAIN_CHUNK):
-        first, index, second, is_mutual = two_nearest(query, _slots(train, start, start + _TRAIN_CHUNK), limits)
+        first, index, second, is_mutual = _two_nearest(query, _slots(train, start, start + _TRAIN_CHUNK), limits)
         found.append((first, index + start, second, is_mutual))
     return found[0] if len(found) == 1 else _merged(found)
 
@@ -114,39 +124,6 @@ def _forbid(
         cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
 
 
-def _two_nearest_by_loops(
-    query: Features, train: Features, limits: _Limits
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """:func:`_two_nearest` on the CPU."""
-    from engine.kernels import nearest  # numba takes a while to import
-
-    rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
-    count, slots = max(len(query.valid), len(train.valid)), query.valid.shape[1]
-    first, second = np.empty((2, count, slots), np.float32)
-    index, is_mutual = np.zeros((count, slots), np.int32), np.zeros((count, slots), np.bool_)
-    least_cos = -2.0 if max_angle_diff_deg is None else math.cos(math.radians(min(max_angle_diff_deg, 180.0)))
-    most_log = np.float32(math.inf if max_scale_factor is None else math.log(max_scale_factor))
-    cosine = (train.descriptors @ query.descriptors.mT).float().numpy()
-    is_limited = max_scale_factor is not None
-    own = _angles_and_scales(query, rotation_deg, scale, is_limited)
-    other = _angles_and_scales(train, 0.0, 1.0, is_limited)
-    for n, table in enumerate(cosine):
-        pair = (own[:, min(n, len(query.valid) - 1)], other[:, min(n, len(train.valid) - 1)])
-        nearest.two_nearest(table, *pair, np.float32(least_cos), most_log, first[n], index[n], second[n])
-        if table.size:
-            is_mutual[n] = first[n] == table.max(axis=1)[index[n]]
-    of_slots = (first, index.astype(np.int64), second, is_mutual)
-    return tuple(map(torch.from_numpy, of_slots))  # type: ignore[return-value]
-
-
-def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:
-    """(3, B, N) logarithm of scale where that counts, NaN without a keypoint; cosine and sine of the angle."""
-    sizes = features.scale_px.float().numpy() if is_limited else np.ones(features.valid.shape, np.float32)
-    angle = np.deg2rad(features.angle_deg.float().numpy() + np.float32(rotation_deg))
-    log = np.log(np.where(features.valid.numpy(), np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
-    return np.stack([log, np.cos(angle), np.sin(angle)]).astype(np.float32)
-
-
 def _two_nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     cosine = query.descriptors @ train.descriptors.mT
@@ -167,6 +144,57 @@ def _merged(found: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> tuple[Tensor,
     best = first.argmax(dim=0, keepdim=True)
     others = first.scatter(0, best, second.gather(0, best))
     return first.gather(0, best)[0], index.gather(0, best)[0], others.amax(dim=0), is_mutual.gather(0, best)[0]
+
+
+# -------------------------------------------------------------------------------------------------------- loops
+
+
+def _by_loops(query: Features, train: Features, limits: _Limits, ratio: float, mutual: bool) -> Matches:
+    """The same on the CPU: a matrix product by torch, and one pass over it."""
+    first, index, second, is_mutual = _nearest_by_loops(query, train, limits)
+    nearest, next_nearest = (
+        np.where(c < _FORBIDDEN, np.inf, np.sqrt(np.maximum(2 - 2 * c, 0))) for c in (first, second)
+    )
+    with np.errstate(invalid="ignore"):  # of two that are infinite
+        quotient = np.maximum(nearest, _ROUNDING) / np.maximum(next_nearest, _ROUNDING)
+    quotient = np.where(np.isnan(quotient), np.float32(1), quotient)
+    valid = np.isfinite(nearest) & (quotient <= ratio)
+    columns = (index, nearest, quotient, valid & is_mutual if mutual else valid)
+    return Matches(*map(torch.from_numpy, columns))
+
+
+def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tuple[AnyArray, ...]:
+    """As :func:`_nearest`, in arrays."""
+    from engine.kernels import nearest  # numba takes a while to import
+
+    rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
+    count, slots = max(len(query.valid), len(train.valid)), query.valid.shape[1]
+    first, second = np.full((2, count, slots), -np.inf, np.float32)
+    index, is_mutual = np.zeros((count, slots), np.int64), np.zeros((count, slots), np.bool_)
+    least_cos = -2.0 if max_angle_diff_deg is None else math.cos(math.radians(min(max_angle_diff_deg, 180.0)))
+    most_log = np.float32(math.inf if max_scale_factor is None else math.log(max_scale_factor))
+    own = _angles_and_scales(query, rotation_deg, scale, max_scale_factor is not None)
+    other = _angles_and_scales(train, 0.0, 1.0, max_scale_factor is not None)
+    for n in range(count):
+        q, t = min(n, len(query.valid) - 1), min(n, len(train.valid) - 1)
+        out = (first[n], index[n], second[n], is_mutual[n])
+        for start in range(0, train.valid.shape[1], _TRAIN_CHUNK):
+            end = start + _TRAIN_CHUNK
+            with torch.inference_mode():
+                cosine = torch.mm(train.descriptors[t, start:end], query.descriptors[q].T).float().numpy()
+            angles = np.ascontiguousarray(other[:, t, start:end])
+            nearest.two_nearest(
+                cosine, np.ascontiguousarray(own[:, q]), angles, np.float32(least_cos), most_log, start, *out
+            )
+    return first, index, second, is_mutual
+
+
+def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:
+    """(3, B, N) logarithm of scale where that counts, NaN without a keypoint; cosine and sine of the angle."""
+    sizes = features.scale_px.float().numpy() if is_limited else np.ones(features.valid.shape, np.float32)
+    angle = np.deg2rad(features.angle_deg.float().numpy() + np.float32(rotation_deg))
+    log = np.log(np.where(features.valid.numpy(), np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
+    return np.stack([log, np.cos(angle), np.sin(angle)]).astype(np.float32)
 
 
 def _fields(features: Features) -> tuple[Tensor, ...]:

@@ -72,6 +72,18 @@ def test_a_stream_that_stalls_is_opened_again(command, monkeypatch):
     taken(command(count=4, wait_s=60.0), lambda found: count(found) >= 5)
 
 
+def test_a_camera_that_starts_slowly_is_waited_for(command, monkeypatch, caplog):
+    """An interpreter that imports OpenCV takes longer to its first picture than a camera in use may be silent."""
+    monkeypatch.setattr("engine.adapters.camera_stream._STALL_S", 0.05)
+    assert count(taken(command(count=1, wait_s=60.0), lambda pictures: count(pictures) == 1)) == 1
+    assert "opened again" not in caplog.text
+
+
+def test_a_camera_that_never_starts_is_opened_again(command, monkeypatch, caplog):
+    monkeypatch.setattr("engine.adapters.camera_stream._START_S", 0.2)
+    taken(command(count=0, wait_s=60.0), lambda _: "no picture for 0.2 s; opened again" in caplog.text)
+
+
 def test_a_picture_that_repeats_is_none(command):
     stream = CameraStream(command(count=12, repeats=6, wait_s=5.0))
     found = [stream.next(2.0) for _ in range(2)]

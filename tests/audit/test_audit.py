@@ -30,7 +30,7 @@ HALF = SIDE // 2
 
 @pytest.fixture(scope="module")
 def town_gray():
-    return cv2.cvtColor(drawn_town(5).ortho, cv2.COLOR_RGB2GRAY)[:SIDE, :SIDE]
+    return cv2.cvtColor(drawn_town(1).ortho, cv2.COLOR_RGB2GRAY)[:SIDE, :SIDE]
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ MIDDLE = (CORNER[0] + 450, CORNER[1] + 450)
 
 @pytest.fixture(scope="module")
 def gray():
-    town = cv2.cvtColor(drawn_town(5).ortho, cv2.COLOR_RGB2GRAY)[:900, :900]
+    town = cv2.cvtColor(drawn_town(1).ortho, cv2.COLOR_RGB2GRAY)[:900, :900]
     return np.maximum(town, 1)
 
 

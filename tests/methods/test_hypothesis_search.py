@@ -31,7 +31,7 @@ KNOWN = pytest.mark.parametrize(
 @pytest.fixture(scope="module")
 def flight():
     """A flight whose telemetry is the truth: what is off, the tests put there."""
-    plan = plan_flight(3, town=drawn_town(3), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    plan = plan_flight(3, town=drawn_town(1), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
     return plan.draw()
 
 

@@ -20,7 +20,7 @@ from engine.realtime import _FIFO_CURE, _MEMORY_CURE
 from engine.runs import mavlink_bridge
 from engine.runs.bridge_files import BridgeFiles
 from engine.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
-from engine.runs.service import _BEATS, running_service
+from engine.runs.service import _BEATS, running_service, tell_status
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
@@ -106,6 +106,11 @@ def test_an_abstract_socket_is_found(monkeypatch):
         assert heard(ear) == ["READY=1", "STOPPING=1"]
 
 
+def test_a_status_is_told_as_one_line(manager):
+    tell_status("autopilot heard; sent 5")
+    assert heard(manager) == ["STATUS=autopilot heard; sent 5"]
+
+
 @pytest.mark.parametrize("address", ["", "/nowhere/at/all", "@nobody-listens"])
 def test_a_bridge_goes_on_where_nobody_listens(address, monkeypatch):
     monkeypatch.setenv("NOTIFY_SOCKET", address)
@@ -126,6 +131,7 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
     monkeypatch.setenv("WATCHDOG_USEC", "800000")  # no more beats than the socket's queue holds
     monkeypatch.setattr(mavlink_bridge, "end_on_sigterm", lambda: None)
     monkeypatch.setattr(mavlink_bridge, "_AUTOPILOT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(mavlink_bridge, "_MESSAGE_PERIOD_S", 0.0)
     flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=2))
     files = BridgeFiles(map=flight.map, camera=flight.camera, frames=flight.frames, rate_hz=10.0)
     link, settings = MavlinkSettings(connect="udpout:127.0.0.1:9"), BridgeSettings(method="ncc")
@@ -135,8 +141,10 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
     run_mavlink_bridge(files, link, settings)
     told = heard(manager)
     assert (told[0], told[-1]) == ("READY=1", "STOPPING=1")
-    assert told[1:-1] == ["WATCHDOG=1"] * len(told[1:-1])
-    assert len(told) >= 4  # while it waits for the autopilot, too
+    beats = [line for line in told[1:-1] if not line.startswith("STATUS=")]
+    assert beats == ["WATCHDOG=1"] * len(beats)
+    assert len(beats) >= 2  # while it waits for the autopilot, too
+    assert "STATUS=no autopilot; sent 0" in "".join(told)
 
 
 # ----------------------------------------------------------------------------------------------------- the unit
@@ -163,6 +171,8 @@ def test_the_unit_hears_the_worker_of_a_supervisor_and_has_a_watchdog(unit):
     # The longest between two beats: one that just was not due, and a silent network camera that is opened again.
     longest_s = _IDLE_S + _TIMEOUTS[_TIMEOUTS.index(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC) + 1] / 1e3 + _REOPEN_S
     assert float(unit["WatchdogSec"]) * (1.0 - 1.0 / _BEATS) > longest_s
+    # A bridge that such a camera holds hears SIGTERM when it is open again: it is not killed before.
+    assert longest_s < float(unit["TimeoutStopSec"]) <= float(unit["WatchdogSec"])
 
 
 def test_the_units_command_is_one_of_the_command_line(unit):

@@ -66,7 +66,8 @@ def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
     trains = [described(90, seed, like=query) for seed in range(batch)]
     train = Features(*(torch.cat(values) for values in zip(*map(module._fields, trains), strict=True)))
     limits = (20.0, most_deg, 1.2, factor)
-    got, expected = (two(query, train, limits) for two in (module._two_nearest_by_loops, module._two_nearest))
+    got = tuple(map(torch.from_numpy, module._nearest_by_loops(query, train, limits)))
+    expected = module._nearest(query, train, limits)
     allowed = expected[0] > -2.0
     assert allowed.sum() > 20 * batch
     torch.testing.assert_close(got[0][allowed], expected[0][allowed])
