@@ -31,6 +31,7 @@ _MIN_HALVED_PX = 128 * 128
 _CANDIDATES, _CANDIDATES_WIDE = 6, 64
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
 _UPHILL_STEPS = 4  # within the reach of one LocalScores
+_MAX_LOSS = 0.5  # of a perfect match between the pixels of the coarsest level that serves a quick look
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class QuickLook:
     """Which peaks of a wide window are kept although not every position was scored at full resolution.
 
     Attributes:
-        is_clear: whether a peak stands whose rival is taken to be as high as the coarse scores are elsewhere.
+        is_clear: whether a peak stands whose rival is taken to be as high as the coarse scores allow elsewhere.
         is_hopeless: whether a peak is of no use even if nothing elsewhere is higher than the refined rivals.
     """
 
@@ -76,6 +77,11 @@ class _Levels:
     min_overlap: float
 
     @property
+    def loss(self) -> float:
+        """What a perfect match loses at most between the coarsest level's pixels."""
+        return _phase_loss(self.models[-2], self.models[-1])
+
+    @property
     def scale(self) -> int:
         """Pixels of the finest level per pixel of the coarsest."""
         return 1 << (len(self.parts) - 1)
@@ -107,11 +113,11 @@ def peak(
         Peak | None: as :func:`engine.peaks.find_peak`, the second score being that of a coarse level where that is
         higher than the refined rivals; None where positions elsewhere are not excluded.
     """
-    levels = _levels(search, template, min_overlap)
+    wide = quick is not None and is_wide(search)
+    levels = _levels(search, template, min_overlap, _MAX_LOSS if wide else 1.0)
     if levels is None:
         return None  # nothing to gain
     scores = _coarse_scores(levels)
-    wide = quick is not None and is_wide(search)
     count = _CANDIDATES_WIDE if wide else _CANDIDATES
     candidates = best_positions(scores, _SEPARATION_PX, count + 1)
     refinement = _refined_candidates(levels, scores, candidates, count, stops=not wide)
@@ -125,14 +131,16 @@ def peak(
     ]
     second = max((refined.score for refined, _ in rivals), default=-1.0)
     rest = _coarse_rest(scores, [candidate for _, candidate in rivals], levels.scale, best, exclusion_px)
-    pessimistic, optimistic = replace(best, second_score=max(rest, second)), replace(best, second_score=second)
+    by_coarse_scores = replace(best, second_score=max(rest, second))
     if refinement.is_certain:
-        return pessimistic
+        return by_coarse_scores
     if quick is None or not wide or refinement.unresolved >= origin[2]:
         return None
+    # A place between coarse pixels has more at full resolution than the coarse score shows.
+    pessimistic = replace(best, second_score=max(min(rest / (1.0 - levels.loss), 1.0), second))
     if quick.is_clear(pessimistic):
         return pessimistic
-    return optimistic if quick.is_hopeless(optimistic) else None
+    return by_coarse_scores if quick.is_hopeless(replace(best, second_score=second)) else None
 
 
 def best_places(
@@ -150,22 +158,29 @@ def best_places(
     Returns:
         (x, y, score) in falling order of the score; None where there is no coarser level.
     """
-    levels = _levels(search, template, min_overlap)
+    levels = _levels(search, template, min_overlap, _MAX_LOSS)
     if levels is None:
         return None
     scores = _coarse_scores(levels)
     candidates = best_positions(scores, _SEPARATION_PX, _CANDIDATES_WIDE)
-    refinement = _refined_candidates(levels, scores, candidates, _CANDIDATES_WIDE, stops=False)
+    found = [refined for x, y, _ in candidates if (refined := _refined(levels, scores, x, y)[0]) is not None]
     kept: list[tuple[int, int, float]] = []
-    for each in sorted((refined for refined, _ in refinement.found), key=lambda refined: -refined.score):
+    for each in sorted(found, key=lambda refined: -refined.score):
         x, y = round(each.x), round(each.y)
         if all(max(abs(x - u), abs(y - v)) > separation_px for u, v, _ in kept):
             kept.append((x, y, each.score))
     return kept[:count]
 
 
-def _levels(search: Search, template: FloatImage, min_overlap: float) -> _Levels | None:
-    """The levels on which there is something to gain, or None where the finest is the only one."""
+def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
+    """The levels on which there is something to gain, or None where the finest is the only one.
+
+    Args:
+        search: the window.
+        template: (h, w) float32.
+        min_overlap: see :func:`peak`.
+        max_loss: of a perfect match between pixels, beyond which a level is too coarse.
+    """
     parts, models = [search], [template - template.mean()]
     while True:
         part, model = parts[-1], models[-1]
@@ -174,15 +189,18 @@ def _levels(search: Search, template: FloatImage, min_overlap: float) -> _Levels
             break
         if H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
             break
+        coarser = kernels.halved(model)
+        if max_loss < 1.0 and _phase_loss(model, coarser) > max_loss:
+            break
         parts.append(part.half)
-        models.append(kernels.halved(model))
+        models.append(coarser)
     return _Levels(parts, models, min_overlap) if len(parts) > 1 else None
 
 
 def surfaces_over_nodata(
     search: Search, templates: FloatImage, *, min_overlap: float, group: int
 ) -> Iterator[FloatImage]:
-    """Scores of many templates with nodata taken as 0, which are no less than those that leave it out.
+    """Scores of many templates with nodata taken as 0, which are about those that leave it out.
 
     Args:
         search: (H, W) arrays with ``counts``, about 0.
@@ -204,7 +222,7 @@ def surfaces_over_nodata(
 
 
 def _coarse_scores(levels: _Levels) -> FloatImage:
-    """Scores on the coarsest level, of what lies partly on nodata no less than they are at full resolution."""
+    """Scores on the coarsest level, of what lies partly on nodata about as at full resolution."""
     coarse, model = levels.parts[-1], levels.models[-1]
     inverse_norms = kernels.inverse_norm(coarse.sums, *model.shape)
     counts, (h, w), step = levels.parts[0].counts, levels.models[0].shape, levels.scale
@@ -252,7 +270,7 @@ def _refined_candidates(
         count: upper bound on what is refined.
         stops: return nothing as soon as it is known that they do not exclude every other position.
     """
-    loss = _phase_loss(levels.models[-2], levels.models[-1])
+    loss = levels.loss
     found: list[tuple[Peak, tuple[int, int, float]]] = []
     best, error, unresolved, is_certain = -math.inf, 0.0, -1.0, True
     for index, candidate in enumerate(candidates):

@@ -198,7 +198,7 @@ class Correlator:
             found = self._coarse_to_fine(region, template, exclusion_px, quick)
             if found is not None:
                 return found
-            if not coarse_to_fine.is_wide(search):
+            if not (coarse_to_fine.is_wide(search) and self._has_coarse_levels(region)):
                 return self._of_every_place(region, template, exclusion_px)
         work_px = float(math.prod(search.image.shape))
         if not scheduler.can_afford(_EVERY_PLACE, work_px):

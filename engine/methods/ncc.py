@@ -31,7 +31,7 @@ from engine.methods.peak_evidence import (
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.scheduler import OutOfTime
-from engine.methods.second_look import SecondLook, hopeful_look, second_look
+from engine.methods.second_look import SecondLook, can_look_coarsely, hopeful_look, second_look
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
 
@@ -39,6 +39,7 @@ MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _MAX_CANDIDATES = 4  # of a refused frame
 _SECOND_LOOK, _AT_ONCE = "ncc second look", "refinement at once"  # steps
+_HOPEFUL_LOOK = "ncc second look by a coarser level"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
 _TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
 _TURNED_SIGMA_DEG = 2.0  # of the heading then
@@ -78,7 +79,7 @@ class Ncc(Method):
         if isinstance(found, PeakCandidate):
             self._candidates(query, found)  # as of a refused frame
         if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
-            self._costed_second_look(query, found, found.fix.window)
+            self.find_again(query, found)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
@@ -222,7 +223,7 @@ class Ncc(Method):
             peak, aligned = hypothesis_search.search(correlator, aligned, window)
         else:
             peak = correlator.search(aligned, window, quick_look(correlator, aligned, window, min_confidence))
-            peak, aligned = self._over_its_ground(correlator, aligned, window, peak)
+            peak, aligned = self._over_its_ground(correlator, aligned, window, peak, min_confidence)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
             return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
@@ -235,7 +236,12 @@ class Ncc(Method):
         return found if no_features else with_confidence(correlator, found, min_confidence)
 
     def _over_its_ground(
-        self, correlator: Correlator, aligned: Aligned, window: Window, peak: Peak | None
+        self,
+        correlator: Correlator,
+        aligned: Aligned,
+        window: Window,
+        peak: Peak | None,
+        min_confidence: float,
     ) -> tuple[Peak | None, Aligned]:
         """The peak of an oblique frame, drawn once more if it was found over other ground than at the prior."""
         query, pose = correlator.query, aligned.pose
@@ -243,7 +249,9 @@ class Ncc(Method):
             return peak, aligned
         nadir_px = correlator.nadir_px(peak, aligned)
         again = None if is_ground_below(query, nadir_px) else correlator.align(pose, aligned.level, nadir_px)
-        second = correlator.search(again, window) if isinstance(again, Aligned) else None
+        second = None
+        if isinstance(again, Aligned):
+            second = correlator.search(again, window, quick_look(correlator, again, window, min_confidence))
         return (peak, aligned) if second is None or not isinstance(again, Aligned) else (second, again)
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
@@ -270,12 +278,14 @@ class Ncc(Method):
         if best is None:
             return (found.fix,)
         (places, corner_px), fixes = best, [found.fix]
-        for x, y, score in places[1:]:
+        for x, y, score in places:
             place = corner_px + np.array([x, y])
+            if max(abs(place - [found.peak.x, found.peak.y])) <= apart_px:
+                continue
             peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
             fix = fix_of(correlator, aligned, peak, found.fix.window, searched=False)
             fixes.append(replace(fix, confidence=probability(features_of(query, aligned, peak, fix))))
-        return tuple(fixes)
+        return tuple(fixes[:_MAX_CANDIDATES])
 
     def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
         """The fix by a heading that is a few degrees off, where one is much more probable, else the refusal.
@@ -308,10 +318,7 @@ class Ncc(Method):
         """The fix of the second look about the same place, if wanted and affordable, else the refusal."""
         if not self.options.second_look:
             return refusal
-        window = self._looked_at(query, found)
-        if not query.scheduler.can_afford(_SECOND_LOOK, found.aligned.work_px(window)):
-            return refusal
-        again = self._costed_second_look(query, found, window)
+        again = self.find_again(query, found, self._looked_at(query, found))
         return refusal if again is None else self.judge_again(query, again)
 
     def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
@@ -322,11 +329,6 @@ class Ncc(Method):
         correlator = self._correlator(replace(query, prior=place))
         return correlator.window(found.aligned) or found.fix.window
 
-    def _costed_second_look(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
-        work_px = found.aligned.work_px(window)
-        with query.scheduler.costed(_SECOND_LOOK, work_px), query.scheduler.stage("second look"):
-            return self.find_again(query, found, window)
-
     def find_again(self, query: Query, found: PeakCandidate, window: Window | None = None) -> PeakCandidate | None:
         """The highest peak of the second look, see :mod:`engine.methods.second_look`.
 
@@ -334,15 +336,24 @@ class Ncc(Method):
             query: the frame.
             found: at the first look.
             window: that is looked at; None takes that of the first look, which the fix names in any case.
+
+        Returns:
+            PeakCandidate | None: None where the template is nowhere on the map, or there is no time.
         """
         window = window or found.fix.window
-        correlator = self._correlator(query)
-        hopeful = hopeful_look(correlator, found.aligned, window)
-        if hopeful is not None:
-            best = self._candidate(correlator, found, hopeful)
-            if is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
+        correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)
+        if can_look_coarsely(correlator, found.aligned, window):
+            if not scheduler.can_afford(_HOPEFUL_LOOK, work_px):
+                return None
+            with scheduler.costed(_HOPEFUL_LOOK, work_px), scheduler.stage("second look"):
+                hopeful = hopeful_look(correlator, found.aligned, window)
+            best = None if hopeful is None else self._candidate(correlator, found, hopeful)
+            if best is not None and is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
                 return best
-        looked = second_look(correlator, found.aligned, window)
+        if not scheduler.can_afford(_SECOND_LOOK, work_px):
+            return None
+        with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
+            looked = second_look(correlator, found.aligned, window)
         return None if looked is None else self._candidate(correlator, found, looked)
 
     def _candidate(self, correlator: Correlator, found: PeakCandidate, looked: SecondLook) -> PeakCandidate:

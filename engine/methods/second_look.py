@@ -43,6 +43,12 @@ class SecondLook:
     chance_sigma: float
 
 
+def can_look_coarsely(correlator: Correlator, aligned: Aligned, window: Window) -> bool:
+    """Whether a window is wide, and its places are scored where coarser levels save work: on the CPU."""
+    is_on_cpu = correlator.query.device.type == "cpu"
+    return is_on_cpu and aligned.work_px(window) > WIDE_PX and not correlator.options.exhaustive
+
+
 def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> SecondLook | None:
     """What a second look at a wide window can show at best, by the places that a coarser level shows.
 
@@ -55,7 +61,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
         window: in full-resolution map pixels.
 
     Returns:
-        SecondLook | None: None where the window is not wide, or its places have to be looked at one by one.
+        SecondLook | None: None where its places have to be looked at one by one.
     """
     coarse = _on_coarser_level(correlator, aligned, window)
     if coarse is None:
@@ -84,9 +90,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
 
 
 def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -> Aligned | None:
-    """The same hypothesis on the coarsest level that serves; None where the window is not wide."""
-    if aligned.work_px(window) <= WIDE_PX or correlator.options.exhaustive:
-        return None
+    """The same hypothesis on the coarsest level that serves; None where there is none."""
     for above in (2, 1):
         level = aligned.level + above
         if level < correlator.query.site.levels and min(aligned.template.shape) >> above >= COARSE_TEMPLATE_PX:

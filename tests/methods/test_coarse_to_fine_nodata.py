@@ -6,13 +6,14 @@ The reference is the masked surface, which has tests of its own against sums by 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, NccOptions, NoFix, OrthoMap, SceneMatcher, coarse_to_fine
-from engine.budget import Budget
+from engine.budget import Budget, Deadline
 from engine.coarse_to_fine import QuickLook
 from engine.kernels import ncc as kernels
 from engine.ncc_fft import ncc
@@ -41,10 +42,10 @@ def mask_of(rng, size, share):
     return valid.astype(bool)
 
 
-def drawn(seed, share, size=(420, 460), model=(110, 130), noise=10.0):
+def drawn(seed, share, size=(420, 460), model=(110, 130), noise=10.0, detail_px=1.5):
     """A window with nodata and a noisy template from where at least most of it is on the map."""
     rng = np.random.default_rng([seed, round(100 * share)])
-    gray, valid = texture(rng, size), mask_of(rng, size, share)
+    gray, valid = texture(rng, size, detail_px), mask_of(rng, size, share)
     h, w = model
     inside = kernels.counts(valid)
     inside = (inside[h:, w:] - inside[:-h, w:] - inside[h:, :-w] + inside[:-h, :-w]) >= MIN_OVERLAP * h * w
@@ -94,7 +95,7 @@ def test_scores_with_nodata_as_zero_are_those_without_it_where_there_is_none(sha
     search, image, valid, template, _ = drawn(2, share)
     surface = every_place(image, valid, template)
     (quick,) = coarse_to_fine.surfaces_over_nodata(search, template[None], min_overlap=MIN_OVERLAP, group=1)
-    whole = every_place(np.ones_like(image) * image, valid, template) > -1.0
+    whole = surface > -1.0
     np.testing.assert_array_equal(quick > -1.0, whole)
     h, w = template.shape
     inside = cv2.erode(valid.astype(np.uint8), np.ones((h, w), np.uint8), anchor=(0, 0)) > 0
@@ -126,9 +127,34 @@ def test_a_quick_look_is_kept_only_where_the_caller_says_so(monkeypatch):
     assert hopeless.second_score <= surface.max() + 2e-6
 
 
+@pytest.mark.parametrize("phase", range(8))
+@pytest.mark.parametrize("detail_px", [0.0, 0.6, 1.5])
+def test_a_quick_look_allows_for_a_twin_between_coarse_pixels(monkeypatch, detail_px, phase):
+    """What is shown twice is never clear, however little of the twin a coarse level shows."""
+    monkeypatch.setattr(coarse_to_fine, "WIDE_PX", 1000)
+    rng = np.random.default_rng([5, phase])
+    field = rng.standard_normal((1000, 1100))
+    field = field if detail_px == 0.0 else cv2.GaussianBlur(field, (0, 0), detail_px)
+    gray = np.clip(128.0 + 45.0 * field / field.std(), 0, 255).astype(np.uint8)
+    y, x = 400 + phase, 420 + phase
+    gray[y : y + 400, x : x + 400] = gray[8:408, 8:408]
+    image = enhance(gray)
+    seconds: list[float] = []
+
+    def is_clear(peak):
+        seconds.append(peak.second_score)
+        return peak.second_score < 0.5
+
+    shown = enhance(np.clip(gray[40:350, 40:350] + rng.normal(0.0, 15.0, (310, 310)), 0, 255).astype(np.uint8))
+    quick = QuickLook(is_clear, lambda _: False)
+    found = coarse_to_fine.peak(prepare(image), shown, 9.0, quick=quick)
+    assert found is None or found.second_score > 0.5
+    assert all(second > 0.5 for second in seconds)
+
+
 @pytest.mark.parametrize("share", SHARES)
 def test_the_best_place_of_a_wide_window_is_that_of_every_place(share):
-    search, image, valid, template, _ = drawn(4, share)
+    search, image, valid, template, _ = drawn(4, share, detail_px=3.0)
     places = coarse_to_fine.best_places(search, template, 9, 4, min_overlap=MIN_OVERLAP)
     full = best_positions(every_place(image, valid, template), 9, 4)
     assert places is not None
@@ -136,6 +162,7 @@ def test_the_best_place_of_a_wide_window_is_that_of_every_place(share):
     for (x, y, score), (u, v, _) in zip(places[1:], places, strict=False):
         assert max(abs(x - u), abs(y - v)) > 9
         assert score <= full[0][2]
+    assert len(places) == 4
 
 
 # By the matcher: a window of a few hundred pixels counts as wide, and every place of it is the reference
@@ -194,3 +221,72 @@ def test_a_wide_window_for_which_there_is_no_time_is_refused_at_once():
     assert isinstance(result, NoFix)
     assert result.reason is Reason.LATE
     assert "match" not in result.timings.stages_ms
+
+
+@pytest.mark.usefixtures("wide")
+def test_every_place_is_scored_only_where_there_is_time_for_it():
+    """A quick look that settles nothing goes on by the cost of all places, not by its own."""
+    from engine.methods.correlation import _EVERY_PLACE
+
+    site, _ = site_with(0.3, 6)
+    nadir = np.array([480.0, 450.0])
+    matcher = SceneMatcher(site, CAMERA, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
+    frame = Ground(size=GROUND.size, seed=99).frame(CAMERA, nadir)  # shows no place of this map
+    prior = GROUND.prior(nadir, sigma_m=80.0)
+    asked: list[str] = []
+
+    def can_afford_all(self, works):
+        asked.extend(works)
+        return _EVERY_PLACE not in works
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("engine.methods.scheduler.Scheduler.can_afford_all", can_afford_all)
+        patch.setattr("engine.methods.peak_evidence.is_hopeless", lambda *_: False)
+        result = matcher.locate(frame, prior, budget=Budget(total_ms=60_000.0))
+    assert _EVERY_PLACE in asked
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.LATE
+
+
+@pytest.mark.usefixtures("wide")
+def test_a_second_look_at_every_place_is_a_step_of_its_own():
+    """A second look by a coarser level is cheap, and its cost says nothing of that of every place."""
+    from engine.methods import ncc as module
+
+    site, _ = site_with(0.1, 6)
+    nadir = np.array([480.0, 450.0])
+    matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
+    frame = GROUND.frame(CAMERA, nadir)
+    shown = np.clip(255.0 - frame.image.astype(float), 0, 255).astype(np.uint8)  # grey levels the other way round
+    asked: list[str] = []
+
+    def can_afford_all(self, works):
+        asked.extend(works)
+        return module._SECOND_LOOK not in works
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("engine.methods.scheduler.Scheduler.can_afford_all", can_afford_all)
+        patch.setattr(module, "is_hopeless", lambda *_: False)
+        result = matcher.locate(replace(frame, image=shown), GROUND.prior(nadir, sigma_m=60.0))
+    assert [step for step in asked if "second look" in step][:2] == [module._HOPEFUL_LOOK, module._SECOND_LOOK]
+    assert isinstance(result, NoFix)
+
+
+@pytest.mark.usefixtures("wide")
+def test_a_second_look_by_a_coarser_level_finds_the_place_of_every_place():
+    from engine.methods.second_look import hopeful_look, second_look
+
+    site, _ = site_with(0.1, 6)
+    matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
+    for number, nadir in enumerate(([480.0, 450.0], [430.0, 500.0])):
+        frame = GROUND.frame(CAMERA, np.array(nadir), heading_deg=70.0 * number)
+        query = matcher._query(frame, GROUND.prior(np.array(nadir), sigma_m=60.0), Deadline(Budget()))
+        method = matcher._method
+        found = method.find(query)
+        correlator = method._correlator(query)
+        quick = hopeful_look(correlator, found.aligned, found.fix.window)
+        whole = second_look(correlator, found.aligned, found.fix.window)
+        assert quick is not None
+        assert (quick.peak.x, quick.peak.y) == pytest.approx((whole.peak.x, whole.peak.y), abs=1e-2)
+        # Local normalisation differs a little towards the edges of a smaller crop.
+        assert quick.peak.score == pytest.approx(whole.peak.score, abs=1e-3)
