@@ -55,5 +55,12 @@ def check_finite(**arrays: NDArray[Any]) -> None:
 
 
 def counts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Running sums (H+1, W+1) of the valid pixels of a mask (H, W); the first row and column are 0."""
+    """Running sums of the valid pixels of a mask.
+
+    Args:
+        valid: (H, W).
+
+    Returns:
+        (H+1, W+1) int32; the first row and column are 0.
+    """
     return np.asarray(cv2.integral(np.ascontiguousarray(valid).view(np.uint8)))
