@@ -153,10 +153,9 @@ class RosBridge:
             topics.compass: ("std_msgs/msg/Float64", lambda m: telemetry.compass(m.data, now_ns())),
             topics.height: ("std_msgs/msg/Float64", lambda m: telemetry.height(m.data, now_ns())),
             topics.range: ("sensor_msgs/msg/Range", telemetry.range),
+            topics.velocity: ("geometry_msgs/msg/TwistStamped", telemetry.velocity),
             topics.odometry: ("nav_msgs/msg/Odometry", lambda m: telemetry.odometry(m, now_ns())),
         }
-        if not topics.odometry:
-            handlers[topics.velocity] = ("geometry_msgs/msg/TwistStamped", telemetry.velocity)
         return {name: handler for name, handler in handlers.items() if name}
 
     def on_imu(self, message: Any) -> None:

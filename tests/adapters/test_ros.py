@@ -347,6 +347,19 @@ def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, 
         assert frame.velocity_sigma_mps == (pytest.approx(told_mps) if told_mps else None)
 
 
+def test_a_velocity_takes_the_place_of_an_odometry_that_is_silent(maker):
+    heard = RosTelemetry()
+    for after_ms in (0, 500, 1000, 1500):
+        time_ns = NOW_NS + after_ms * 1_000_000
+        heard.imu(maker.imu(time_ns, "", 0.0, 0.0, 90.0))
+        heard.velocity(maker.velocity(time_ns, "", 3.0, 4.0))
+        if after_ms <= 500:
+            heard.odometry(odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0)), 0)
+    known = [heard.vehicle(NOW_NS + after_ms * 1_000_000) for after_ms in (500, 900, 1100, 1500)]
+    velocities = [(now.east_velocity_mps, now.north_velocity_mps) for now in known]
+    assert velocities == [pytest.approx(v, abs=1e-9) for v in ((1.0, 0.0), (1.0, 0.0), (3.0, 4.0), (3.0, 4.0))]
+
+
 def test_an_accuracy_that_one_odometry_states_and_the_next_does_not_is_not_mixed(maker):
     heard, step_ns = RosTelemetry(), 100_000_000
     for time_ns, variances in ((NOW_NS, (0.04, 0.04, 0.04)), (NOW_NS + step_ns, None)):
@@ -698,7 +711,7 @@ def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
     assert "" not in kinds
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
     assert instead["/vio/odometry"][0] == "nav_msgs/msg/Odometry"
-    assert RosTopics().velocity not in instead
+    assert instead[RosTopics().velocity][0] == "geometry_msgs/msg/TwistStamped"
     assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
 
