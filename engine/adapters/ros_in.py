@@ -36,8 +36,8 @@ class RosTopics:
             has no stamp, and takes precedence.
         height: std_msgs/Float64, metres above take-off.
         range: sensor_msgs/Range along the body's down axis; takes precedence over the height.
-        velocity: geometry_msgs/TwistStamped, east and north in m/s; used where no odometry is at most half a second
-            old.
+        velocity: geometry_msgs/TwistStamped, east and north in m/s; used where the last half second has no
+            odometry.
         odometry: nav_msgs/Odometry of another camera's odometry, whose twist is along the body.
     """
 
