@@ -34,7 +34,7 @@ class Auto(Method):
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.ncc = Ncc(site, device, options)
-        self.sift = Sift(site, device, options)
+        self.sift = Sift(site, device, options, self.ncc.samples)
 
     @property
     def parts(self) -> Mapping[str, Method]:
@@ -103,7 +103,7 @@ class Auto(Method):
             if not isinstance(first, Fix):
                 return self.sift.locate(query)
             with query.scheduler.with_fix():
-                return self.sift.locate(query)
+                return self.sift.confirm(query)
         except OutOfTime:
             return query.refuse(Reason.LATE, "the budget was spent before there was a second fix", "sift")
 

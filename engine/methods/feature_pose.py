@@ -93,6 +93,11 @@ class FeatureMatcher:
         assert first is not None  # the telemetry's own hypothesis is always tried
         return first
 
+    def find_at_once(self) -> PoseCandidate | NoFix:
+        """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
+        refusal = self.query.refuse_flat(self.method, self.options.min_deviation)
+        return refusal or self._find_with(next(self._attempts())[1])
+
     def judge(self, found: PoseCandidate) -> Fix | NoFix:
         """The fix where its pose is accepted, else a refusal."""
         fix, least = found.fix, self.options.min_confidence

@@ -1,4 +1,4 @@
-"""Dense refinement of a fix by correlation: all of the camera's pose, through the surface model or a plane."""
+"""Dense refinement of a fix: all of the camera's pose, through the surface model or a plane."""
 
 from __future__ import annotations
 
@@ -89,6 +89,14 @@ class Refinement:
         """The fix of a known tilt refined on the frame's own level, None where that is not beyond doubt."""
         prior = self._prior(fix)
         return self._refined(fix, prior, self._at_once(prior))
+
+    def refine_pose(self, fix: Fix) -> Fix | None:
+        """The fix of a pose by features refined, from one level coarser where that is necessary; None if it fails.
+
+        Features displace no peak: where the picture does not confirm the telemetry, their pose stands.
+        """
+        prior = self._prior(fix)
+        return self._refined(fix, prior, self._at_once(prior) or self._through_levels(prior, _COARSER))
 
     def _doubting(self) -> Refinement:
         """The same, of a frame whose attitude is hardly known."""

@@ -1,23 +1,31 @@
-"""The SIFT method (Fig. 6): half scale, features of frame and map, matches lifted to 3D, PnP with RANSAC."""
+"""The SIFT method (Fig. 6): half scale, features of frame and map, matches lifted to 3D, PnP, refinement."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from engine.align import SIDE_STEP_PX
 from engine.device import Device
 from engine.features import prepare_plans
 from engine.indexes.landmarks import LandmarkMap
+from engine.indexes.prepared import PreparedMap
+from engine.indexes.samples import SampleMap
 from engine.methods.explanation import Explanation, explain_features
-from engine.methods.feature_pose import METHOD, FeatureMatcher, PoseCandidate
+from engine.methods.feature_matching import is_doubled
+from engine.methods.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
+from engine.methods.refinement import Refinement
+from engine.methods.scheduler import OutOfTime
 from engine.orthomap import OrthoMap
 from engine.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
+_FEW_SHARE = 0.5  # of the keypoints, where a pose is refined from few
+_FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
 
 class Sift(Method):
@@ -26,17 +34,27 @@ class Sift(Method):
     Args:
         site: the map.
         device: where tensors live.
-        options: settings; ``options.sift`` counts.
+        options: settings; ``options.sift`` counts, and for the refinement how NCC enhances the map.
+        samples: of the map for the refinement, where another method has them already.
     """
 
-    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
+    def __init__(
+        self, site: OrthoMap, device: Device, options: MatcherOptions, samples: SampleMap | None = None
+    ) -> None:
         self.options = options.sift
         self.landmarks = LandmarkMap(site, device)
+        few = max(MIN_VOTES, round(self.options.max_keypoints * _FEW_SHARE))
+        self._few = replace(self.options, max_keypoints=few, upsample=1)
+        self._enhancement = replace(options.ncc, errors=options.sift.errors)
+        if samples is None:
+            prepared = PreparedMap(site, device, options.ncc.enhance_radius_px, options.ncc.score)
+            samples = SampleMap(site, prepared)
+        self.samples = samples
 
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""
-        return {"landmark tiles": self.landmarks.created}
+        return {"landmark tiles": self.landmarks.created, "sampled cells": self.samples.created}
 
     def prepare(self) -> None:
         """Find the map's features on every level that is small enough, or load those of an earlier start."""
@@ -48,9 +66,12 @@ class Sift(Method):
         # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
         longest_px = 3 * max(query.gray.shape)
         prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), torch.device(query.device))
+        self._by_few_features(query, {})
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed("sift", work_px):
-                self._at_scale(query, share)
+                result = self._at_scale(query, share)
+            if isinstance(result, Fix):
+                self._refined(query, result)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map."""
@@ -58,7 +79,49 @@ class Sift(Method):
             self.locate(query)
 
     def locate(self, query: Query) -> Result:
-        """A fix at the highest resolution of the frame that there is time for."""
+        """A refined fix by few features, else one by all at the highest resolution that there is time for.
+
+        Few features take half the time of all, and refinement makes up for what their pose lacks in accuracy.
+        Where it does not, their pose is the fix only if there is no time for all of them.
+        """
+        few = self._by_few_features(query, {_REFINEMENT: query.gray.size} if self._has_time(query) else {})
+        if few is not None:
+            fix = self._refined(query, few)
+            if fix.stage == "refined":
+                return fix
+            if not self._has_time(query):
+                return replace(fix, stage="coarse")
+        result = self._by_all_features(query)
+        if few is not None or isinstance(result, NoFix) or result.stage == "coarse":
+            return result
+        return self._refined(query, result)
+
+    def confirm(self, query: Query) -> Result:
+        """A fix to compare with that of another method: not refined by the grey levels that the other goes by."""
+        return self._by_few_features(query, {}) or self._by_all_features(query)
+
+    def _by_few_features(self, query: Query, following: Mapping[str, float]) -> Fix | None:
+        """A fix by half as many keypoints of a picture that is not doubled, None where that is not beyond doubt.
+
+        Of a picture that is not doubled anyway they would be no fewer.
+
+        Args:
+            query: the frame.
+            following: work of the steps after it, for which there must be time as well.
+        """
+        works = {_FEW: self._work_px(query)[1.0], **following}
+        if not self._can_refine(query) or not is_doubled(query, self.options):
+            return None
+        if not query.scheduler.can_afford_all(works):
+            return None
+        with query.scheduler.costed(_FEW, works[_FEW]):
+            found = FeatureMatcher(query, self.landmarks, self._few).find_at_once()
+        if isinstance(found, NoFix) or found.confidence < self.options.null_test_below:
+            return None
+        return found.fix
+
+    def _by_all_features(self, query: Query) -> Result:
+        """A fix by all keypoints, not refined, at the highest resolution of the frame that there is time for."""
         step = "sift"
         if query.prior is None or query.telemetry.height_agl_m is None:
             step = "sift search" if query.prior is None else "sift heights"
@@ -68,6 +131,33 @@ class Sift(Method):
             return query.refuse_late(METHOD, step)
         with query.scheduler.costed(step, works[share]):
             return self._at_scale(query, share)
+
+    def _has_time(self, query: Query) -> bool:
+        """Whether there is time for all features, at some resolution."""
+        return query.scheduler.first_affordable("sift", self._work_px(query)) is not None
+
+    def _can_refine(self, query: Query) -> bool:
+        """Whether poses are refined: by a telemetry that is trusted, over a surface model."""
+        options, known = self.options, query.telemetry
+        if not options.refine or not options.use_attitude or options.matcher is not None:
+            return False
+        is_known = known.height_agl_m is not None and known.grid_heading_deg is not None and known.has_tilt
+        return is_known and query.prior is not None and query.site.has_surface and not query.frame.is_doubted
+
+    def _refined(self, query: Query, fix: Fix) -> Fix:
+        """The fix with its pose refined, where that is possible and affordable."""
+        work_px = float(query.gray.size)
+        if not self._can_refine(query):
+            return fix
+        if not query.scheduler.can_afford(_REFINEMENT, work_px):
+            query.scheduler.note_refusal(_REFINEMENT, keeps_cost=True)
+            return fix
+        refinement = Refinement(query, self.samples, self._enhancement)
+        try:
+            with query.scheduler.with_fix(), query.scheduler.costed(_REFINEMENT, work_px):
+                return refinement.refine_pose(fix) or fix
+        except OutOfTime:
+            return fix
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

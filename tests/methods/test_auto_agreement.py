@@ -7,6 +7,7 @@ import pytest
 
 from engine import Fix, NoFix, OrthoMap, SceneMatcher
 from engine.methods.ncc import Ncc
+from engine.methods.sift import Sift
 from engine.values import Reason
 
 NADIR = np.array([310.0, 305.0])
@@ -24,8 +25,9 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
     ground, site, camera, monkeypatch, off_m, same_place
 ):
     frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
-    sift = SceneMatcher(site, camera, "sift", "cpu").locate(frame, prior)
-    own = Ncc.correlate
+    own, compared = Ncc.correlate, Sift.confirm
+    seen = []
+    monkeypatch.setattr(Sift, "confirm", lambda self, query: seen.append(compared(self, query)) or seen[-1])
 
     def off(self, query, *args, **kwargs):
         fix = own(self, query, *args, **kwargs)
@@ -37,6 +39,7 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
     result = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
     if same_place:
         assert isinstance(result, Fix)
+        (sift,) = seen
         assert (result.east_m, result.north_m) == (sift.east_m, sift.north_m)
         assert result.covariance_m2[0, 0] > sift.covariance_m2[0, 0] + 0.8 * off_m**2
     else:

@@ -42,7 +42,9 @@ class FixedCosts:
         self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
 
     def upper_bound_ms(self, step, work):
-        return self.per_unit.get(step.removesuffix(" at once"), 0.0) * work  # refinement, in both of its ways
+        for suffix in (" at once", " of sift", " by few features"):  # other ways of the same step
+            step = step.removesuffix(suffix)
+        return self.per_unit.get(step, 0.0) * work
 
     def learn(self, step, work, ms, waited_ms=0.0):
         pass
@@ -91,7 +93,7 @@ def test_with_time_the_finest_level(ground, make, frame, prior, method):
     for budget in (None, HURRY):
         fix = make(method).locate(frame, prior, budget)
         assert off_m(ground, fix) < 1.0
-        assert fix.stage == {"ncc": "refined", "sift": "fine"}[method]
+        assert fix.stage == "refined"
 
 
 def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, prior):
@@ -166,17 +168,17 @@ def test_both_methods_verify_each_other(ground, make, frame, prior):
 def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, costs, method):
     fix = make("auto", **costs).locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 1.0
-    assert (fix.stage, fix.method) == ({"ncc": "refined", "sift": "fine"}[method], method)
+    assert (fix.stage, fix.method) == ("refined", method)
 
 
 def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):
-    honest = Sift.locate
+    honest = Sift.confirm
 
     def elsewhere(*args, **named):
         fix = honest(*args, **named)
         return replace(fix, east_m=fix.east_m + 40.0)
 
-    monkeypatch.setattr(Sift, "locate", elsewhere)
+    monkeypatch.setattr(Sift, "confirm", elsewhere)
     result = make("auto").locate(frame, prior)
     assert isinstance(result, NoFix)
     assert result.reason is Reason.INCONSISTENT

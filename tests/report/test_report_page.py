@@ -198,7 +198,7 @@ def test_settings_are_read_back_from_the_record():
 
 def matched(flight, site, method, profile="engine"):
     """A matcher and its first fix of a flight, with the frame."""
-    options = MatcherOptions(profile=profile, ncc=NccOptions(refine=False))
+    options = MatcherOptions(profile=profile, ncc=NccOptions(refine=False), sift=SiftOptions(refine=False))
     matcher = SceneMatcher(site, flight.camera, method, "cpu", options)
     frame, truth = flight.frames[0], flight.truth[0]
     prior = Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=4.0)

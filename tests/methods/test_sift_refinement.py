@@ -1,0 +1,168 @@
+"""SIFT's pose refined densely, from few features where these are beyond doubt."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import Budget, Fix, OrthoMap, SceneMatcher
+from engine.errors import OptionError
+from engine.methods.feature_pose import FeatureMatcher
+from engine.methods.options import MatcherOptions, SiftOptions
+from engine.methods.refinement import Refinement
+from engine.methods.scheduler import OutOfTime
+from engine.methods.sift import Sift
+from engine.values import NoFix, Reason
+from tests.methods.test_scheduler import FixedCosts
+
+NADIR = np.array([310.0, 305.0])
+PLACES = [np.array([x, y]) for x in (270.0, 330.5, 371.25) for y in (262.5, 301.0, 340.75)]
+
+
+@pytest.fixture(scope="module")
+def site(ground):
+    """The ground with a surface model that says how flat it is: only then is a pose refined."""
+    flat = np.zeros(ground.gray.shape, np.float32)
+    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
+
+
+@pytest.fixture(scope="module")
+def matcher(site, camera):
+    return SceneMatcher(site, camera, "sift", "cpu")
+
+
+@pytest.fixture(scope="module")
+def plain(site, camera):
+    return SceneMatcher(site, camera, "sift", "cpu", MatcherOptions(sift=SiftOptions(refine=False)))
+
+
+def shot(ground, camera, nadir_px=NADIR, heading_deg=25.0):
+    return ground.frame(camera, nadir_px, heading_deg=heading_deg, roll_deg=3.0, pitch_deg=-2.0)
+
+
+def test_a_refined_pose_is_nearer_and_says_so(ground, camera, matcher, plain):
+    """Within its covariance, on average over places and headings."""
+    errors_m, chi_squares = {"refined": [], "fine": []}, []
+    for heading_deg, place in enumerate(PLACES):
+        frame, at_m = shot(ground, camera, place, 40.0 * heading_deg), ground.enu_from_pixel(place)
+        for one, stage in ((matcher, "refined"), (plain, "fine")):
+            fix = one.locate(frame, ground.prior(place))
+            assert isinstance(fix, Fix)
+            assert (fix.stage, fix.method) == (stage, "sift")
+            off_m = np.array([fix.east_m, fix.north_m]) - at_m
+            errors_m[stage].append(float(np.hypot(*off_m)))
+            if stage == "refined":
+                chi_squares.append(float(off_m @ np.linalg.solve(fix.relative_covariance_m2, off_m)))
+    refined, fine = (np.sqrt(np.mean(np.square(errors_m[stage]))) for stage in ("refined", "fine"))
+    assert refined < fine
+    assert np.mean(chi_squares) / 2.0 < 3.0
+
+
+def test_a_fix_keeps_the_confidence_of_its_features(ground, camera, matcher):
+    """Refinement says how near the pose is, not whether the place is right."""
+    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
+    assert fix.confidence is not None
+    assert fix.confidence >= SiftOptions().null_test_below
+    assert fix.attitude_covariance_deg2 is not None
+    assert fix.up_m is not None
+
+
+def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypatch):
+    few = []
+    honest = FeatureMatcher.find_at_once
+
+    def doubtful(self):
+        few.append(honest(self))
+        return replace(few[-1], fix=replace(few[-1].fix, confidence=0.9))
+
+    by_few = matcher.locate(shot(ground, camera), ground.prior(NADIR))
+    monkeypatch.setattr(FeatureMatcher, "find_at_once", doubtful)
+    by_all = matcher.locate(shot(ground, camera), ground.prior(NADIR))
+    assert len(few) == 1
+    assert by_few.stage == by_all.stage == "refined"
+    apart_m = np.hypot(by_few.east_m - by_all.east_m, by_few.north_m - by_all.north_m)
+    assert apart_m < by_few.relative_sigma_m  # the same picture agrees with the map at the same pose
+
+
+def test_where_refinement_fails_all_features_give_the_pose(ground, camera, matcher, plain, monkeypatch):
+    frame, prior = shot(ground, camera), ground.prior(NADIR)
+    expected = plain.locate(frame, prior)
+    monkeypatch.setattr(Refinement, "refine_pose", lambda _self, _fix: None)
+    fix = matcher.locate(frame, prior)
+    assert fix.stage == "fine"
+    assert (fix.east_m, fix.north_m, fix.up_m) == (expected.east_m, expected.north_m, expected.up_m)
+    np.testing.assert_array_equal(fix.covariance_m2, expected.covariance_m2)
+
+
+def test_a_refinement_that_is_abandoned_leaves_the_fix(ground, camera, matcher, monkeypatch):
+    def out_of_time(_self, _fix):
+        raise OutOfTime
+
+    monkeypatch.setattr(Refinement, "refine_pose", out_of_time)
+    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
+    assert isinstance(fix, Fix)
+    assert fix.stage == "fine"
+
+
+def test_few_features_are_better_than_none_where_time_is_short(ground, site, camera):
+    """With no time for all features nor for refinement."""
+    matcher = SceneMatcher(site, camera, "sift", "cpu")
+    matcher._costs = FixedCosts()
+    matcher._costs.upper_bound_ms = lambda step, work: 0.0 if step == "sift by few features" else 1e9
+    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR), Budget(total_ms=1000.0))
+    assert isinstance(fix, Fix)
+    assert fix.stage == "coarse"
+    off_m = np.hypot(*(np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)))
+    assert off_m < 3.0 * fix.sigma_m
+
+
+@pytest.mark.parametrize(
+    "known",
+    [{"roll_deg": None, "pitch_deg": None}, {"heading_deg": None}, {"height_agl_m": None}, {"is_doubted": True}],
+    ids=["no tilt", "no heading", "no height", "doubted"],
+)
+def test_without_a_telemetry_to_hold_to_the_features_do_it_alone(ground, camera, matcher, known):
+    fix = matcher.locate(replace(shot(ground, camera), **known), ground.prior(NADIR))
+    assert isinstance(fix, Fix)
+    assert fix.stage == "fine"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"height_agl_m": 100.0}, {"roll_deg": 9.0}, {"heading_deg": 35.0}], ids=["height", "roll", "heading"]
+)
+def test_wrong_telemetry_does_not_draw_the_pose_away(ground, camera, matcher, plain, wrong):
+    """The pose by features rests less on it than the refinement, which must then agree or not count."""
+    frame = replace(shot(ground, camera), **wrong)
+    fix, by_features = (one.locate(frame, ground.prior(NADIR)) for one in (matcher, plain))
+    assert isinstance(fix, Fix)
+    assert isinstance(by_features, Fix)
+    off_m = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)
+    assert off_m @ np.linalg.solve(fix.covariance_m2[:2, :2], off_m) < 9.21  # of 2 degrees of freedom, 99 %
+
+
+def test_foreign_ground_is_refused_as_before(ground, camera, matcher):
+    frame = replace(shot(ground, camera), image=np.ascontiguousarray(shot(ground, camera).image[:, ::-1]))
+    result = matcher.locate(frame, ground.prior(NADIR))
+    assert isinstance(result, NoFix)
+    assert result.reason in (Reason.BAD_POSE, Reason.TOO_FEW_MATCHES, Reason.AMBIGUOUS)
+
+
+def test_no_frame_but_the_first_samples_the_map(ground, camera, matcher):
+    frame, prior = shot(ground, camera), ground.prior(NADIR)
+    matcher.locate(frame, prior)
+    before = dict(matcher.cache_counters)
+    matcher.locate(frame, prior)
+    assert matcher.cache_counters == before
+
+
+def test_upsampling_is_once_or_twice():
+    for value in (0, 3):
+        with pytest.raises(OptionError, match=f"upsample: expected 1 or 2, got {value}"):
+            SiftOptions(upsample=value)
+
+
+def test_samples_of_another_method_are_shared(site, camera):
+    both = SceneMatcher(site, camera, "auto", "cpu")
+    parts = both._method.parts
+    assert isinstance(parts["sift"], Sift)
+    assert parts["sift"].samples is parts["ncc"].samples
