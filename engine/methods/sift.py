@@ -25,6 +25,8 @@ from engine.values import Fix, NoFix, Reason, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
 _FEW_SHARE = 0.5  # of the keypoints, where a pose is refined from few
+# Correlation at a refined pose that takes the place of the null hypothesis, as where NCC refines at once.
+_CONFIRMED = 0.45
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
 
@@ -43,8 +45,12 @@ class Sift(Method):
     ) -> None:
         self.options = options.sift
         self.landmarks = LandmarkMap(site, device)
-        few = max(MIN_VOTES, round(self.options.max_keypoints * _FEW_SHARE))
-        self._few = replace(self.options, max_keypoints=few, upsample=1)
+        self._few = replace(
+            self.options,
+            max_keypoints=max(MIN_VOTES, round(self.options.max_keypoints * _FEW_SHARE)),
+            keypoints_per_px=self.options.keypoints_per_px * _FEW_SHARE,
+            upsample=1,
+        )
         self._enhancement = replace(options.ncc, errors=options.sift.errors)
         if samples is None:
             prepared = PreparedMap(site, device, options.ncc.enhance_radius_px, options.ncc.score)
@@ -85,25 +91,26 @@ class Sift(Method):
         Where it does not, their pose is the fix only if there is no time for all of them.
         """
         few = self._by_few_features(query, {_REFINEMENT: query.gray.size} if self._has_time(query) else {})
-        if few is not None:
-            fix = self._refined(query, few)
-            if fix.stage == "refined":
-                return fix
-            if not self._has_time(query):
-                return replace(fix, stage="coarse")
+        refined = None if few is None else self._refined(query, few)
+        if refined is not None and refined.stage == "refined":
+            if self._is_certain(refined) or refined.score >= _CONFIRMED:
+                return refined
+        elif refined is not None and self._is_certain(refined) and not self._has_time(query):
+            return replace(refined, stage="coarse")
         result = self._by_all_features(query)
-        if few is not None or isinstance(result, NoFix) or result.stage == "coarse":
-            return result
-        return self._refined(query, result)
+        is_fine = isinstance(result, Fix) and result.stage == "fine"
+        has_failed = refined is not None and refined.stage != "refined"
+        return self._refined(query, result) if isinstance(result, Fix) and is_fine and not has_failed else result
 
     def confirm(self, query: Query) -> Result:
         """A fix to compare with that of another method: not refined by the grey levels that the other goes by."""
-        return self._by_few_features(query, {}) or self._by_all_features(query)
+        few = self._by_few_features(query, {})
+        return few if few is not None and self._is_certain(few) else self._by_all_features(query)
 
     def _by_few_features(self, query: Query, following: Mapping[str, float]) -> Fix | None:
-        """A fix by half as many keypoints of a picture that is not doubled, None where that is not beyond doubt.
+        """A fix by half as many keypoints of a picture that is not doubled, None where that is not accepted.
 
-        Of a picture that is not doubled anyway they would be no fewer.
+        Of a picture that is not doubled anyway they would not be searched faster.
 
         Args:
             query: the frame.
@@ -116,9 +123,12 @@ class Sift(Method):
             return None
         with query.scheduler.costed(_FEW, works[_FEW]):
             found = FeatureMatcher(query, self.landmarks, self._few).find_at_once()
-        if isinstance(found, NoFix) or found.confidence < self.options.null_test_below:
-            return None
-        return found.fix
+        return None if isinstance(found, NoFix) or found.confidence < self.options.min_confidence else found.fix
+
+    def _is_certain(self, fix: Fix) -> bool:
+        """Whether a pose is so probable that no null hypothesis is asked."""
+        assert fix.confidence is not None  # each pose has one
+        return fix.confidence >= self.options.null_test_below
 
     def _by_all_features(self, query: Query) -> Result:
         """A fix by all keypoints, not refined, at the highest resolution of the frame that there is time for."""
