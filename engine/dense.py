@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
 MIN_SAMPLES = 60
-_STEPS = 12  # Gauss-Newton steps at most; three or four are usual
+_STEPS = 12  # Gauss-Newton steps at most; four are usual
+_LAST_STEP = 0.5  # in standard deviations of the pose; the next one would be a tenth of it
 _EDGE_PX = 2.0  # border of the picture that is not sampled
 # The score vector is summed over 8 x 8 cells of the picture: the scatter of the sums accounts for errors that
 # neighbouring samples have in common.
@@ -173,9 +174,7 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
     return float(dense_loops.compare_levels(levels, samples.values, weights)[2]) if count >= MIN_SAMPLES else 0.0
 
 
-def refine(
-    picture: EnhancedFrame, samples: Samples, start: Pose, prior: GaussianPrior, *, last_step_sigmas: float = 0.2
-) -> DenseFit | None:
+def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: GaussianPrior) -> DenseFit | None:
     """Gauss-Newton from a start whose reprojection is off by a few pixels at most.
 
     Args:
@@ -183,7 +182,6 @@ def refine(
         samples: of the map.
         start: initial pose.
         prior: of the parameters.
-        last_step_sigmas: a step this small, in standard deviations of the pose, is the last.
 
     Returns:
         The pose, or None where too few samples are visible or the pose is not determined.
@@ -197,7 +195,7 @@ def refine(
         picture.levels, picture.matrix, rotation, start.center_m, start.slope,
         prior_rotation, prior.pose.center_m, prior.pose.slope, prior.precision,
         offset_m, samples.values, samples.gradients, samples.weights,
-        _EDGE_PX, _CELLS, MIN_SAMPLES, _STEPS, _EXCESS, last_step_sigmas**2,
+        _EDGE_PX, _CELLS, MIN_SAMPLES, _STEPS, _EXCESS, _LAST_STEP**2,
     )  # fmt: skip
     if not found:
         return None

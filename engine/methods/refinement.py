@@ -43,7 +43,6 @@ _UNCONFIRMED_TILT_DEG = 1.5
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # of a coarser level
-_LAST_STEP, _LAST_STEP_COARSE = 0.2, 0.5  # in standard deviations: a coarser level only has to come near
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,8 +178,7 @@ class Refinement:
                 ground = self.samples.find(window, level, MAX_SAMPLES if level == own else _COARSE_SAMPLES)
                 if not has_tilt and fit is None:
                     pose = max(_tilted(pose, height_m), key=lambda start: correlation_at(picture, ground, start))
-                last_step, start = _LAST_STEP if level == own else _LAST_STEP_COARSE, pose
-                fit = refine(picture, ground, start, prior, last_step_sigmas=last_step)
+                start, fit = pose, refine(picture, ground, pose, prior)
                 pose = start if fit is None else fit.pose
         if fit is None or not fit.converged:
             return None
