@@ -297,8 +297,19 @@ def ros(
         str, typer.Option("--velocity-topic", metavar="NAME", help="geometry_msgs/TwistStamped, east and north.")
     ] = "/mavros/local_position/velocity_local",
     odometry_topic: Annotated[
-        str, typer.Option("--odometry-topic", metavar="NAME", help="nav_msgs/Odometry; outranks the velocity.")
+        str,
+        typer.Option(
+            "--odometry-topic", metavar="NAME", help="Another odometry's velocity; outranks the velocity."
+        ),
     ] = "",
+    odometry_type: Annotated[
+        str,
+        typer.Option(
+            "--odometry-type",
+            metavar="NAME",
+            help="Its message: Odometry, TwistWithCovarianceStamped or TwistStamped.",
+        ),
+    ] = "Odometry",
     firmware: Annotated[
         str,
         typer.Option("--firmware", metavar="none|ardupilot|px4", help="For whom the poses are, behind MAVROS."),
@@ -335,7 +346,7 @@ def ros(
     use_threads(threads)
     topics = RosTopics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
-        velocity=velocity, odometry=odometry_topic,
+        velocity=velocity, odometry=odometry_topic, odometry_type=odometry_type,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
