@@ -92,6 +92,14 @@ class RosStatus:
     unusable: int = 0
     restarts: int = 0
 
+    def line(self) -> str:
+        """The same in one line."""
+        others = {"unusable": self.unusable, "dropped": self.counts.dropped}
+        counts = self.refused | {why: count for why, count in others.items() if count}
+        reasons = ", ".join(f"{why} {count}" for why, count in counts.items()) or "nothing"
+        again = f"; {self.restarts} restarts" if self.restarts else ""
+        return f"{self.counts.submitted} pictures; published {self.fixes}; not published: {reasons}{again}"
+
 
 class RosBridge:
     """Connects the topics of one vehicle to one navigator.

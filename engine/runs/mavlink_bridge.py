@@ -31,7 +31,7 @@ from engine.runs.inputs import open_map
 from engine.runs.last_fix import LastFix, last_fix_file
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
-from engine.runs.service import running_service, tell_status
+from engine.runs.service import running_service, status_reporter
 from engine.runs.settings import with_weights
 from engine.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from engine.adapters.mavlink_out import MavlinkOptions
     from engine.adapters.mavlink_status import MavlinkStatus
 
-_MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
 _MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
 
@@ -273,20 +272,15 @@ def _run(
     beat: Callable[[], None],
 ) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
-    begin = reported = time.monotonic()
-    count = 0
+    begin, count = time.monotonic(), 0
+    report = status_reporter(lambda: bridge.status.line(), progress)
     for picture in pictures:
         if picture is not None:
             count += 1
             _submit(bridge, picture, camera, count)
         beat()
-        now = time.monotonic()
-        if now - reported >= _MESSAGE_PERIOD_S:
-            reported = now
-            line = bridge.status.line()
-            progress.message(line)
-            tell_status(line)
-        if seconds is not None and now - begin >= seconds:
+        report()
+        if seconds is not None and time.monotonic() - begin >= seconds:
             return
     if count == 0:
         raise TelemetryError("frames: expected at least one picture, got none")
