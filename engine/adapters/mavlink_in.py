@@ -62,6 +62,9 @@ HANDLED_MESSAGES = frozenset(
 
 _CLOCK_SAMPLES = 64
 _CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot must have rebooted
+_CLOCK_SLIP_NS = (
+    10_000_000  # beyond what two round trips explain, after which its clock was set: crystals drift less
+)
 _MAX_STALE_STAMPS = 20  # consecutive stamps that far back, after which it must have rebooted too
 _UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
 _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
@@ -85,7 +88,8 @@ class AutopilotClock:
     """Maps the autopilot's time since boot to the local monotonic clock.
 
     The offset is that of the TIMESYNC exchange with the shortest round trip; without TIMESYNC it is bounded by the
-    message with the shortest delay, since none arrives before it was sent.
+    message with the shortest delay, since none arrives before it was sent. An exchange that contradicts it by less
+    than a reboot does takes its place: the clock was set, and stamps by the old offset would be as wrong.
     """
 
     def __init__(self) -> None:
@@ -119,8 +123,13 @@ class AutopilotClock:
             return True
         self._requests.remove(stamp_ns)
         round_trip_ns, offset_ns = now_ns - stamp_ns, remote_ns - (stamp_ns + now_ns) // 2
-        if self._by_sync and abs(offset_ns - min(self._by_sync)[1]) > _CLOCK_JUMP_NS + round_trip_ns // 2:
-            return False
+        if self._by_sync:
+            best_trip_ns, best_ns = min(self._by_sync)
+            apart_ns = abs(offset_ns - best_ns)
+            if apart_ns > _CLOCK_JUMP_NS + round_trip_ns // 2:
+                return False
+            if apart_ns > (best_trip_ns + round_trip_ns) // 2 + _CLOCK_SLIP_NS:
+                self._by_sync.clear()
         self._by_sync.append((round_trip_ns, offset_ns))
         return True
 

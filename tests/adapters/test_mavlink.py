@@ -537,6 +537,24 @@ def test_a_restart_shows_in_timesync_before_it_shows_in_the_stamps():
     assert telemetry.vehicle(6_549_000_000).roll_deg == pytest.approx(math.degrees(0.2))
 
 
+@pytest.mark.parametrize("step_ms", [-950, -700, -300, -50, 50, 700])
+def test_a_clock_that_is_set_is_followed_from_the_next_answer_on(step_ms):
+    """Less than a restart: the origin stays, and heights are those of their times, though answers took longer."""
+    telemetry, boot_ms = MavlinkTelemetry(), 100_000
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
+    for ms in range(10_000, 14_000, 20):
+        at_ns, own_ms = ms * 1_000_000, ms + boot_ms + (step_ms if ms >= 12_000 else 0)
+        if ms % 500 == 0:
+            trip_ns = 4_000_000 if ms < 12_000 else 20_000_000
+            telemetry.add_timesync_request(at_ns)
+            answer = mavlink.MAVLink_timesync_message(own_ms * 1_000_000 + trip_ns // 2, at_ns)
+            telemetry.update(answer, at_ns + trip_ns)
+        telemetry.update(mavlink.MAVLink_local_position_ned_message(own_ms, 0, 0, -ms * 1e-3, 0, 0, 0), at_ns)
+        if ms >= 12_520 - min(step_ms, 0):
+            assert telemetry.vehicle(at_ns - 100_000_000).down_m == pytest.approx(0.1 - ms * 1e-3, abs=0.01)
+    assert telemetry.origin is not None
+
+
 # ------------------------------------------------------------------------------------------------ security
 
 
