@@ -23,6 +23,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.quaternion import Quaternion
 
+from engine.adapters import mavlink_requests
 from engine.adapters.delay_memory import remember_delay
 from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
 from engine.adapters.links import Connection, parse_connection
@@ -1054,8 +1055,8 @@ def test_each_firmware_is_asked_for_what_it_has(bridge_to):
 
 
 def test_an_autopilot_whose_receiver_may_still_get_a_fix_sets_its_origin_itself(bridge_to, monkeypatch):
-    monkeypatch.setattr("engine.adapters.mavlink._ORIGIN_TIMEOUT_NS", 300_000_000)
-    monkeypatch.setattr("engine.adapters.mavlink._RECEIVER_FOUND_MS", Standin.BOOT_NS // 1_000_000 + 1_000)
+    monkeypatch.setattr(mavlink_requests, "_ORIGIN_TIMEOUT_NS", 300_000_000)
+    monkeypatch.setattr(mavlink_requests, "_RECEIVER_FOUND_MS", Standin.BOOT_NS // 1_000_000 + 1_000)
     made = bridge_to(origin=ORIGIN)
     with Standin(made.port, receiver=(1, 0, 0)) as pilot:
         fly(made.bridge, lambda: len(pilot.of("TIMESYNC")) > 6)
