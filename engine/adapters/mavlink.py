@@ -81,6 +81,7 @@ class MavlinkBridge:
         check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None is a fixed one.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
+        component_id: component of the vehicle that the bridge is.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
         on_sent: called with every fix that was sent; must return quickly.
@@ -103,20 +104,21 @@ class MavlinkBridge:
         check_gnss: bool = True,
         gimbal_mount: NDArray[np.float64] | None = None,
         system_id: int = 1,
+        component_id: int = BRIDGE_COMPONENT,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
         on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
-        self.telemetry = MavlinkTelemetry(gimbal_mount)
+        self.telemetry = MavlinkTelemetry(gimbal_mount, component_id)
         self._requests = AutopilotRequests(system_id, options, origin, with_gimbal=gimbal_mount is not None)
         self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
-        self._system_id, self._key = system_id, key
+        self._system_id, self._component_id, self._key = system_id, component_id, key
         self._site, self._check_gnss = site, check_gnss
         self._guard = TrackGuard(None if start is None or site is None else position_of(start, site))
         self._notices = PilotNotices()
-        self._encoder = PacketEncoder(system_id, key)
+        self._encoder = PacketEncoder(system_id, key, component_id)
         self._sending = threading.Lock()
         self._navigator: Navigator | None = None
         self._resets_before = 0  # by navigators that have been replaced
@@ -321,7 +323,7 @@ class MavlinkBridge:
 
     def _obey(self, message: Any) -> None:
         """An operator's command to this component: to trust the fixes that contradict the track."""
-        if (message.target_system, message.target_component) != (self._system_id, BRIDGE_COMPONENT):
+        if (message.target_system, message.target_component) != (self._system_id, self._component_id):
             return
         accepted = message.command == CONFIRM_COMMAND
         if accepted:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.gimbal import body_behind, from_device, from_mount
+from engine.adapters.packets import BRIDGE_COMPONENT
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
 from engine.adapters.vision_in import has_failed, vision_velocity
 from engine.geo import wrap_heading_deg
@@ -147,6 +148,7 @@ class MavlinkTelemetry:
 
     Args:
         gimbal_mount: (3, 3) mount of a camera on a gimbal; None is one that is fixed to the vehicle.
+        bridge_component: component of the vehicle that the bridge itself is.
 
     Attributes:
         origin: NED origin of the autopilot; None where it has reported none.
@@ -158,7 +160,10 @@ class MavlinkTelemetry:
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
 
-    def __init__(self, gimbal_mount: NDArray[np.float64] | None = None) -> None:
+    def __init__(
+        self, gimbal_mount: NDArray[np.float64] | None = None, bridge_component: int = BRIDGE_COMPONENT
+    ) -> None:
+        self._bridge_component = bridge_component
         self._lock = threading.Lock()
         self._clock = AutopilotClock()
         self._gimbal_mount, self._holder = gimbal_mount, RecentValues(ANGLES)
@@ -261,9 +266,9 @@ class MavlinkTelemetry:
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
         elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that nobody else has
-            if has_failed(message):
+            if has_failed(message, self._bridge_component):
                 self._vision.clear()
-            seen = vision_velocity(message, self._attitude.at(arrival_ns))
+            seen = vision_velocity(message, self._attitude.at(arrival_ns), self._bridge_component)
             if seen is not None:
                 self._vision.add(arrival_ns, *seen)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):

@@ -53,6 +53,7 @@ class MavlinkSettings:
         connect: as :func:`engine.adapters.links.parse_connection` reads it.
         listen_anywhere: allow udpin on addresses that other machines reach.
         system_id: of the vehicle; others are not heard.
+        component_id: of the vehicle, that the bridge is; an ODOMETRY of type VISION from it is taken for its own.
         key: secret of MAVLink's signing; with it unsigned packets are ignored.
         firmware: of the autopilot, "ardupilot" or "px4".
         message: what is sent; "" is the firmware's usual one.
@@ -64,12 +65,14 @@ class MavlinkSettings:
         gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first.
 
     Raises:
-        OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
+        OptionError: the height of the origin is not one of the Earth's, or there is to be no origin; or the
+            component is none, or the autopilot.
     """
 
     connect: str
     listen_anywhere: bool = False
     system_id: int = 1
+    component_id: int = 197
     key: StrPath | None = None
     firmware: str = "ardupilot"
     message: str = ""
@@ -87,6 +90,9 @@ class MavlinkSettings:
             raise OptionError(
                 f"origin_alt_m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
             )
+
+        if not 2 <= self.component_id <= 255:
+            raise OptionError(f"component_id: expected 2 to 255, 1 is the autopilot, got {self.component_id}")
 
     def outgoing(self) -> MavlinkOptions:
         """What is sent.
@@ -224,8 +230,8 @@ def run_mavlink_bridge(
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
-                check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
-                on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
+                check_gnss=link.check_gnss, system_id=link.system_id, component_id=link.component_id, key=key,
+                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None

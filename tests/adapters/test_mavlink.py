@@ -36,6 +36,7 @@ from engine.adapters.mavlink_out import (
     command_message,
     fix_message,
     heartbeat_message,
+    no_position_message,
     pose_covariance,
     set_origin_message,
     timesync_message,
@@ -380,6 +381,23 @@ def test_a_velocity_by_another_camera_counts_more_than_the_autopilots(message, e
 def test_what_is_no_velocity_of_another_camera_is_left_out(message):
     vehicle = heard(TO_THE_WEST, message)
     assert (vehicle.east_velocity_mps, vehicle.velocity_sigma_mps) == (None, None)
+
+
+@pytest.mark.parametrize(("bridge", "camera"), [(194, 197), (197, 191), (191, 197)])
+def test_beside_a_camera_with_the_usual_id_the_bridge_takes_another(bridge, camera):
+    """And its own messages, which a router passes back, count for nothing: neither a velocity nor a failure."""
+    telemetry, by = MavlinkTelemetry(bridge_component=bridge), mavlink.MAV_ESTIMATOR_TYPE_VISION
+    for message in (
+        TO_THE_WEST,
+        from_camera(odometry(2.0, 1.0, 0.0, by=by), camera),
+        from_camera(odometry(9.0, 9.0, 9.0, by=by), bridge),
+        from_camera(no_position_message(1), bridge),
+    ):
+        telemetry.update(message, 10_000_000_000)
+    vehicle = telemetry.vehicle(10_000_000_000)
+    assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-2.0, 1.0), abs=1e-6)
+    telemetry.update(from_camera(odometry(0.0, 0.0, 0.0, by=by, quality=-1), camera), 10_000_000_001)
+    assert telemetry.vehicle(10_000_000_000).east_velocity_mps is None
 
 
 def test_a_camera_that_failed_takes_its_last_velocity_back():
@@ -1126,6 +1144,34 @@ def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(brid
         pilot.socket.send(word.pack(station))
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
         assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(bridge_to):
+    made = bridge_to(component_id=194, use_velocity=False)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        camera, station = autopilot(component=197), autopilot(system=255, component=190)
+        for number in (197, 194):
+            word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+            fly(made.bridge, lambda: pilot.of("HEARTBEAT"))
+            pilot.socket.send(word.pack(station))
+
+        def seen():
+            pilot.socket.send(odometry(2.0, 1.0, 0.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION).pack(camera))
+            frames = made.navigator.frames
+            return frames and frames[-1].east_velocity_mps is not None and pilot.of("COMMAND_ACK")
+
+        fly(made.bridge, seen)
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        assert len(pilot.of("COMMAND_ACK")) == 1
+        for kind in ("HEARTBEAT", "COMMAND_ACK", "VISION_POSITION_ESTIMATE"):
+            assert {(m.get_srcSystem(), m.get_srcComponent()) for m, _ in pilot.of(kind)} == {(1, 194)}
+
+
+@pytest.mark.parametrize("number", ["1", "0", "256"])
+def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
+    given = ["--connect", "udp:14550", "--map", "m.tif", "--frames", "f", "--camera", "c.yaml"]
+    assert main(["bridge", "mavlink", *given, "--component-id", number]) == 2
+    assert f"--component-id: expected 2 to 255, 1 is the autopilot, got {number}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("by_camera", [True, False])

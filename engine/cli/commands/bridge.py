@@ -96,6 +96,10 @@ def mavlink(
         int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
     ] = 0,
     system_id: SystemIdOption = 1,
+    component_id: Annotated[
+        int,
+        typer.Option("--component-id", metavar="N", help="Of the vehicle, that the bridge is: not another VIO's."),
+    ] = 197,
     key: KeyOption = None,
     listen_anywhere: ListenAnywhereOption = False,
     set_origin: Annotated[
@@ -148,9 +152,9 @@ def mavlink(
         camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
     )  # fmt: skip
     link = MavlinkSettings(
-        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
-        message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
-        use_velocity=use_velocity, check_gnss=check_gnss, gps_id=gps_id,
+        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, component_id=component_id,
+        key=key, firmware=firmware, message=message, max_sigma_m=max_sigma_m, set_origin=set_origin,
+        origin_alt_m=origin_alt_m, use_velocity=use_velocity, check_gnss=check_gnss, gps_id=gps_id,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
