@@ -234,6 +234,11 @@ def test_the_unit_hears_the_worker_of_a_supervisor_and_has_a_watchdog(unit):
     assert longest_s < float(unit["TimeoutStopSec"]) <= float(unit["WatchdogSec"])
 
 
+def test_a_process_that_want_of_memory_ends_is_replaced_by_the_bridge_and_its_main_one_by_systemd(unit):
+    assert "--supervise" in unit["ExecStart"]  # replaces a worker
+    assert (unit["OOMPolicy"], unit["Restart"]) == ("continue", "on-failure")
+
+
 def test_the_units_command_is_one_of_the_command_line(unit):
     from engine.cli.app import run
 
