@@ -63,9 +63,7 @@ HANDLED_MESSAGES = frozenset(
 
 _CLOCK_SAMPLES = 64
 _CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot must have rebooted
-_CLOCK_SLIP_NS = (
-    10_000_000  # beyond what two round trips explain, after which its clock was set: crystals drift less
-)
+_CLOCK_SLIP_NS = 10_000_000  # beyond what two round trips explain: its clock was set, since crystals drift less
 _MAX_STALE_STAMPS = 20  # consecutive stamps that far back, after which it must have rebooted too
 _UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
 _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
