@@ -95,7 +95,7 @@ def test_the_topics_of_the_bridge_are_those_of_the_models_and_the_node():
                  model.findtext(".//odom_topic")}  # fmt: skip
     assert {row["gz_topic_name"] for row in bridged.values()} == published
     told = yaml.safe_load((ROS2 / "config/node.yaml").read_text())["/**"]["ros__parameters"]
-    for name in RosTopics.__slots__:
+    for name in (name for name in RosTopics.__slots__ if name != "odometry_type"):
         assert told[f"{name}_topic"] == getattr(RosTopics(), name)
     assert {told["image_topic"], told["camera_info_topic"]} <= set(bridged)
 

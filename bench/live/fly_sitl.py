@@ -3,8 +3,9 @@
 ``python -m bench.live.fly_sitl VIDEO [--link udpin:127.0.0.1:14552]``, beside SITL with the parameters of
 ``bridge mavlink-params --takeoff gnss``, the bridge and its camera (:mod:`bench.live.video_camera`). It arms in
 GUIDED, climbs to the first height on the receiver, waits for fixes, selects them (source set 2), switches the
-simulated receiver off, holds, flies the subtitles' positions at their own pace, and holds again. Of each part it
-prints how far the estimate was from SITL's own true state, both as they arrive here.
+simulated receiver off, holds, flies the subtitles' positions at their own pace, and holds again. Where a failsafe
+takes over (LAND, RTL), it steers no more and ends when the vehicle has landed and disarmed. Of each part it prints
+how far the estimate was from SITL's own true state, both as they arrive here.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 4,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2,
 }
+_LANDING_S = 600.0  # that a vehicle may take to come home and down by itself
 _ABSOLUTE = mavlink.EKF_POS_HORIZ_ABS
 _IGNORED = (
     mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE
@@ -40,6 +42,10 @@ _IGNORED = (
     | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE
     | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 )
+
+
+class TakenOverError(Exception):
+    """The vehicle follows no targets any more: a failsafe changed its mode, or it has disarmed."""
 
 
 class Pilot:
@@ -53,6 +59,11 @@ class Pilot:
         self.variances: dict[str, list[float]] = {}
         self.height_m, self.armed, self.mode, self.texts, self.fix_type = 0.0, False, "", [], 0
         self._estimate: tuple[float, float] | None = None
+
+    @property
+    def is_steered(self) -> bool:
+        """Whether the vehicle still takes targets: armed in GUIDED, or not heard yet."""
+        return not self.mode or (self.mode == "GUIDED" and self.armed)
 
     def listen(self, seconds: float, done: Callable[[], bool] = lambda: False) -> bool:
         """Take what comes until the time is over, or until something is so."""
@@ -136,17 +147,42 @@ def take_off(pilot: Pilot, height_m: float) -> None:
 
 
 def fly_course(pilot: Pilot, motion: Callable[[float], State], seconds: float, *, still: bool = False) -> None:
-    """Send ten targets a second; ``still`` holds the first of them."""
+    """Send ten targets a second; ``still`` holds the first of them.
+
+    Raises:
+        TakenOverError: the vehicle does not take them any more.
+    """
     begin = time.monotonic()
     while (gone := time.monotonic() - begin) < seconds:
+        if not pilot.is_steered:
+            raise TakenOverError
         state = motion(0.0 if still else gone)
         velocity = (0.0, 0.0) if still else (state.east_mps, state.north_mps)
         pilot.go_to(replace(state, east_mps=velocity[0], north_mps=velocity[1]))
         pilot.listen(0.1)
 
 
+def await_landing(pilot: Pilot) -> None:
+    """Listen until a vehicle that nobody steers any more is down and disarmed."""
+    pilot.part = f"{pilot.mode} by itself"
+    landed = pilot.listen(_LANDING_S, lambda: not pilot.armed)
+    pilot.say("landed" if landed else f"still armed after {_LANDING_S:g} s, at {pilot.height_m:.0f} m")
+
+
 def fly(pilot: Pilot, motion: Callable[[float], State], duration_s: float, hold_s: float) -> None:
-    """The whole flight."""
+    """The whole flight, or up to where the vehicle has landed by itself."""
+    try:
+        fly_parts(pilot, motion, duration_s, hold_s)
+    except TakenOverError:
+        await_landing(pilot)
+
+
+def fly_parts(pilot: Pilot, motion: Callable[[float], State], duration_s: float, hold_s: float) -> None:
+    """The whole flight.
+
+    Raises:
+        TakenOverError: the vehicle did not take its targets up to the end.
+    """
     for message_id, rate_hz in RATES_HZ.items():
         pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
     take_off(pilot, motion(0.0).height_m)

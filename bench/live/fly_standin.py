@@ -2,8 +2,9 @@
 
 ``python -m bench.live.fly_standin FLIGHT [--port N] [--firmware ardupilot|px4] [--seconds S]``, before or after
 the bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT is a folder with a
-``telemetry.csv`` and a ``truth.csv`` with heights and attitude, as ``scenematch simulate`` writes them, or a video
-with DJI's ``.SRT`` beside it: it then flies the positions, the heights and the gimbal's angles of the subtitles.
+``telemetry.csv`` and a ``truth.csv`` with attitude, as ``scenematch simulate`` writes them, or a video with DJI's
+``.SRT`` beside it: it then flies the positions, the heights and the gimbal's angles of the subtitles. Where truth
+has no heights above ground it flies those of the telemetry.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import math
 import socket
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
 from engine.errors import EngineError, TelemetryError
 from engine.formats.flight import open_flight
-from engine.formats.telemetry import read_telemetry
-from engine.formats.truth import read_truth
+from engine.formats.telemetry import TelemetryRow, read_telemetry
+from engine.formats.truth import Truth, read_truth
 from engine.geo import LocalFrame
 
 FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
@@ -54,12 +56,29 @@ def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]
 def _states(flight: Path) -> tuple[Sequence[Any], int]:
     """The states of a folder's truth or a video's subtitles, and the stamp of the first picture."""
     if flight.is_dir():
-        return read_truth(flight / "truth.csv"), read_telemetry(flight / "telemetry.csv")[0].timestamp_ns
+        telemetry = read_telemetry(flight / "telemetry.csv")
+        return _true_states(flight, telemetry), telemetry[0].timestamp_ns
     rows = open_flight(flight).rows
     known = [row for row in rows if None not in (row.lat_deg, row.height_agl_m, row.heading_deg)]
     if not known:
         raise TelemetryError(f"{flight}: expected subtitles beside it with position, rel_alt and gimbal, got none")
     return known, rows[0].timestamp_ns
+
+
+def _true_states(flight: Path, telemetry: Sequence[TelemetryRow]) -> list[Truth]:
+    """The truth of a folder; a truth of altitudes above the sea alone has the telemetry's heights above ground."""
+    rows = read_truth(flight / "truth.csv")
+    if any(row.heading_deg is None for row in rows):
+        raise TelemetryError(f"{flight / 'truth.csv'}: expected a heading_deg in every row")
+    sources: tuple[Sequence[Truth | TelemetryRow], ...] = (rows, telemetry)
+    known = next(filter(None, ([row for row in each if row.height_agl_m is not None] for each in sources)), None)
+    if known is None:
+        raise TelemetryError(f"{flight}: expected height_agl_m in truth.csv or telemetry.csv, got none in either")
+    stamps_ns = [row.timestamp_ns for row in rows]
+    heights_m = np.interp(
+        stamps_ns, [row.timestamp_ns for row in known], [row.height_agl_m or 0.0 for row in known]
+    )
+    return [replace(row, height_agl_m=float(height_m)) for row, height_m in zip(rows, heights_m, strict=True)]
 
 
 def _velocity(time_s: NDArray[np.float64], east_north: NDArray[np.float64]) -> NDArray[np.float64]:

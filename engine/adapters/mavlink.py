@@ -18,28 +18,21 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.fix_velocity import VelocityFromFixes
 from engine.adapters.links import Connection, Link, PeerAddress, parse_connection
-from engine.adapters.mavlink_in import (
-    GIMBAL_RATES_HZ,
-    HANDLED_MESSAGES,
-    MAV_AUTOPILOTS,
-    REQUESTED_RATES_HZ,
-    MavlinkTelemetry,
-)
+from engine.adapters.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, MavlinkTelemetry
 from engine.adapters.mavlink_out import (
     FixReport,
     MavlinkOptions,
     acknowledgement_message,
-    command_message,
     fix_message,
     heartbeat_message,
     no_position_message,
     notice_message,
     repeated_receiver_message,
-    set_origin_message,
     stamp_on_ground_ns,
     timesync_message,
     withhold_reason,
 )
+from engine.adapters.mavlink_requests import AutopilotRequests
 from engine.adapters.mavlink_status import MavlinkCounters, MavlinkStatus
 from engine.adapters.notices import INFO, Notice, PilotNotices
 from engine.adapters.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder
@@ -69,9 +62,6 @@ CONFIRM_COMMAND = mavlink.MAV_CMD_USER_1
 _POLL_S = 0.02
 _SILENCE_NS = 5_000_000_000  # without a heartbeat, after which the vehicle counts as disconnected
 _REOPEN_S = 1.0
-_ORIGIN_TIMEOUT_NS = 3_000_000_000  # after which an origin is set on an autopilot that reports none
-_ORIGIN_TIMEOUT_GNSS_NS = 60_000_000_000  # the same while its GNSS receiver may still get a first fix
-_RECEIVER_FOUND_MS = 20_000  # after its start, by when an autopilot has found its receiver: ArduPilot takes 9 s
 _GNSS_STALE_NS = 2_000_000_000
 
 
@@ -91,6 +81,7 @@ class MavlinkBridge:
         check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None is a fixed one.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
+        component_id: component of the vehicle that the bridge is.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
         on_sent: called with every fix that was sent; must return quickly.
@@ -113,22 +104,21 @@ class MavlinkBridge:
         check_gnss: bool = True,
         gimbal_mount: NDArray[np.float64] | None = None,
         system_id: int = 1,
+        component_id: int = BRIDGE_COMPONENT,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
         on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
-        self.telemetry = MavlinkTelemetry(gimbal_mount)
-        self._rates_hz = REQUESTED_RATES_HZ[options.firmware]
-        if gimbal_mount is not None:
-            self._rates_hz = self._rates_hz | GIMBAL_RATES_HZ[options.firmware]
+        self.telemetry = MavlinkTelemetry(gimbal_mount, component_id)
+        self._requests = AutopilotRequests(system_id, options, origin, with_gimbal=gimbal_mount is not None)
         self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
-        self._system_id, self._key = system_id, key
+        self._system_id, self._component_id, self._key = system_id, component_id, key
         self._site, self._check_gnss = site, check_gnss
         self._guard = TrackGuard(None if start is None or site is None else position_of(start, site))
         self._notices = PilotNotices()
-        self._encoder = PacketEncoder(system_id, key)
+        self._encoder = PacketEncoder(system_id, key, component_id)
         self._sending = threading.Lock()
         self._navigator: Navigator | None = None
         self._resets_before = 0  # by navigators that have been replaced
@@ -137,8 +127,7 @@ class MavlinkBridge:
         self._confirmed = False  # by an operator, for the next fix
         self._peer: PeerAddress = None
         self._connected_ns = 0  # when the vehicle was heard first, or again
-        self._without_origin_ns = 0  # since when the autopilot has reported no origin
-        self._last_done_ns = {"heartbeat": 0, "timesync": 0, "request": 0, "log": 0}
+        self._last_done_ns = {"heartbeat": 0, "timesync": 0, "log": 0}
         self._closed = threading.Event()
         self._link: Link | None = connection.open()
         self._decoder = self._new_decoder(self._link)
@@ -334,7 +323,7 @@ class MavlinkBridge:
 
     def _obey(self, message: Any) -> None:
         """An operator's command to this component: to trust the fixes that contradict the track."""
-        if (message.target_system, message.target_component) != (self._system_id, BRIDGE_COMPONENT):
+        if (message.target_system, message.target_component) != (self._system_id, self._component_id):
             return
         accepted = message.command == CONFIRM_COMMAND
         if accepted:
@@ -345,8 +334,9 @@ class MavlinkBridge:
     def _on_connected(self, now_ns: int) -> None:
         """Start over with a vehicle that is heard for the first time, or again."""
         self._counters.reconnections += self._connected_ns != 0
-        self._connected_ns = self._without_origin_ns = now_ns
-        self._last_done_ns["request"] = self._last_done_ns["timesync"] = 0
+        self._connected_ns = now_ns
+        self._last_done_ns["timesync"] = 0
+        self._requests.restart(now_ns)
         self.telemetry.reset()
 
     def _keep_alive(self) -> None:
@@ -360,26 +350,8 @@ class MavlinkBridge:
         if self._is_due("timesync", now_ns, 0.5):
             self.telemetry.add_timesync_request(now_ns)
             self._send(timesync_message(now_ns))
-        if self.telemetry.origin is not None:
-            self._without_origin_ns = now_ns
-        if self._is_due("request", now_ns, 10.0 if self.telemetry.origin else 1.0):
-            self._request_streams(now_ns)
-
-    def _request_streams(self, now_ns: int) -> None:
-        """Request the telemetry messages and the origin; set an origin where the autopilot has none."""
-        for number, rate_hz in self._rates_hz.items():
-            interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz
-            self._send(command_message(self._system_id, *interval))
-        origin = mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-        self._send(command_message(self._system_id, *origin))
-        # An autopilot with a receiver sets its origin itself, in a better place, when that has a fix.
-        receiver, uptime_ms = self.telemetry.has_receiver, self.telemetry.uptime_ms
-        on_ground = not self.telemetry.armed
-        seeks = on_ground and not receiver and uptime_ms is not None and uptime_ms < _RECEIVER_FOUND_MS
-        waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if receiver or seeks else _ORIGIN_TIMEOUT_NS
-        wanted = self._origin is not None and self._options.kind != "gps_input"
-        if self._origin is not None and wanted and now_ns - self._without_origin_ns > waited_ns:
-            self._send(set_origin_message(self._system_id, self._origin, now_ns))
+        for request in self._requests.due(self.telemetry, now_ns):
+            self._send(request)
 
     def _is_due(self, task: str, now_ns: int, period_s: float) -> bool:
         due = now_ns - self._last_done_ns[task] >= round(period_s * 1e9)

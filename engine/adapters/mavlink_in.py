@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.adapters.gimbal import body_behind, from_device, from_mount
+from engine.adapters.packets import BRIDGE_COMPONENT
 from engine.adapters.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
 from engine.adapters.vision_in import has_failed, vision_velocity
 from engine.geo import wrap_heading_deg
@@ -62,6 +63,7 @@ HANDLED_MESSAGES = frozenset(
 
 _CLOCK_SAMPLES = 64
 _CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot must have rebooted
+_CLOCK_SLIP_NS = 10_000_000  # beyond what two round trips explain: its clock was set, since crystals drift less
 _MAX_STALE_STAMPS = 20  # consecutive stamps that far back, after which it must have rebooted too
 _UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
 _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
@@ -85,7 +87,8 @@ class AutopilotClock:
     """Maps the autopilot's time since boot to the local monotonic clock.
 
     The offset is that of the TIMESYNC exchange with the shortest round trip; without TIMESYNC it is bounded by the
-    message with the shortest delay, since none arrives before it was sent.
+    message with the shortest delay, since none arrives before it was sent. An exchange that contradicts it by less
+    than a reboot does takes its place: the clock was set, and stamps by the old offset would be as wrong.
     """
 
     def __init__(self) -> None:
@@ -119,8 +122,13 @@ class AutopilotClock:
             return True
         self._requests.remove(stamp_ns)
         round_trip_ns, offset_ns = now_ns - stamp_ns, remote_ns - (stamp_ns + now_ns) // 2
-        if self._by_sync and abs(offset_ns - min(self._by_sync)[1]) > _CLOCK_JUMP_NS + round_trip_ns // 2:
-            return False
+        if self._by_sync:
+            best_trip_ns, best_ns = min(self._by_sync)
+            apart_ns = abs(offset_ns - best_ns)
+            if apart_ns > _CLOCK_JUMP_NS + round_trip_ns // 2:
+                return False
+            if apart_ns > (best_trip_ns + round_trip_ns) // 2 + _CLOCK_SLIP_NS:
+                self._by_sync.clear()
         self._by_sync.append((round_trip_ns, offset_ns))
         return True
 
@@ -138,6 +146,7 @@ class MavlinkTelemetry:
 
     Args:
         gimbal_mount: (3, 3) mount of a camera on a gimbal; None is one that is fixed to the vehicle.
+        bridge_component: component of the vehicle that the bridge itself is.
 
     Attributes:
         origin: NED origin of the autopilot; None where it has reported none.
@@ -149,7 +158,10 @@ class MavlinkTelemetry:
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
 
-    def __init__(self, gimbal_mount: NDArray[np.float64] | None = None) -> None:
+    def __init__(
+        self, gimbal_mount: NDArray[np.float64] | None = None, bridge_component: int = BRIDGE_COMPONENT
+    ) -> None:
+        self._bridge_component = bridge_component
         self._lock = threading.Lock()
         self._clock = AutopilotClock()
         self._gimbal_mount, self._holder = gimbal_mount, RecentValues(ANGLES)
@@ -252,9 +264,9 @@ class MavlinkTelemetry:
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
         elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that nobody else has
-            if has_failed(message):
+            if has_failed(message, self._bridge_component):
                 self._vision.clear()
-            seen = vision_velocity(message, self._attitude.at(arrival_ns))
+            seen = vision_velocity(message, self._attitude.at(arrival_ns), self._bridge_component)
             if seen is not None:
                 self._vision.add(arrival_ns, *seen)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):

@@ -15,6 +15,7 @@ from engine.errors import OptionError
 V1, V2 = 0xFE, 0xFD
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 BRIDGE_COMPONENT = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+"""Component of the vehicle that the bridge is where it is given no other."""
 
 # A companion computer is another component; `vision_in` leaves out the autopilot's and the bridge's own.
 _FROM_ANY_COMPONENT = (mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE)
@@ -55,10 +56,11 @@ class PacketEncoder:
     Args:
         system_id: MAVLink system id of the vehicle, of which the bridge is a component.
         key: 32-byte signing key, or None.
+        component_id: that component.
     """
 
-    def __init__(self, system_id: int, key: bytes | None = None) -> None:
-        self._mavlink: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=BRIDGE_COMPONENT)
+    def __init__(self, system_id: int, key: bytes | None = None, component_id: int = BRIDGE_COMPONENT) -> None:
+        self._mavlink: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         if key is not None:
             self._mavlink.signing.secret_key = key
             self._mavlink.signing.sign_outgoing = True

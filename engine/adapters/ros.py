@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from engine.adapters.ros_in import RESTART_NS, RosTelemetry, RosTopics
 from engine.adapters.ros_out import RosOptions, diagnostics, is_finite, pose, window_picture
 from engine.errors import EngineError, StateError
-from engine.formats.ros.messages import MessageFactory, image_from_message, stamp_ns
+from engine.formats.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
 from engine.live import Answer, Counts, Live, LiveOptions
 from engine.navigator import Navigator
 from engine.orthomap import OrthoMap
@@ -92,6 +92,14 @@ class RosStatus:
     unusable: int = 0
     restarts: int = 0
 
+    def line(self) -> str:
+        """The same in one line."""
+        others = {"unusable": self.unusable, "dropped": self.counts.dropped}
+        counts = self.refused | {why: count for why, count in others.items() if count}
+        reasons = ", ".join(f"{why} {count}" for why, count in counts.items()) or "nothing"
+        again = f"; {self.restarts} restarts" if self.restarts else ""
+        return f"{self.counts.submitted} pictures; published {self.fixes}; not published: {reasons}{again}"
+
 
 class RosBridge:
     """Connects the topics of one vehicle to one navigator.
@@ -124,6 +132,7 @@ class RosBridge:
         self._live = self._start_live()
         self._held = _Held()
         self._image_topic = ""
+        self._odometry_error = ""  # of the last one
         self._said: set[str] = set()  # in the terminal, each once
         self._last_ns: int | None = None
         self._last_image_s = time.monotonic()
@@ -154,7 +163,7 @@ class RosBridge:
             topics.height: ("std_msgs/msg/Float64", lambda m: telemetry.height(m.data, now_ns())),
             topics.range: ("sensor_msgs/msg/Range", telemetry.range),
             topics.velocity: ("geometry_msgs/msg/TwistStamped", telemetry.velocity),
-            topics.odometry: ("nav_msgs/msg/Odometry", lambda m: telemetry.odometry(m, now_ns())),
+            topics.odometry: (ODOMETRY_TYPES[topics.odometry_type], self.on_odometry),
         }
         return {name: handler for name, handler in handlers.items() if name}
 
@@ -162,6 +171,16 @@ class RosBridge:
         """Store an attitude; a picture that waits for it goes on."""
         self.telemetry.imu(message)
         self._held.release(lambda captured_ns: not self.telemetry.waits_for_attitude(captured_ns))
+
+    def on_odometry(self, message: Any) -> None:
+        """Store the velocity of another odometry; why it cannot be used is reported with every frame."""
+        try:
+            self.telemetry.odometry(message, self._node.now_ns())
+        except EngineError as error:
+            self._odometry_error = str(error)
+            self._say("odometry", f"an odometry cannot be used: {error}")
+        else:
+            self._odometry_error = ""
 
     def on_image(self, message: Any) -> None:
         """Submit the newest picture, once the attitude of its capture is known; one without a stamp is of now."""
@@ -219,6 +238,8 @@ class RosBridge:
         captured_ns, result = answer.frame.timestamp_ns, answer.result
         assert captured_ns is not None  # set by on_image
         values = {"method": result.method or "", "age_ms": f"{answer.age_ms:.1f}", **_known(answer.frame)}
+        if self._odometry_error:
+            values["odometry"] = self._odometry_error
         if result.score is not None:
             values["score"] = f"{result.score:.3f}"
         if isinstance(result, Fix) and is_finite(result):

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from engine.adapters.vehicle import ANGLES, RecentValues, VehicleState, scalar
+from engine.errors import OptionError
 from engine.formats.ros import bags
 from engine.formats.ros.messages import (
+    ODOMETRY_TYPES,
     attitude_from_message,
     body_velocity_from_message,
     range_from_message,
@@ -38,7 +40,12 @@ class RosTopics:
         range: sensor_msgs/Range along the body's down axis; takes precedence over the height.
         velocity: geometry_msgs/TwistStamped, east and north in m/s; used where the last half second has no
             odometry.
-        odometry: nav_msgs/Odometry of another camera's odometry, whose twist is along the body.
+        odometry: another camera's odometry, whose twist is along the body.
+        odometry_type: its message, one of :data:`engine.formats.ros.messages.ODOMETRY_TYPES`: Odometry,
+            TwistWithCovarianceStamped or TwistStamped.
+
+    Raises:
+        OptionError: the message of the odometry is another.
     """
 
     image: str = bags.IMAGE
@@ -49,6 +56,12 @@ class RosTopics:
     range: str = bags.RANGE
     velocity: str = bags.VELOCITY
     odometry: str = ""
+    odometry_type: str = "Odometry"
+
+    def __post_init__(self) -> None:
+        if self.odometry_type not in ODOMETRY_TYPES:
+            known = ", ".join(ODOMETRY_TYPES)
+            raise OptionError(f"odometry_type: expected one of {known}, got {self.odometry_type!r}")
 
     @property
     def image_type(self) -> str:
@@ -96,7 +109,11 @@ class RosTelemetry:
         self._add(self._velocity, stamp_ns(message), linear.x, linear.y)
 
     def odometry(self, message: Any, now_ns: int) -> None:
-        """Store the velocity along the body of a nav_msgs/Odometry; one without a stamp is of now."""
+        """Store the velocity along the body of another odometry; one without a stamp is of now.
+
+        Raises:
+            TelemetryError: its velocity is not along the body.
+        """
         velocity = body_velocity_from_message(message)
         if velocity is not None:
             self._add(self._odometry, stamp_ns(message) or now_ns, *velocity)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.packets import AUTOPILOT_COMPONENT, BRIDGE_COMPONENT
+from engine.adapters.packets import AUTOPILOT_COMPONENT
 from engine.formats.velocities import velocity_sigma_mps
 from engine.geo import enu_from_body
 
@@ -21,19 +21,20 @@ _FAILED = -1  # quality
 
 
 def vision_velocity(
-    message: Any, attitude_deg: tuple[float, ...] | None
+    message: Any, attitude_deg: tuple[float, ...] | None, bridge_component: int
 ) -> tuple[float, float, float, float] | None:
     """East, north and up in m/s, and one standard deviation per axis, 0 where it is not stated.
 
     Args:
         message: VISION_SPEED_ESTIMATE or ODOMETRY.
         attitude_deg: roll, pitch and heading of the vehicle, by which a velocity along its body is turned.
+        bridge_component: component of the vehicle that the bridge itself is.
 
     Returns:
         None where the message has no such velocity: of another estimator than a camera's, the autopilot's or the
         bridge's own, in another frame, failed, of an absurd size, or of an unbounded variance.
     """
-    if not _is_by_camera(message) or has_failed(message):
+    if not _is_by_camera(message, bridge_component) or has_failed(message, bridge_component):
         return None
     if message.get_type() == "VISION_SPEED_ESTIMATE":
         velocity, variances = np.array([message.x, message.y, message.z]), message.covariance[0::4]
@@ -49,22 +50,25 @@ def vision_velocity(
     return east, north, up, sigma_mps
 
 
-def has_failed(message: Any) -> bool:
+def has_failed(message: Any, bridge_component: int) -> bool:
     """Whether another camera's ODOMETRY says that it has failed, so that what it said last holds no more."""
-    return message.get_type() == "ODOMETRY" and _is_by_camera(message) and message.quality == _FAILED
+    if message.get_type() != "ODOMETRY" or message.quality != _FAILED:
+        return False
+    return _is_by_camera(message, bridge_component)
 
 
-def _is_by_camera(message: Any) -> bool:
+def _is_by_camera(message: Any, bridge_component: int) -> bool:
     """Whether it is of another camera's odometry: not the autopilot's, nor the bridge's own.
 
-    An autopilot also passes on what it was sent, the bridge's fixes included, as a component of its own.
+    An autopilot also passes on what it was sent, the bridge's fixes included, as a component of its own; a router
+    may pass them back unchanged. The bridge's ODOMETRY is of type VISION: another type is not its own.
     """
     if message.get_srcComponent() == AUTOPILOT_COMPONENT:
         return False
     if message.get_type() == "VISION_SPEED_ESTIMATE":
         return True
     if message.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_VISION:
-        return bool(message.get_srcComponent() != BRIDGE_COMPONENT)
+        return bool(message.get_srcComponent() != bridge_component)
     return bool(message.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_VIO)
 
 

@@ -143,7 +143,7 @@ ImageTopicOption = Annotated[
 EveryOption = Annotated[int, typer.Option("--every", metavar="N", help="Use one frame in N, from the first on.")]
 OdometryTopicOption = Annotated[
     str | None,
-    typer.Option("--odometry-topic", metavar="NAME", help="Of a bag: nav_msgs/Odometry that has the velocity."),
+    typer.Option("--odometry-topic", metavar="NAME", help="Of a bag: another odometry, that has the velocity."),
 ]
 FrameStampsOption = Annotated[
     Path | None,

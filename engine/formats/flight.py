@@ -141,7 +141,7 @@ def open_flight(
         clock: capture times of the frames, where the telemetry is a log.
         image_topic: topic of a bag's images; None where there is only one.
         columns: what a telemetry.csv calls a column, by its name in :data:`engine.formats.telemetry.COLUMNS`.
-        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
+        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
 
     Returns:
         The flight; no image but the first has been read.

@@ -46,7 +46,7 @@ class RecordedFlight:
         frame_stamps: with a log, a CSV with timestamp_ns and frame; without it the frames' own stamps.
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
-        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
+        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
         every: one frame in so many is used.
         truth: truth.csv or a log.
         map_sigma_m: georeferencing accuracy of the map per axis; none is what the map states.

@@ -58,7 +58,7 @@ class FlightFiles:
         frame_stamps: with a log, a CSV with timestamp_ns and frame.
         log_offset_s: with a log, added to the frames' stamps.
         image_topic: of the pictures, where the frames are a bag with several.
-        odometry_topic: nav_msgs/Odometry that the velocity is taken from, where the telemetry is a bag.
+        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
         every: one frame in so many is used, from the first on.
         map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
         map_bounds: "W,S,E,N" of the outer edges of a picture, in degrees or in ``map_crs``; None is the

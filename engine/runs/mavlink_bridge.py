@@ -31,7 +31,7 @@ from engine.runs.inputs import open_map
 from engine.runs.last_fix import LastFix, last_fix_file
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.progress import SILENT, Progress
-from engine.runs.service import running_service, tell_status
+from engine.runs.service import running_service, status_reporter
 from engine.runs.settings import with_weights
 from engine.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 from engine.values import Prior
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from engine.adapters.mavlink_out import MavlinkOptions
     from engine.adapters.mavlink_status import MavlinkStatus
 
-_MESSAGE_PERIOD_S = 5.0
 _AUTOPILOT_TIMEOUT_S = 10.0
 _MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
 
@@ -54,6 +53,7 @@ class MavlinkSettings:
         connect: as :func:`engine.adapters.links.parse_connection` reads it.
         listen_anywhere: allow udpin on addresses that other machines reach.
         system_id: of the vehicle; others are not heard.
+        component_id: of the vehicle, that the bridge is; an ODOMETRY of type VISION from it is taken for its own.
         key: secret of MAVLink's signing; with it unsigned packets are ignored.
         firmware: of the autopilot, "ardupilot" or "px4".
         message: what is sent; "" is the firmware's usual one.
@@ -65,12 +65,14 @@ class MavlinkSettings:
         gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first.
 
     Raises:
-        OptionError: the height of the origin is not one of the Earth's, or there is to be no origin.
+        OptionError: the height of the origin is not one of the Earth's, or there is to be no origin; or the
+            component is none, or the autopilot.
     """
 
     connect: str
     listen_anywhere: bool = False
     system_id: int = 1
+    component_id: int = 197
     key: StrPath | None = None
     firmware: str = "ardupilot"
     message: str = ""
@@ -88,6 +90,9 @@ class MavlinkSettings:
             raise OptionError(
                 f"origin_alt_m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
             )
+
+        if not 2 <= self.component_id <= 255:
+            raise OptionError(f"component_id: expected 2 to 255, 1 is the autopilot, got {self.component_id}")
 
     def outgoing(self) -> MavlinkOptions:
         """What is sent.
@@ -225,8 +230,8 @@ def run_mavlink_bridge(
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
-                check_gnss=link.check_gnss, system_id=link.system_id, key=key, watch=watcher,
-                on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
+                check_gnss=link.check_gnss, system_id=link.system_id, component_id=link.component_id, key=key,
+                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -273,20 +278,15 @@ def _run(
     beat: Callable[[], None],
 ) -> None:
     """Every picture to the bridge; now and then a line of what it does."""
-    begin = reported = time.monotonic()
-    count = 0
+    begin, count = time.monotonic(), 0
+    report = status_reporter(lambda: bridge.status.line(), progress)
     for picture in pictures:
         if picture is not None:
             count += 1
             _submit(bridge, picture, camera, count)
         beat()
-        now = time.monotonic()
-        if now - reported >= _MESSAGE_PERIOD_S:
-            reported = now
-            line = bridge.status.line()
-            progress.message(line)
-            tell_status(line)
-        if seconds is not None and now - begin >= seconds:
+        report()
+        if seconds is not None and time.monotonic() - begin >= seconds:
             return
     if count == 0:
         raise TelemetryError("frames: expected at least one picture, got none")

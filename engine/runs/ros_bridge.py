@@ -21,7 +21,7 @@ from engine.runs.inputs import open_map
 from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from engine.runs.mavlink_bridge import BridgeSettings
 from engine.runs.progress import SILENT, Progress
-from engine.runs.service import running_service
+from engine.runs.service import running_service, status_reporter
 
 _CAMERA_INFO_TIMEOUT_S = 30.0
 
@@ -138,11 +138,13 @@ def run_ros_bridge(
         try:
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
+            report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat:
 
                 def every_second() -> None:
                     bridge.check_input()
                     beat()
+                    report()
 
                 node.spin(bridge.handlers(ros.topics), every_second, settings.seconds)
         finally:

@@ -1,6 +1,6 @@
-"""What systemd is told of a bridge that it runs: that it is ready, that its loop goes on, how, that it ends.
+"""What a bridge reports while it runs: to the terminal a line, to systemd also that it is ready, goes on and ends.
 
-Nothing is sent where systemd does not ask for it by $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
+Nothing is sent to systemd where it does not ask for it by $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from engine.runs.progress import Progress
+
+_STATUS_PERIOD_S = 5.0
 _BEATS = 4  # within the time that the watchdog waits, so that one that is late or lost does not end the bridge
 
 
@@ -38,9 +41,24 @@ def running_service() -> Iterator[Callable[[], None]]:
         _tell("STOPPING=1")
 
 
-def tell_status(line: str) -> None:
-    """Let ``systemctl status`` show a line."""
-    _tell(f"STATUS={line}")
+def status_reporter(line: Callable[[], str], progress: Progress) -> Callable[[], None]:
+    """A function for the loop to call each time around: now and then it shows what the bridge does.
+
+    Args:
+        line: of the bridge's status.
+        progress: is shown it; so is ``systemctl status``.
+    """
+    reported_s = time.monotonic()
+
+    def report() -> None:
+        nonlocal reported_s
+        if (now := time.monotonic()) - reported_s >= _STATUS_PERIOD_S:
+            reported_s = now
+            text = line()
+            progress.message(text)
+            _tell(f"STATUS={text}")
+
+    return report
 
 
 def _tell(state: str) -> None:

@@ -23,6 +23,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.quaternion import Quaternion
 
+from engine.adapters import mavlink_requests
 from engine.adapters.delay_memory import remember_delay
 from engine.adapters.fix_velocity import GroundVelocity, VelocityFromFixes
 from engine.adapters.links import Connection, parse_connection
@@ -35,6 +36,7 @@ from engine.adapters.mavlink_out import (
     command_message,
     fix_message,
     heartbeat_message,
+    no_position_message,
     pose_covariance,
     set_origin_message,
     timesync_message,
@@ -381,6 +383,23 @@ def test_what_is_no_velocity_of_another_camera_is_left_out(message):
     assert (vehicle.east_velocity_mps, vehicle.velocity_sigma_mps) == (None, None)
 
 
+@pytest.mark.parametrize(("bridge", "camera"), [(194, 197), (197, 191), (191, 197)])
+def test_beside_a_camera_with_the_usual_id_the_bridge_takes_another(bridge, camera):
+    """And its own messages, which a router passes back, count for nothing: neither a velocity nor a failure."""
+    telemetry, by = MavlinkTelemetry(bridge_component=bridge), mavlink.MAV_ESTIMATOR_TYPE_VISION
+    for message in (
+        TO_THE_WEST,
+        from_camera(odometry(2.0, 1.0, 0.0, by=by), camera),
+        from_camera(odometry(9.0, 9.0, 9.0, by=by), bridge),
+        from_camera(no_position_message(1), bridge),
+    ):
+        telemetry.update(message, 10_000_000_000)
+    vehicle = telemetry.vehicle(10_000_000_000)
+    assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-2.0, 1.0), abs=1e-6)
+    telemetry.update(from_camera(odometry(0.0, 0.0, 0.0, by=by, quality=-1), camera), 10_000_000_001)
+    assert telemetry.vehicle(10_000_000_000).east_velocity_mps is None
+
+
 def test_a_camera_that_failed_takes_its_last_velocity_back():
     good, failed = (from_camera(odometry(1.0, 2.0, 3.0, quality=quality)) for quality in (80, -1))
     assert heard(TO_THE_WEST, good, failed).east_velocity_mps is None
@@ -535,6 +554,24 @@ def test_a_restart_shows_in_timesync_before_it_shows_in_the_stamps():
     ask(6_500_000_000, 501_000_000, 2_000_000)
     telemetry.update(mavlink.MAVLink_attitude_message(550, 0.2, 0, 0, 0, 0, 0), 6_552_000_000)
     assert telemetry.vehicle(6_549_000_000).roll_deg == pytest.approx(math.degrees(0.2))
+
+
+@pytest.mark.parametrize("step_ms", [-950, -700, -300, -50, 50, 700])
+def test_a_clock_that_is_set_is_followed_from_the_next_answer_on(step_ms):
+    """Less than a restart: the origin stays, and heights are those of their times, though answers took longer."""
+    telemetry, boot_ms = MavlinkTelemetry(), 100_000
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
+    for ms in range(10_000, 14_000, 20):
+        at_ns, own_ms = ms * 1_000_000, ms + boot_ms + (step_ms if ms >= 12_000 else 0)
+        if ms % 500 == 0:
+            trip_ns = 4_000_000 if ms < 12_000 else 20_000_000
+            telemetry.add_timesync_request(at_ns)
+            answer = mavlink.MAVLink_timesync_message(own_ms * 1_000_000 + trip_ns // 2, at_ns)
+            telemetry.update(answer, at_ns + trip_ns)
+        telemetry.update(mavlink.MAVLink_local_position_ned_message(own_ms, 0, 0, -ms * 1e-3, 0, 0, 0), at_ns)
+        if ms >= 12_520 - min(step_ms, 0):
+            assert telemetry.vehicle(at_ns - 100_000_000).down_m == pytest.approx(0.1 - ms * 1e-3, abs=0.01)
+    assert telemetry.origin is not None
 
 
 # ------------------------------------------------------------------------------------------------ security
@@ -1036,8 +1073,8 @@ def test_each_firmware_is_asked_for_what_it_has(bridge_to):
 
 
 def test_an_autopilot_whose_receiver_may_still_get_a_fix_sets_its_origin_itself(bridge_to, monkeypatch):
-    monkeypatch.setattr("engine.adapters.mavlink._ORIGIN_TIMEOUT_NS", 300_000_000)
-    monkeypatch.setattr("engine.adapters.mavlink._RECEIVER_FOUND_MS", Standin.BOOT_NS // 1_000_000 + 1_000)
+    monkeypatch.setattr(mavlink_requests, "_ORIGIN_TIMEOUT_NS", 300_000_000)
+    monkeypatch.setattr(mavlink_requests, "_RECEIVER_FOUND_MS", Standin.BOOT_NS // 1_000_000 + 1_000)
     made = bridge_to(origin=ORIGIN)
     with Standin(made.port, receiver=(1, 0, 0)) as pilot:
         fly(made.bridge, lambda: len(pilot.of("TIMESYNC")) > 6)
@@ -1107,6 +1144,34 @@ def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(brid
         pilot.socket.send(word.pack(station))
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
         assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(bridge_to):
+    made = bridge_to(component_id=194, use_velocity=False)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        camera, station = autopilot(component=197), autopilot(system=255, component=190)
+        for number in (197, 194):
+            word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+            fly(made.bridge, lambda: pilot.of("HEARTBEAT"))
+            pilot.socket.send(word.pack(station))
+
+        def seen():
+            pilot.socket.send(odometry(2.0, 1.0, 0.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION).pack(camera))
+            frames = made.navigator.frames
+            return frames and frames[-1].east_velocity_mps is not None and pilot.of("COMMAND_ACK")
+
+        fly(made.bridge, seen)
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        assert len(pilot.of("COMMAND_ACK")) == 1
+        for kind in ("HEARTBEAT", "COMMAND_ACK", "VISION_POSITION_ESTIMATE"):
+            assert {(m.get_srcSystem(), m.get_srcComponent()) for m, _ in pilot.of(kind)} == {(1, 194)}
+
+
+@pytest.mark.parametrize("number", ["1", "0", "256"])
+def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
+    given = ["--connect", "udp:14550", "--map", "m.tif", "--frames", "f", "--camera", "c.yaml"]
+    assert main(["bridge", "mavlink", *given, "--component-id", number]) == 2
+    assert f"--component-id: expected 2 to 255, 1 is the autopilot, got {number}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("by_camera", [True, False])

@@ -26,6 +26,7 @@ from engine.cli.argument_names import ros_arguments_last
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.formats.ros.messages import (
     NO_POSITION,
+    ODOMETRY_TYPES,
     MessageFactory,
     attitude_from_message,
     body_velocity_from_message,
@@ -39,7 +40,7 @@ from engine.formats.ros.messages import (
 from engine.live import LiveOptions
 from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
 from tests.support.ground import body_axes
-from tests.support.odometries import odometry_message
+from tests.support.odometries import odometry_message, twist_message
 from tests.support.towns import drawn_town
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
@@ -385,6 +386,34 @@ def test_an_odometry_that_says_nothing(maker):
     assert heard.vehicle(NOW_NS + 600_000_000).north_velocity_mps is None
 
 
+@pytest.mark.parametrize(
+    ("variances", "told_mps"),
+    [(None, None), ((0.0, 0.0, 0.0), None), ((0.04, 0.09, 0.01), 0.3)],
+)
+@pytest.mark.parametrize("frame", ["base_link", "/base_link", "uav1/base_link"])
+def test_a_twist_by_itself_is_turned_as_an_odometrys(ros, maker, frame, variances, told_mps):
+    rng = np.random.default_rng(6)
+    for angles in random_angles(10):
+        enu_mps, heard = rng.normal(0.0, 8.0, 3), RosTelemetry()
+        message = twist_message(maker, NOW_NS, angles, enu_mps, frame=frame, variances=variances)
+        heard.odometry(wired(ros, message), 0)
+        heard.imu(maker.imu(NOW_NS, "", *angles))
+        now = heard.vehicle(NOW_NS)
+        assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
+        turned_mps = math.radians(1.0) * np.linalg.norm(enu_mps)  # the heading is off by a degree
+        told = None if told_mps is None else pytest.approx(math.hypot(told_mps, turned_mps))
+        assert now.velocity_sigma_mps == told
+
+
+@pytest.mark.parametrize("frame", ["", "odom", "map", "base_link_frd", "dvl_link", "base_link/"])
+def test_a_twist_along_other_axes_is_refused(maker, frame):
+    for variances in (None, (0.04, 0.04, 0.04)):
+        level, velocity = (0.0, 0.0, 0.0), (1.0, 2.0, 0.0)
+        message = twist_message(maker, NOW_NS, level, velocity, frame=frame, variances=variances)
+        with pytest.raises(TelemetryError, match=f"a velocity along base_link .*, got one along {frame!r}"):
+            body_velocity_from_message(message)
+
+
 # ---------------------------------------------------------------------------------------------------- poses
 
 
@@ -631,6 +660,25 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
     assert (status.restarts, status.counts.submitted, status.counts.answered) == (1, 3, 3)
 
 
+def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, sim_site, caplog):
+    node, level = StandIn(maker), (0.0, 0.0, 0.0)
+    topics = RosTopics(odometry="/vio/twist", odometry_type="TwistWithCovarianceStamped")
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        _, heard = bridge.handlers(topics)["/vio/twist"]
+        bridge.on_imu(maker.imu(NOW_NS, "", *level))
+        for k, frame in enumerate(("odom", "odom", "base_link")):
+            message = twist_message(maker, NOW_NS, level, (1.0, 2.0, 0.0), frame=frame, variances=(0.04,) * 3)
+            heard(wired(ros, message))
+            bridge.on_image(an_image(maker, NOW_NS - 3 + k))
+            node.wait_for("diagnostics", k + 1)
+    told = [{pair.key: pair.value for pair in message.status[0].values} for message in node.of("diagnostics")]
+    assert [each.get("odometry", "") != "" for each in told] == [True, True, False]
+    assert "along base_link (forward-left-up), got one along 'odom'" in told[0]["odometry"]
+    assert [each["velocity"] for each in told] == ["unknown", "unknown", "known"]
+    assert caplog.text.count("an odometry cannot be used: frame_id: expected") == 1
+    assert seen.frames[2].north_velocity_mps == pytest.approx(2.0)
+
+
 def a_compressed(maker, time_ns, picture):
     _, data = cv2.imencode(".png", picture)
     return maker.make("sensor_msgs/msg/CompressedImage", header=maker.header(time_ns, ""), format="png", data=data)
@@ -708,9 +756,14 @@ def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
         handlers[RosTopics().height][1](maker.float64(42.0))
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
         instead = bridge.handlers(RosTopics(odometry="/vio/odometry"))
+        by_type = {
+            name: bridge.handlers(RosTopics(odometry="/vio", odometry_type=name)) for name in ODOMETRY_TYPES
+        }
     assert "" not in kinds
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
     assert instead["/vio/odometry"][0] == "nav_msgs/msg/Odometry"
+    assert {name: by_type[name]["/vio"][0] for name in ODOMETRY_TYPES} == ODOMETRY_TYPES
+    assert set(ODOMETRY_TYPES.values()) <= set(STORES["ros1"].types) & set(STORES["ros2"].types)
     assert instead[RosTopics().velocity][0] == "geometry_msgs/msg/TwistStamped"
     assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
     assert all(kind in STORES["ros2"].types for kind in kinds.values())
@@ -947,8 +1000,16 @@ def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
         assert told in capsys.readouterr().err
 
 
+def test_an_odometry_of_another_message_is_refused(capsys, tmp_path):
+    given = ["--odometry-topic", "/vio", "--odometry-type", "PoseStamped"]
+    assert main(["bridge", "ros", "--map", str(tmp_path / "m.tif"), *given]) == 2
+    told = "--odometry-type: expected one of Odometry, TwistWithCovarianceStamped, TwistStamped, got 'PoseStamped'"
+    assert told in capsys.readouterr().err
+
+
 def test_the_command_line_names_the_topics_of_the_code(capsys):
     assert main(["bridge", "ros", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
+    assert all(name in text for name in ODOMETRY_TYPES)
     for name in RosTopics.__slots__:
         assert getattr(RosTopics(), name) in text

@@ -1,5 +1,6 @@
 """The pilot of a simulated vehicle compares the estimate with the simulator's own truth."""
 
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,9 @@ import pytest
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from bench.live import fly_sitl
 from bench.live.fly_sitl import Pilot, fly_course, report
 from bench.live.standin import State
 from engine.geo import LocalFrame
@@ -53,3 +57,40 @@ def test_targets_have_the_heading_and_the_velocity_of_the_course():
     assert (moving[3], moving[4]) == (4.0, 3.0)  # north, east
     assert (still[3], still[4]) == (0.0, 0.0)
     assert moving[9] == pytest.approx(np.pi / 2.0)
+
+
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+def heartbeat(mode, *, armed=True):
+    """Of an ArduCopter, in the mode by ArduPilot's number: 4 is GUIDED, 6 RTL, 9 LAND."""
+    return message(
+        "HEARTBEAT", type=mavlink.MAV_TYPE_QUADROTOR, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode=ARMED if armed else mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, custom_mode=mode,
+        get_srcSystem=lambda: 1, get_srcComponent=lambda: 1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("mode", "name"), [(9, "LAND"), (6, "RTL")])
+def test_a_vehicle_that_lands_by_itself_is_steered_no_more_and_ends_the_flight(monkeypatch, mode, name):
+    """A link that plays a failsafe early on, and a landing that takes a while."""
+    monkeypatch.setattr(fly_sitl, "take_off", lambda pilot, height_m: None)
+    left = [heartbeat(4)] * 3 + [heartbeat(mode)] * 40 + [heartbeat(mode, armed=False)]
+    waiting, commands, settings = [], [], []
+
+    def heard(**_):
+        time.sleep(0.01)
+        return left.pop(0) if left else None
+
+    mav = SimpleNamespace(
+        set_position_target_global_int_send=lambda *_: waiting.append(len(left)),
+        command_long_send=lambda *fields: commands.append(fields[2]),
+    )
+    link = SimpleNamespace(mav=mav, recv_match=heard, param_set_send=lambda *fields: settings.append(fields))
+    pilot = Pilot(link, PLACE, COURSE)
+    pilot.texts.append("Scenematch: fixes begin")
+    fly_sitl.fly(pilot, lambda _: State(0.0, 0.0, 170.0, 0.0, 0.0, 0.0, 0.0, 0.0), 60.0, 30.0)
+    assert (pilot.part, pilot.mode, pilot.armed, left) == (f"{name} by itself", name, False, [])
+    assert len(waiting) == 1  # one target, before the failsafe was heard of
+    assert mavlink.MAV_CMD_SET_EKF_SOURCE_SET not in commands
+    assert settings == []  # the receiver stays on

@@ -46,3 +46,31 @@ def test_subtitles_without_a_heading_are_refused(tmp_path):
 
     with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
         recorded(video(tmp_path, ""))
+
+
+def folder(path, truth, telemetry):
+    """Two seconds due north, a row a second, with these columns besides."""
+    for name, columns in (("truth", truth), ("telemetry", telemetry)):
+        places = {"lat_deg": 48.1, "lon_deg": 16.2} if name == "truth" else {"frame": 0}
+        columns = places | columns
+        rows = [",".join(["timestamp_ns", *columns])]
+        for k in range(3):
+            steps = {"lat_deg": 1e-4 * k, "frame": k}
+            values = [value + steps.get(column, 0) for column, value in columns.items()]
+            rows.append(",".join(map(str, [10**9 * (k + 1), *values])))
+        (path / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_truth_without_heights_above_ground_is_flown_at_the_telemetrys(tmp_path):
+    from bench.live.fly_standin import recorded
+
+    heading, height, altitude = {"heading_deg": 30.0}, {"height_agl_m": 150.0}, {"alt_amsl_m": 200.0}
+    motion, _, _ = recorded(folder(tmp_path, heading | altitude, height))
+    assert [motion(time_s).height_m for time_s in (0.0, 0.5, 2.0)] == [150.0] * 3
+    motion, _, _ = recorded(folder(tmp_path, heading | {"height_agl_m": 149.0}, height))
+    assert motion(1.0).height_m == 149.0
+    with pytest.raises(TelemetryError, match=r"height_agl_m in truth.csv or telemetry.csv, got none in either$"):
+        recorded(folder(tmp_path, heading | altitude, {}))
+    with pytest.raises(TelemetryError, match=r"truth.csv: expected a heading_deg in every row$"):
+        recorded(folder(tmp_path, altitude, height))

@@ -6,6 +6,7 @@ import io
 import shutil
 import sys
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from engine.formats.ros.bag_writer import BAG_KINDS, write_bag
 from engine.formats.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
 from engine.formats.ros.messages import MessageFactory
 from engine.values import Frame, Prior, Truth
-from tests.support.odometries import odometry_message
+from tests.support.odometries import odometry_message, twist_message
 from tests.support.towns import drawn_town
 
 STEP_NS = 100_000_000
@@ -141,15 +142,20 @@ def test_without_a_compass_the_imu_has_the_heading(tmp_path):
     assert np.mod(series["heading_deg"].values, 360.0) == pytest.approx([200.0, 201.0, 202.0])
 
 
+STORES = {True: Stores.ROS1_NOETIC, False: Stores.ROS2_HUMBLE}
+
+
 def written(path, topics):
-    """A bag of ROS 1 with messages by topic: (time_ns, message)."""
-    types = get_typestore(Stores.ROS1_NOETIC)
-    with Writer1(path) as writer:
+    """A bag with messages by topic, (time_ns, message): of ROS 1 where its name is one, else a folder of ROS 2."""
+    ros1 = path.suffix == ".bag"
+    types = get_typestore(STORES[ros1])
+    serialize = types.serialize_ros1 if ros1 else types.serialize_cdr
+    with Writer1(path) if ros1 else Writer2(path, version=9) as writer:
         for topic, messages in topics.items():
             name = messages[0][1].__msgtype__
             connection = writer.add_connection(topic, name, typestore=types)
             for time_ns, message in messages:
-                writer.write(connection, time_ns, types.serialize_ros1(message, name))
+                writer.write(connection, time_ns, serialize(message, name))
     return path
 
 
@@ -209,16 +215,16 @@ def test_the_heading_with_a_stamp_precedes_the_one_without(tmp_path, maker):
     assert read_bag(written(tmp_path / "raw.bag", raw)).series["heading_deg"].values == pytest.approx(110.0)
 
 
-def a_bag_with_odometry(path, maker, *, variances=None, **left_out):
+def a_bag_with_odometry(path, maker, *, variances=None, by=None, **left_out):
     """A turn of 60 degrees a second by attitude and odometry, and by a velocity of another source."""
     moments = [(k * STEP_NS, (10.0, -5.0, 20.0 + 6.0 * k), (0.5 * k, -3.0, 0.25)) for k in range(1, 12)]
+    by = by or partial(odometry_message, yaw_deg=77.0)
     topics = {
         IMAGE: [(t, maker.image(t, "", np.zeros((4, 6), np.uint8))) for t, _, _ in moments[::5]],
         "/imu/data": [(t, maker.imu(t, "", *angles)) for t, angles, _ in moments],
         "/uav/velocity_local": [(t, maker.velocity(t, "map", 50.0, 50.0)) for t, _, _ in moments],
         "/vio/odometry": [
-            (t + 7, odometry_message(maker, t, angles, enu_mps, yaw_deg=77.0, variances=variances))
-            for t, angles, enu_mps in moments
+            (t + 7, by(maker, t, angles, enu_mps, variances=variances)) for t, angles, enu_mps in moments
         ],
     }
     return written(path, {name: each for name, each in topics.items() if name not in left_out.get("without", ())})
@@ -240,12 +246,35 @@ def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ma
     assert frames[1].east_velocity_mps == pytest.approx(3.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("variances", [(0.16, 0.04, 0.04), None])
+@pytest.mark.parametrize("ros1", [True, False])
+def test_a_twist_by_itself_is_an_odometry_too(tmp_path, ros1, variances):
+    maker = MessageFactory(get_typestore(STORES[ros1]).types.__getitem__, ros1)
+    path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker, variances=variances, by=twist_message)
+    flight = open_flight(path, odometry_topic="/vio/odometry")
+    for k, item in zip((1, 6, 11), flight, strict=True):
+        told = item.frame.east_velocity_mps, item.frame.north_velocity_mps
+        assert told == pytest.approx((0.5 * k, -3.0), abs=1e-9)
+        turned_mps = np.radians(1.0) * np.linalg.norm((0.5 * k, -3.0, 0.25))
+        stated = None if variances is None else pytest.approx(np.hypot(0.4, turned_mps))
+        assert item.frame.velocity_sigma_mps == stated
+
+
+def test_a_twist_along_other_axes_is_refused(tmp_path, maker):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker, by=partial(twist_message, frame="odom"))
+    told = r"x\.bag: /vio/odometry: frame_id: expected a velocity along base_link .*, got one along 'odom'"
+    with pytest.raises(TelemetryError, match=told):
+        read_bag(path, odometry_topic="/vio/odometry")
+    with pytest.raises(TelemetryError, match=r"/uav/velocity_local: .*, got one along 'map'"):
+        read_bag(path, odometry_topic="/uav/velocity_local")
+
+
 def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
     path = a_bag_with_odometry(tmp_path / "x.bag", maker)
-    with pytest.raises(TelemetryError, match=r"expected nav_msgs/msg/Odometry on /odom, got /vio/odometry"):
-        read_bag(path, odometry_topic="/odom")
-    with pytest.raises(TelemetryError, match=r"expected nav_msgs/msg/Odometry on /imu/data, got /vio/odometry"):
-        read_bag(path, odometry_topic="/imu/data")
+    for other in ("/odom", "/imu/data"):
+        told = f"nav_msgs/msg/Odometry or .* on {other}, got /uav/velocity_local, /vio/odometry"
+        with pytest.raises(TelemetryError, match=told):
+            read_bag(path, odometry_topic=other)
     path = a_bag_with_odometry(tmp_path / "blind.bag", maker, without=("/imu/data",))
     with pytest.raises(TelemetryError, match="expected a heading at the times of /vio/odometry, got none"):
         read_bag(path, odometry_topic="/vio/odometry")

@@ -10,17 +10,26 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
+import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from engine.adapters.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS
+from engine.adapters.ros import RosStatus, RosTopics
+from engine.camera import Camera
 from engine.errors import OptionError
+from engine.formats.ros.messages import MessageFactory
+from engine.live import Counts
 from engine.realtime import _FIFO_CURE, _MEMORY_CURE
-from engine.runs import mavlink_bridge
+from engine.runs import mavlink_bridge, service
 from engine.runs.bridge_files import BridgeFiles
 from engine.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
-from engine.runs.service import _BEATS, running_service, tell_status
+from engine.runs.progress import Progress
+from engine.runs.ros_bridge import RosSettings, run_ros_bridge
+from engine.runs.service import _BEATS, running_service, status_reporter
 from engine.runs.simulation import write_flight
 from engine.sim import plan_flight
 from tests.support.paths import ROOT
@@ -106,9 +115,14 @@ def test_an_abstract_socket_is_found(monkeypatch):
         assert heard(ear) == ["READY=1", "STOPPING=1"]
 
 
-def test_a_status_is_told_as_one_line(manager):
-    tell_status("autopilot heard; sent 5")
-    assert heard(manager) == ["STATUS=autopilot heard; sent 5"]
+def test_a_status_is_told_as_one_line_now_and_then(manager, monkeypatch):
+    shown, clock = Shown(), iter([0.0, 4.9, 5.0, 5.1, 10.0])
+    monkeypatch.setattr(service.time, "monotonic", lambda: next(clock))
+    report = status_reporter(lambda: "autopilot heard; sent 5", shown)
+    for _ in range(4):
+        report()
+    assert shown.lines == ["autopilot heard; sent 5"] * 2
+    assert heard(manager) == ["STATUS=autopilot heard; sent 5"] * 2
 
 
 @pytest.mark.parametrize("address", ["", "/nowhere/at/all", "@nobody-listens"])
@@ -131,7 +145,7 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
     monkeypatch.setenv("WATCHDOG_USEC", "800000")  # no more beats than the socket's queue holds
     monkeypatch.setattr(mavlink_bridge, "end_on_sigterm", lambda: None)
     monkeypatch.setattr(mavlink_bridge, "_AUTOPILOT_TIMEOUT_S", 0.5)
-    monkeypatch.setattr(mavlink_bridge, "_MESSAGE_PERIOD_S", 0.0)
+    monkeypatch.setattr(service, "_STATUS_PERIOD_S", 0.0)
     flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=2))
     files = BridgeFiles(map=flight.map, camera=flight.camera, frames=flight.frames, rate_hz=10.0)
     link, settings = MavlinkSettings(connect="udpout:127.0.0.1:9"), BridgeSettings(method="ncc")
@@ -145,6 +159,51 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
     assert beats == ["WATCHDOG=1"] * len(beats)
     assert len(beats) >= 2  # while it waits for the autopilot, too
     assert "STATUS=no autopilot; sent 0" in "".join(told)
+
+
+class Shown(Progress):
+    """Keeps what is shown."""
+
+    def __init__(self):
+        self.lines = []
+
+    def message(self, text):
+        self.lines.append(text)
+
+
+def test_a_ros_bridge_reports_as_the_other_does(manager, tmp_path, monkeypatch):
+    monkeypatch.setenv("WATCHDOG_USEC", "1000")
+    monkeypatch.setattr(service, "_STATUS_PERIOD_S", 0.0)
+    types = get_typestore(Stores.ROS1_NOETIC).types
+    maker, shown, published = MessageFactory(types.__getitem__, True), Shown(), []
+    flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=1))
+    black = np.zeros((Camera.load(flight.camera).height_px, Camera.load(flight.camera).width_px), np.uint8)
+
+    def spin(handlers, every_second, seconds):
+        handlers["/down"][1](maker.image(10**9, "", black))
+        handlers["/down"][1](maker.image(9 * 10**8, "", black))  # out of order
+        until_s = time.monotonic() + 20.0
+        while not published and time.monotonic() < until_s:
+            time.sleep(0.01)
+        every_second()
+
+    node = SimpleNamespace(
+        messages=maker, now_ns=lambda: 10**9, spin=spin, has_subscribers=lambda output: False,
+        publish=lambda output, message: published.append(output),
+    )  # fmt: skip
+    ros = RosSettings(map=flight.map, camera=flight.camera, topics=RosTopics(image="/down"))
+    run_ros_bridge(ros, BridgeSettings(method="ncc"), node=node, progress=shown)
+    line = "1 pictures; published 0; not published: no_height 1, unusable 1"
+    assert shown.lines[-1] == line
+    assert heard(manager) == ["READY=1", "WATCHDOG=1", f"STATUS={line}", "STOPPING=1"]
+
+
+def test_the_line_of_a_ros_bridge_names_what_was_not_published():
+    counts = Counts(submitted=9, dropped=1, answered=8)
+    status = RosStatus(counts, fixes=5, refused={"late": 2, "low_score": 1}, unusable=4, restarts=1)
+    told = "9 pictures; published 5; not published: late 2, low_score 1, unusable 4, dropped 1; 1 restarts"
+    assert status.line() == told
+    assert RosStatus(Counts()).line() == "0 pictures; published 0; not published: nothing"
 
 
 # ----------------------------------------------------------------------------------------------------- the unit
@@ -173,6 +232,11 @@ def test_the_unit_hears_the_worker_of_a_supervisor_and_has_a_watchdog(unit):
     assert float(unit["WatchdogSec"]) * (1.0 - 1.0 / _BEATS) > longest_s
     # A bridge that such a camera holds hears SIGTERM when it is open again: it is not killed before.
     assert longest_s < float(unit["TimeoutStopSec"]) <= float(unit["WatchdogSec"])
+
+
+def test_a_process_that_want_of_memory_ends_is_replaced_by_the_bridge_and_its_main_one_by_systemd(unit):
+    assert "--supervise" in unit["ExecStart"]  # replaces a worker
+    assert (unit["OOMPolicy"], unit["Restart"]) == ("continue", "on-failure")
 
 
 def test_the_units_command_is_one_of_the_command_line(unit):

@@ -96,6 +96,10 @@ def mavlink(
         int, typer.Option("--gps-id", metavar="N", help="Receiver that gps_input poses as; 0 is the first.")
     ] = 0,
     system_id: SystemIdOption = 1,
+    component_id: Annotated[
+        int,
+        typer.Option("--component-id", metavar="N", help="Of the vehicle, that the bridge is: not another VIO's."),
+    ] = 197,
     key: KeyOption = None,
     listen_anywhere: ListenAnywhereOption = False,
     set_origin: Annotated[
@@ -148,9 +152,9 @@ def mavlink(
         camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
     )  # fmt: skip
     link = MavlinkSettings(
-        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, key=key, firmware=firmware,
-        message=message, max_sigma_m=max_sigma_m, set_origin=set_origin, origin_alt_m=origin_alt_m,
-        use_velocity=use_velocity, check_gnss=check_gnss, gps_id=gps_id,
+        connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, component_id=component_id,
+        key=key, firmware=firmware, message=message, max_sigma_m=max_sigma_m, set_origin=set_origin,
+        origin_alt_m=origin_alt_m, use_velocity=use_velocity, check_gnss=check_gnss, gps_id=gps_id,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,
@@ -297,8 +301,19 @@ def ros(
         str, typer.Option("--velocity-topic", metavar="NAME", help="geometry_msgs/TwistStamped, east and north.")
     ] = "/mavros/local_position/velocity_local",
     odometry_topic: Annotated[
-        str, typer.Option("--odometry-topic", metavar="NAME", help="nav_msgs/Odometry; outranks the velocity.")
+        str,
+        typer.Option(
+            "--odometry-topic", metavar="NAME", help="Another odometry's velocity; outranks the velocity."
+        ),
     ] = "",
+    odometry_type: Annotated[
+        str,
+        typer.Option(
+            "--odometry-type",
+            metavar="NAME",
+            help="Its message: Odometry, TwistWithCovarianceStamped or TwistStamped.",
+        ),
+    ] = "Odometry",
     firmware: Annotated[
         str,
         typer.Option("--firmware", metavar="none|ardupilot|px4", help="For whom the poses are, behind MAVROS."),
@@ -335,7 +350,7 @@ def ros(
     use_threads(threads)
     topics = RosTopics(
         image=image, camera_info=camera_info, imu=imu, compass=compass, height=height, range=ranging,
-        velocity=velocity, odometry=odometry_topic,
+        velocity=velocity, odometry=odometry_topic, odometry_type=odometry_type,
     )  # fmt: skip
     settings = BridgeSettings(
         method=method, weights=tuple(weights or ()), device=device, start=start, deadline_ms=deadline_ms,

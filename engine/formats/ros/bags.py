@@ -30,6 +30,7 @@ from engine.formats.resampling import (
     make_series,
 )
 from engine.formats.ros.messages import (
+    ODOMETRY_TYPES,
     attitude_from_message,
     body_velocity_from_message,
     camera_from_message,
@@ -51,8 +52,7 @@ TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
 """Topics that are written, and preferred where a bag has several of a type."""
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_FLOAT, _CALIBRATION = "std_msgs/msg/Float64", "sensor_msgs/msg/CameraInfo"
-_ODOMETRY = "nav_msgs/msg/Odometry"
+_FLOAT, _CALIBRATION = ("std_msgs/msg/Float64",), ("sensor_msgs/msg/CameraInfo",)
 
 Sample = tuple[int, tuple[float | None, ...]]
 """Stamp in nanoseconds, and values; None where one is unknown."""
@@ -157,7 +157,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
     with _opened(path) as reader:
         beside = _image_topic(path, reader, topic).rpartition("/")[0] + "/camera_info"
         found = _topic(reader, _CALIBRATION, (beside, ""))
-        first = None if found is None else next(_messages(path, reader, {found}, {_CALIBRATION}), None)
+        first = None if found is None else next(_messages(path, reader, {found}, _CALIBRATION), None)
     if first is None:
         raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with `camera`")
     try:
@@ -175,14 +175,15 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     sensor_msgs/Range           height along the body's down axis
     ``.../rel_alt``             height above take-off
     ``.../velocity_local``      east and north velocity; without ``odometry_topic``
-    nav_msgs/Odometry           the velocity along the body, turned by the attitude above
+    ``odometry_topic``          the velocity along the body, turned by the attitude above
     sensor_msgs/NavSatFix       the prior
     ==========================  ===========================================================================
 
     Args:
         path: the bag.
         truth: whether the ``/truth`` topics replace these, where the bag has them.
-        odometry_topic: of another camera's odometry, whose velocity and its accuracy are used.
+        odometry_topic: of another camera's odometry, whose velocity and its accuracy are used: nav_msgs/Odometry,
+            geometry_msgs/TwistWithCovarianceStamped or TwistStamped.
 
     Raises:
         TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
@@ -195,9 +196,12 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
             found["odometry"] = _odometry_topic(path, reader, odometry_topic)
         names = {topic: name for name, topic in found.items() if topic is not None}
         known: dict[str, list[Sample]] = {name: [] for name in names.values()}
-        kinds = {_TAKEN[name][0] for name in known}
+        kinds = {kind for name in known for kind in _TAKEN[name][0]}
         for topic, time_ns, message in _messages(path, reader, set(names), kinds) if names else ():
-            numbers = _TAKEN[names[topic]][1](message)
+            try:
+                numbers = _TAKEN[names[topic]][1](message)
+            except TelemetryError as error:
+                raise TelemetryError(f"{path}: {topic}: {error}") from None
             if numbers is not None:
                 known[names[topic]].append((time_ns, numbers))
     if _is_same_mavros(found.get("imu"), found.get("compass")):
@@ -220,17 +224,17 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     return make_log(path, series, heights)
 
 
-_TAKEN: dict[str, tuple[str, Callable[[Any], tuple[float | None, ...] | None]]] = {
-    "imu": ("sensor_msgs/msg/Imu", attitude_from_message),
+_TAKEN: dict[str, tuple[tuple[str, ...], Callable[[Any], tuple[float | None, ...] | None]]] = {
+    "imu": (("sensor_msgs/msg/Imu",), attitude_from_message),
     "compass": (_FLOAT, lambda message: (message.data,)),
-    "range": ("sensor_msgs/msg/Range", lambda message: (range_from_message(message),)),
+    "range": (("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
     "height": (_FLOAT, lambda message: (message.data,)),
     "altitude": (_FLOAT, lambda message: (message.data,)),
-    "velocity": ("geometry_msgs/msg/TwistStamped", lambda m: (m.twist.linear.x, m.twist.linear.y)),
-    "place": ("sensor_msgs/msg/NavSatFix", position_from_message),
-    "odometry": (_ODOMETRY, body_velocity_from_message),
+    "velocity": (("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
+    "place": (("sensor_msgs/msg/NavSatFix",), position_from_message),
+    "odometry": (tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
 }
-"""Message type of each quantity, and the function that extracts its values; None where a message has none."""
+"""Message types of each quantity, and the function that extracts its values; None where a message has none."""
 _SUFFIXES = {
     "imu": ("/imu/data", ""),
     "compass": ("/compass_hdg",),
@@ -248,9 +252,10 @@ _TRUTH_SUFFIXES = {
 
 
 def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
-    names = _topic_names(reader, (_ODOMETRY,))
+    kinds = _TAKEN["odometry"][0]
+    names = _topic_names(reader, kinds)
     if topic not in names:
-        raise TelemetryError(f"{path}: expected {_ODOMETRY} on {topic}, got {', '.join(names) or 'none'}")
+        raise TelemetryError(f"{path}: expected {' or '.join(kinds)} on {topic}, got {', '.join(names) or 'none'}")
     return topic
 
 
@@ -319,10 +324,10 @@ def _topic_names(reader: Any, msgtypes: tuple[str, ...]) -> list[str]:
     return sorted({str(c.topic) for c in reader.connections if c.msgtype in msgtypes and c.msgcount})
 
 
-def _topic(reader: Any, msgtype: str, suffixes: tuple[str, ...]) -> str | None:
-    """The first topic of a type whose name has one of the suffixes, best first; an empty suffix excludes truth."""
+def _topic(reader: Any, msgtypes: tuple[str, ...], suffixes: tuple[str, ...]) -> str | None:
+    """The first topic of these types whose name has a suffix, best first; an empty suffix excludes truth."""
     for suffix in suffixes:
-        for name in _topic_names(reader, (msgtype,)):
+        for name in _topic_names(reader, msgtypes):
             if name.endswith(suffix) and (suffix or not name.startswith("/truth/")):
                 return name
     return None

@@ -35,6 +35,14 @@ _FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])  # its own inverse
 _NORM_TOLERANCE = 0.01  # of the squared norm of a quaternion
 _NOT_STATED = -1.0  # first element of a covariance
 _COVARIANCE_KNOWN = 3  # NavSatFix.COVARIANCE_TYPE_KNOWN
+ODOMETRY_TYPES = {
+    "Odometry": "nav_msgs/msg/Odometry",
+    "TwistWithCovarianceStamped": "geometry_msgs/msg/TwistWithCovarianceStamped",
+    "TwistStamped": "geometry_msgs/msg/TwistStamped",
+}
+"""Messages that have a velocity along the body, by their own names."""
+BODY_FRAME = "base_link"
+"""The vehicle's body by REP-105, forward-left-up; a prefix, as in "uav1/base_link", is a vehicle's name."""
 NO_POSITION = -1
 """NavSatStatus.status of a receiver without a fix."""
 
@@ -146,31 +154,53 @@ def attitude_from_message(message: Any) -> tuple[float, float, float] | None:
 
 
 def body_velocity_from_message(message: Any) -> tuple[float, float, float, float] | None:
-    """Velocity along the body (forward, right, down) in m/s of a nav_msgs/Odometry, and its standard deviation.
+    """Velocity along the body (forward, right, down) in m/s of another odometry, and its standard deviation.
 
-    By its definition the twist is along the axes of ``child_frame_id``, the body's (forward-left-up). Where that
-    is the frame of the pose as well, as some odometries publish it, the pose's orientation turns the twist back
-    into the body: where that frame has its north does not matter.
+    Args:
+        message: nav_msgs/Odometry, whose twist is by definition along the axes of ``child_frame_id``, the body's
+            (forward-left-up). Where that is the frame of the pose as well, as some odometries publish it, the
+            pose's orientation turns the twist back into the body: where that frame has its north does not matter.
+            Or geometry_msgs/TwistWithCovarianceStamped or TwistStamped, along the axes of ``header.frame_id``.
 
     Returns:
         None where the message has no velocity that counts, by
         :func:`engine.formats.velocities.velocity_sigma_mps`, or no orientation where one is needed. The standard
-        deviation is per axis, and 0 where the covariance is not stated: zeros, -1 or not finite.
+        deviation is per axis, and 0 where the covariance is not stated: zeros, -1, not finite, or none at all.
+
+    Raises:
+        TelemetryError: the frame of a twist without a pose is not :data:`BODY_FRAME`.
     """
-    linear = message.twist.twist.linear
+    linear, variances = _twist(message)
     velocity = np.array([linear.x, linear.y, linear.z], np.float64)
-    covariance = np.asarray(message.twist.covariance, np.float64)
-    unknown = covariance[0] == _NOT_STATED
-    sigma_mps = velocity_sigma_mps(velocity, (0.0,) * 3 if unknown else covariance[0:15:7].tolist(), turned=True)
-    if sigma_mps is None:
-        return None
-    if message.child_frame_id and message.child_frame_id == message.header.frame_id:
+    sigma_mps = velocity_sigma_mps(velocity, variances, turned=True)
+    if not hasattr(message, "child_frame_id"):
+        _check_body_frame(message.header.frame_id)
+    elif message.child_frame_id and message.child_frame_id == message.header.frame_id:
         rotation = _rotation(message.pose.pose.orientation)
         if rotation is None:
             return None
         velocity = rotation.T @ velocity
+    if sigma_mps is None:
+        return None
     forward, right, down = (float(v) for v in _FLU_FROM_FRD @ velocity)
     return forward, right, down, sigma_mps
+
+
+def _twist(message: Any) -> tuple[Any, list[float]]:
+    """The linear velocity of a message and its three variances; zeros where none are stated."""
+    if not hasattr(message.twist, "covariance"):
+        return message.twist.linear, [0.0] * 3
+    covariance = np.asarray(message.twist.covariance, np.float64)
+    unknown = covariance[0] == _NOT_STATED
+    return message.twist.twist.linear, [0.0] * 3 if unknown else covariance[0:15:7].tolist()
+
+
+def _check_body_frame(frame_id: str) -> None:
+    """A velocity in a world whose north nobody knows cannot be turned, nor one along a sensor's axes."""
+    if frame_id.rpartition("/")[2] != BODY_FRAME:
+        raise TelemetryError(
+            f"frame_id: expected a velocity along {BODY_FRAME} (forward-left-up), got one along {frame_id!r}"
+        )
 
 
 def _rotation(q: Any) -> Array | None:

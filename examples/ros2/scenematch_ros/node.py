@@ -10,12 +10,14 @@ from engine.runs import BridgeSettings, RosSettings, run_ros_bridge
 FILES = ("map", "surface", "camera", "start", "origin", "mount")
 """Parameters of text; an empty one is not given."""
 TOPICS = RosTopics()
+TOPIC_NAMES = [name for name in RosTopics.__slots__ if name != "odometry_type"]
 
 
 def settings_of(node):
     """What the parameters say: of ROS, and of the matching."""
     text = {name: node.parameter(name, "") or None for name in FILES}
-    topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in RosTopics.__slots__}
+    topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in TOPIC_NAMES}
+    topics["odometry_type"] = node.parameter("odometry_type", TOPICS.odometry_type)
     if text["map"] is None:
         raise OptionError("map: expected a file, got nothing; -p map:=site.tif gives it")
     map_sigma_m, hfov_deg = node.parameter("map_sigma_m", 0.0), node.parameter("hfov_deg", 0.0)
