@@ -23,7 +23,7 @@ _SUMMARY = (
     ("95 % within", "r95_m", "{:.2f} m"),
     ("largest error", "max_m", "{:.2f} m"),
     ("false fixes", "false_fixes", "{}"),
-    ("mean NEES (2 is honest)", "nees_mean", "{:.2f}"),
+    ("mean NEES (consistent: 2)", "nees_mean", "{:.2f}"),
     ("height RMS error", "height_rms_m", "{:.2f} m"),
 )
 

@@ -146,6 +146,13 @@ def check_size(camera: Camera, shape: tuple[int, ...]) -> None:
     try:
         camera.check_size(shape)
     except CalibrationError as error:
-        raise CalibrationError(
-            f"{error}; if the pictures were made smaller or larger as a whole, `scale_calibration`"
-        ) from None
+        raise CalibrationError(f"{error}; {_way_out(camera, shape)}") from None
+
+
+def _way_out(camera: Camera, shape: tuple[int, ...]) -> str:
+    """What to do about a calibration for another size; one of another shape cannot be scaled."""
+    try:
+        camera.scaled_to(shape[1], shape[0])
+    except CalibrationError:
+        return "their shapes differ: give the calibration of these pictures"
+    return "if the pictures were made smaller or larger as a whole, add `scale_calibration`"
