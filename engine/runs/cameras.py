@@ -74,7 +74,7 @@ class CameraFiles:
         Args:
             frames: the pictures; None where they are not known before they are taken.
             names: of those pictures that are used; none is all.
-            progress: is told what a photograph's EXIF said.
+            progress: receives what a photograph's EXIF said.
 
         Raises:
             CalibrationError: the calibration cannot be read, or nothing says what the camera's focal length is.
@@ -109,7 +109,7 @@ class CameraFiles:
         Args:
             camera_source: as of :func:`engine.adapters.pictures.capture`; by ``hfov_deg`` it is opened until its
                 first picture says its size, and closed again.
-            progress: is told what is waited for, and what the camera then is.
+            progress: receives what is waited for, and what the camera then is.
 
         Raises:
             CalibrationError: the calibration cannot be read, or there is none.

@@ -1,4 +1,4 @@
-"""What systemd is told of a bridge that it runs: that it is ready, that its loop goes on, how, that it ends.
+"""Notifications to systemd of a bridge that it runs: ready, still running, its status, stopping.
 
 Nothing is sent where systemd does not ask for it by $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
 """
