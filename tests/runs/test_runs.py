@@ -9,12 +9,13 @@ import pytest
 import torch
 
 import engine.runs
-from engine import OptionError
+from engine import OptionError, TelemetryError
 from engine.cli.tables import print_summary
 from engine.errors import BackendError, MissingExtraError, require
 from engine.features import sift
 from engine.formats.ros.bags import import_rosbags
 from engine.formats.track import read_track
+from engine.formats.truth import read_truth
 from engine.runs import (
     BridgeFiles,
     BridgeSettings,
@@ -27,6 +28,7 @@ from engine.runs import (
     compare,
     evaluate,
     export_track,
+    locate_image,
     run_demo,
     run_mavlink_bridge,
     simulate,
@@ -160,10 +162,20 @@ def test_errors_name_arguments(flight, tmp_path):
     )
     far = TrackSettings(start="0,0")
     assert refused(track, files, tmp_path / "out", far).startswith("start: expected a place on the map")
+    place = next(iter(read_truth(flight / "truth.csv")))
+    swapped = TrackSettings(start=f"{place.lon_deg},{place.lat_deg}")
+    assert refused(track, files, tmp_path / "out", swapped).endswith("; latitude and longitude are swapped?")
+    assert "swapped" not in refused(track, files, tmp_path / "out", far)
     assert refused(compare, files, tmp_path / "out", {"far": far}).startswith("start: expected a place on the map")
     assert refused(export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
     assert refused(WorldSettings, surface="dsm.tif") == "surface: expected with `map` only, got dsm.tif"
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_no_picture_is_not_located(flight, tmp_path):
+    for file, said in ((tmp_path / "a.jpg", "no such file"), (flight, "one picture")):
+        with pytest.raises(TelemetryError, match=f"expected .*{said}"):
+            locate_image(file, flight / "map.tif", camera=flight / "camera.yaml")
 
 
 def test_the_public_names_are_sorted_and_there():
