@@ -3,7 +3,7 @@
     python -m bench.faults FOLDER... [--methods ncc sift auto] [--step 4] [--count 60] [--only TEXT] [--map NAME]
                            [--no-diagnosis] [--docs DIR]
 
-Each fault is put into what the engine is told of a flight folder with truth; the flight begins at its true place.
+Each fault is put into the inputs of a flight folder with truth; the flight begins at its true place.
 A false fix is off by more than 5 m and by more than three of its own standard deviations. ``--docs`` writes the
 table of docs/wrong-inputs.md.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import DOCS
-from bench.inputs.faults import Fault, Told, faults, load
+from bench.inputs.faults import Fault, FlightInputs, faults, load
 from bench.pages.text import table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.diagnosis import diagnose
@@ -58,17 +58,17 @@ class Cell:
     named: str = ""
 
 
-def fly(told: Told, stamps_ns: list[int], flight: str, fault: str, method: str) -> Cell:
+def fly(inputs: FlightInputs, stamps_ns: list[int], flight: str, fault: str, method: str) -> Cell:
     """One flight; ``stamps_ns`` are the true ones of its frames."""
-    site = told.site()
-    matcher = SceneMatcher(site, told.camera, method, "cpu")
-    first = interpolate_truth(told.truth, stamps_ns[0])
+    site = inputs.site()
+    matcher = SceneMatcher(site, inputs.camera, method, "cpu")
+    first = interpolate_truth(inputs.truth, stamps_ns[0])
     assert first is not None
     navigator = Navigator(matcher, Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M))
     off_m, chi = [], []
-    for frame, stamp_ns in zip(told.frames, stamps_ns, strict=True):
+    for frame, stamp_ns in zip(inputs.frames, stamps_ns, strict=True):
         result = navigator.update(frame)
-        there = interpolate_truth(told.truth, stamp_ns)
+        there = interpolate_truth(inputs.truth, stamp_ns)
         if not isinstance(result, Fix) or there is None:
             continue
         east, north = site.frame.enu_from_geodetic(there.lat_deg, there.lon_deg)[:2]
@@ -78,27 +78,27 @@ def fly(told: Told, stamps_ns: list[int], flight: str, fault: str, method: str) 
     error, chi_square = np.array(off_m), np.array(chi)
     false = int(((error > FALSE_M) & (chi_square > FALSE_SIGMAS**2)).sum())
     if not off_m:
-        return Cell(flight, fault, method, len(told.frames), 0, 0, None, None, None)
+        return Cell(flight, fault, method, len(inputs.frames), 0, 0, None, None, None)
     rms_m = float(np.sqrt(np.mean(error**2)))
     return Cell(
-        flight, fault, method, len(told.frames), len(error), false, rms_m, float(chi_square.mean() / 2),
+        flight, fault, method, len(inputs.frames), len(error), false, rms_m, float(chi_square.mean() / 2),
         float(error.max()),
     )  # fmt: skip
 
 
-def cell(told: Told, fault: Fault, flight: str, method: str) -> Cell:
+def cell(inputs: FlightInputs, fault: Fault, flight: str, method: str) -> Cell:
     """A flight with a fault; its true stamps go with its pictures."""
-    spoiled = fault.spoil(told)
-    stamps = [frame.timestamp_ns or 0 for frame in told.frames]
+    spoiled = fault.spoil(inputs)
+    stamps = [frame.timestamp_ns or 0 for frame in inputs.frames]
     if len(spoiled.frames) != len(stamps):
         stamps = [frame.timestamp_ns or 0 for frame in spoiled.frames]
     return fly(spoiled, stamps, flight, fault.name, method)
 
 
-def diagnosed(told: Told, fault: Fault) -> tuple[str, str]:
+def diagnosed(inputs: FlightInputs, fault: Fault) -> tuple[str, str]:
     """Whether a diagnosis names it, and what it says."""
-    spoiled = fault.spoil(told)
-    first = interpolate_truth(told.truth, told.frames[0].timestamp_ns or 0)
+    spoiled = fault.spoil(inputs)
+    first = interpolate_truth(inputs.truth, inputs.frames[0].timestamp_ns or 0)
     assert first is not None
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
     found = diagnose(
@@ -128,16 +128,18 @@ def _row(found: Cell) -> str:
     )
 
 
-def rows_of(told: Told, flight: str, methods: list[str], only: str, *, diagnosis: bool) -> Iterator[Cell]:
+def rows_of(
+    inputs: FlightInputs, flight: str, methods: list[str], only: str, *, diagnosis: bool
+) -> Iterator[Cell]:
     """Every cell of a flight."""
     for fault in faults():
         if only not in fault.name:
             continue
-        named, text = diagnosed(told, fault) if diagnosis else ("", "")
+        named, text = diagnosed(inputs, fault) if diagnosis else ("", "")
         if text:
             print(f"{flight:18s} {fault.name:38s} {named}: {text}", flush=True)
         for method in methods:
-            yield replace(cell(told, fault, flight, method), named=named)
+            yield replace(cell(inputs, fault, flight, method), named=named)
 
 
 def lines_of(cells: list[Cell]) -> list[str]:
@@ -176,8 +178,8 @@ def main() -> None:
     set_threads(1)
     begin, cells = time.monotonic(), []
     for folder in wanted.folders:
-        told = load(folder, wanted.map, wanted.step, wanted.count)
-        of_flight = rows_of(told, folder.name, wanted.methods, wanted.only, diagnosis=not wanted.no_diagnosis)
+        inputs = load(folder, wanted.map, wanted.step, wanted.count)
+        of_flight = rows_of(inputs, folder.name, wanted.methods, wanted.only, diagnosis=not wanted.no_diagnosis)
         for found in of_flight:
             cells.append(found)
             print(_row(found), flush=True)

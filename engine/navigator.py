@@ -165,7 +165,7 @@ class Navigator:
             CalibrationError: the frame is not of the camera's resolution.
         """
         clock, budget = Deadline(Budget()), budget or self._budget
-        late, told = self._odometry.is_late(frame), frame
+        late, raw = self._odometry.is_late(frame), frame
         frame = self._velocity.shown(frame)
         self._motion = None if late or self._pictures is None else self._seen_motion(self._pictures, frame)
         now = self._odometry.sample(frame, self._recent.velocity, self._motion)
@@ -183,7 +183,7 @@ class Navigator:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)
         if isinstance(result, Fix):
-            result = self._judge(result, now, sources, told, late=late)
+            result = self._judge(result, now, sources, raw, late=late)
             if isinstance(result, Fix) and sources.given is not None:
                 self._map_offset.add(result, sources.given, now.time_s)
         elif not late and result.reason is not Reason.LATE:
@@ -282,11 +282,11 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
-    def _judge(self, fix: Fix, now: OdometrySample, sources: Sources, told: Frame, *, late: bool) -> Fix | NoFix:
+    def _judge(self, fix: Fix, now: OdometrySample, sources: Sources, raw: Frame, *, late: bool) -> Fix | NoFix:
         """The fix where the evidence for it is enough; else it is pending, and refused for now."""
         if not is_valid(fix):
             return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
-        if not late and self._velocity.note(fix, told, now.time_s):
+        if not late and self._velocity.note(fix, raw, now.time_s):
             self._forget_way(now)
             sources = replace(sources, own=self._reckoned(now), pending=None)
         required, against = self._options.min_log_odds, self._against(fix, now)
@@ -301,7 +301,7 @@ class Navigator:
         if late:
             return self._refuse_match(fix, against, own + others)
         match = Match(fix, others if against is not None else own + others)
-        found = self._hypotheses.add([match], now, sources, self._map_m2(fix), told.height_agl_m)
+        found = self._hypotheses.add([match], now, sources, self._map_m2(fix), raw.height_agl_m)
         odds = match.log_odds if found is None else found.log_odds
         return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(fix, against, odds)
 

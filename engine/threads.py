@@ -1,6 +1,6 @@
 """The number of threads that OpenCV, torch and the engine's own loops take, and work divided among them.
 
-torch is told where it is loaded; loaded later it is told then (:mod:`engine.tensors`).
+torch is configured where it is loaded already, else when it is loaded (:mod:`engine.tensors`).
 """
 
 from __future__ import annotations

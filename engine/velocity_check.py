@@ -24,7 +24,7 @@ _LEAST = 3  # matches of a way that may be called smooth
 _MIN_WAY_M = 5.0  # of either kind: a vehicle that hovers says nothing
 _GATE = 18.4  # chi-square of two degrees of freedom: chance exceeds it once in ten thousand
 _CONTRADICTIONS = 3  # matches in a row
-_AGREES_S = 10.0  # after which a velocity is believed again
+_AGREES_S = 10.0  # after which a velocity is used again
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class VelocityCheck:
         self.is_believed = True
 
     def shown(self, frame: Frame) -> Frame:
-        """The frame, without its velocity where that is not believed."""
+        """The frame, without its velocity where that is not trusted."""
         if self.is_believed:
             return frame
         return replace(frame, east_velocity_mps=None, north_velocity_mps=None)
@@ -78,7 +78,7 @@ class VelocityCheck:
             time_s: on any one clock.
 
         Returns:
-            bool: whether the velocity is not believed any more from this match on.
+            bool: whether the velocity is not trusted any more from this match on.
         """
         known = frame.east_velocity_mps is not None and frame.north_velocity_mps is not None
         if not known or (fix.confidence is not None and fix.confidence < _MIN_CONFIDENCE):

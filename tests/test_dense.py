@@ -235,7 +235,7 @@ def test_errors_are_as_large_as_the_covariance_says(sim_flight, sim_site, error_
 
 
 def test_on_a_map_that_says_it_is_exact_the_errors_fill_the_covariance(sim_flight):
-    """Mean NEES of two dimensions: 2 where it is honest. On a map that says nothing it is far below."""
+    """Mean NEES of two dimensions: 2 where it is consistent. On a map that says nothing it is far below."""
     town = sim_flight.town
     gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
 
@@ -307,7 +307,7 @@ def test_rough_ground_counts_less(ground):
 
 @pytest.mark.parametrize(("method", "has_surface"), [("ncc", True), ("ncc", False), ("sift", True)])
 def test_attitudes_are_as_wrong_as_their_covariance_says(sim_flight, sim_site, method, has_surface):
-    """Normalised squared errors of three angles: 3 in the mean where honest, less where cautious."""
+    """Normalised squared errors of three angles: 3 in the mean where consistent, less where cautious."""
     site, town = sim_site, sim_flight.town
     if not has_surface:
         gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)

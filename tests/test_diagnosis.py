@@ -10,7 +10,7 @@ import pytest
 from engine.camera import mount_rotation
 from engine.diagnosis import diagnose
 from engine.diagnosis.causes import findings, is_known
-from engine.diagnosis.findings import Told
+from engine.diagnosis.findings import TelemetrySeries
 from engine.diagnosis.sightings import Sighting
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.sim import plan_flight
@@ -27,10 +27,12 @@ VELOCITY = np.stack([5.0 + np.sin(0.1 * TIME_S), -4.0 + np.cos(0.2 * TIME_S)], a
 PLACES = np.concatenate([[[0.0, 0.0]], np.cumsum(0.5 * (VELOCITY[1:] + VELOCITY[:-1]) * 0.5, axis=0)])
 
 
-def told(**changes):
+def series(**changes):
     nothing = np.full((N, 2), np.nan)
     return replace(
-        Told(TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, nothing, np.full(N, np.nan), mount_rotation(), 260.0),
+        TelemetrySeries(
+            TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, nothing, np.full(N, np.nan), mount_rotation(), 260.0
+        ),
         **changes,
     )
 
@@ -48,13 +50,13 @@ def seen(noise=True, outliers=2):
 
 
 def cause_of(**changes):
-    found = findings(told(**changes), seen(), 1.0)
+    found = findings(series(**changes), seen(), 1.0)
     return [finding.cause for finding in found]
 
 
 def test_what_fits_is_not_doubted():
     for _ in range(50):
-        assert findings(told(), seen(), 1.0) == []
+        assert findings(series(), seen(), 1.0) == []
 
 
 @pytest.mark.parametrize(("forward_m", "right_m"), [(-6.0, 7.0), (0.0, 9.0), (14.0, 3.0)])
@@ -65,7 +67,7 @@ def test_an_optical_centre_that_is_off_is_named_with_its_pixels(forward_m, right
         heading = np.radians(one.attitude.heading_deg)
         ahead, aside = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
         off.append(replace(one, en_m=one.en_m + forward_m * ahead + right_m * aside))
-    (found,) = findings(told(), off, 1.0)
+    (found,) = findings(series(), off, 1.0)
     assert found.cause == "mount"
     assert found.value == pytest.approx(np.degrees(np.arctan2(np.hypot(forward_m, right_m), 120.0)), abs=1.0)
     column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
@@ -93,7 +95,7 @@ def test_an_attitude_that_is_wrong_is_named(angles, cause):
 
 def test_an_offset_has_its_value_within_three_sigma():
     for off_deg in (-12.0, 5.0, 8.1):
-        (found,) = findings(told(angles_deg=ANGLES + np.array([0, 0, off_deg])), seen(), 1.0)
+        (found,) = findings(series(angles_deg=ANGLES + np.array([0, 0, off_deg])), seen(), 1.0)
         assert abs(found.value + off_deg) < 3.0 * found.sigma
         assert found.cure.startswith(f"--heading-offset-deg {found.value:+.1f}")
 
@@ -108,7 +110,7 @@ def test_a_camera_that_is_turned_is_no_compass_error(turn_deg):
         a = one.attitude
         rotation = enu_from_body(a.roll_deg, a.pitch_deg, a.heading_deg) @ turn
         turned.append(replace(one, attitude=Attitude(*attitude_from_rotation(rotation))))
-    (found,) = findings(told(), turned, 1.0)
+    (found,) = findings(series(), turned, 1.0)
     assert found.cause == "mount"
     name = {90: "nadir-right", 180: "nadir-tail", 270: "nadir-left"}[turn_deg]
     assert found.cure == f"--mount {name}"
@@ -124,14 +126,14 @@ def test_a_height_that_is_wrong_is_named(height, cause):
 def test_a_height_that_is_scaled_is_told_from_one_that_is_shifted():
     true = 60.0 + TIME_S * 2.0
     poses = [replace(one, height_agl_m=float(true[one.index])) for one in seen(outliers=0)]
-    assert findings(told(height_m=true * 1.2), poses, 1.0)[0].cause == "focal"
-    assert findings(told(height_m=true + 25.0), poses, 1.0)[0].cause == "height"
+    assert findings(series(height_m=true * 1.2), poses, 1.0)[0].cause == "focal"
+    assert findings(series(height_m=true + 25.0), poses, 1.0)[0].cause == "height"
 
 
 @pytest.mark.parametrize("shift_s", [-1.5, 0.5, 2.0])
 def test_a_clock_that_is_off_is_named(shift_s):
     late = np.stack([np.interp(TIME_S - shift_s, TIME_S, column) for column in ANGLES.T], axis=1)
-    (found,) = findings(told(angles_deg=late), seen(), 1.0)
+    (found,) = findings(series(angles_deg=late), seen(), 1.0)
     assert found.cause == "clock"
     assert found.value == pytest.approx(shift_s, abs=0.15)
 
@@ -142,17 +144,17 @@ def test_a_clock_that_is_off_is_named(shift_s):
      (VELOCITY / 1.7, "times as far")],
 )  # fmt: skip
 def test_a_velocity_that_is_wrong_is_named(velocity, word):
-    (found,) = findings(told(velocity_mps=np.asarray(velocity, float)), seen(), 1.0)
+    (found,) = findings(series(velocity_mps=np.asarray(velocity, float)), seen(), 1.0)
     assert found.cause == "velocity"
     assert word in found.text
 
 
 def test_a_map_that_other_positions_contradict_is_named():
     reference = {"reference_m": PLACES + np.array([8.0, 0.0]), "reference_sigma_m": np.full(N, 1.0)}
-    (found,) = findings(told(**reference), seen(), 1.0)
+    (found,) = findings(series(**reference), seen(), 1.0)
     assert found.cause == "map"
     assert found.value == pytest.approx(8.0, abs=0.5)
-    assert findings(told(**reference), seen(), 5.0) == []  # within what the map states
+    assert findings(series(**reference), seen(), 5.0) == []  # within what the map states
 
 
 @pytest.mark.parametrize(
@@ -167,10 +169,10 @@ def test_what_no_single_change_explains_is_said_not_to_fit(angles):
 
 
 def test_what_is_not_known_is_not_said_to_fit():
-    unknown = told(angles_deg=np.full((N, 3), np.nan), velocity_mps=np.full((N, 2), np.nan))
+    unknown = series(angles_deg=np.full((N, 3), np.nan), velocity_mps=np.full((N, 2), np.nan))
     assert findings(unknown, seen(), 1.0) == []
     assert is_known(unknown, seen()) == ("height",)
-    assert is_known(told(), seen()) == ("attitude", "height", "velocity")
+    assert is_known(series(), seen()) == ("attitude", "height", "velocity")
 
 
 def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
@@ -180,7 +182,7 @@ def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
         replace(one, attitude=replace(one.attitude, heading_deg=one.attitude.heading_deg - 100.0))
         for one in seen()
     ]
-    assert [found.cause for found in findings(told(angles_deg=angles), poses, 1.0)] == ["radians"]
+    assert [found.cause for found in findings(series(angles_deg=angles), poses, 1.0)] == ["radians"]
 
 
 def test_pictures_say_it_by_themselves():

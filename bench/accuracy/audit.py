@@ -175,12 +175,12 @@ def photograph(ground: Ground, nadir_px: Array, height_m: float, rng: np.random.
     moved = np.array([[1.0, 0.0, -nadir_px[0]], [0.0, 1.0, -nadir_px[1]], [0.0, 0.0, 1.0]])
     size = (CAMERA.width_px, CAMERA.height_px)
     picture = cv2.warpPerspective(ground.seen, view.image_from_map @ moved, size, borderMode=cv2.BORDER_REFLECT)
-    told = (
+    telemetry = (
         height_m * (1.0 + rng.normal(0.0, 0.01)),
         heading + rng.normal(0.0, 1.0),
         *(angle + rng.normal(0.0, 0.5) for angle in (roll, pitch)),
     )
-    return Frame(changed(np.asarray(picture, np.uint8), rng), None, *map(float, told))
+    return Frame(changed(np.asarray(picture, np.uint8), rng), None, *map(float, telemetry))
 
 
 def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator) -> list[Trial]:

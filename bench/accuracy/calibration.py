@@ -1,10 +1,10 @@
-"""Calibration: constant errors of what the engine is told, as the flight itself and ``check`` measure them.
+"""Calibration: constant errors of the inputs, as the flight itself and ``check`` measure them.
 
     python -m bench.accuracy.calibration FOLDER... [--methods ncc sift] [--step 1] [--count 400] [--map NAME]
 
 Each error is put into a flight folder with truth. A row says what `Navigator.calibration` held at the end, how
 soon it was and stayed within three of its sigmas and a fifth of the error, what ``check`` names, and the RMS
-of the fixes as told, with what ``check`` says taken off, and without the error.
+of the fixes as given, with what ``check`` says taken off, and without the error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.inputs.faults import Told, late, lens, load, mounted, raised, turned
+from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.diagnosis import Finding, diagnose
 from engine.formats.truth import interpolate_truth
@@ -46,11 +46,11 @@ class Error:
     """
 
     name: str
-    spoil: Callable[[Told], Told]
+    spoil: Callable[[FlightInputs], FlightInputs]
     size: float
     measured: Callable[[Calibration], Measured | None]
-    own: Callable[[Told], float]
-    cure: Callable[[float], Callable[[Told], Told]]
+    own: Callable[[FlightInputs], float]
+    cure: Callable[[float], Callable[[FlightInputs], FlightInputs]]
     causes: tuple[str, ...]
 
 
@@ -78,10 +78,10 @@ def _lag(found: Calibration) -> Measured | None:
     return found.attitude_lag_s, found.attitude_lag_sigma_s
 
 
-def _own(name: str) -> Callable[[Told], float]:
+def _own(name: str) -> Callable[[FlightInputs], float]:
     """Median of what is to be added to an angle of the telemetry, over the flight."""
 
-    def off_deg(true: Told) -> float:
+    def off_deg(true: FlightInputs) -> float:
         apart = []
         for frame in true.frames:
             there = interpolate_truth(true.truth, frame.timestamp_ns or 0)
@@ -93,7 +93,7 @@ def _own(name: str) -> Callable[[Told], float]:
     return off_deg
 
 
-def _none(true: Told) -> float:
+def _none(true: FlightInputs) -> float:
     return 0.0
 
 
@@ -120,17 +120,17 @@ class Flown:
     history: list[Calibration]
 
 
-def fly(told: Told, true: Told, method: str) -> Flown:
+def fly(inputs: FlightInputs, true: FlightInputs, method: str) -> Flown:
     """Follow a flight from its true place; ``true`` has the true stamps of the same frames."""
-    site = told.site()
+    site = inputs.site()
     first = interpolate_truth(true.truth, true.frames[0].timestamp_ns or 0)
     assert first is not None
     navigator = Navigator(
-        SceneMatcher(site, told.camera, method, "cpu"),
+        SceneMatcher(site, inputs.camera, method, "cpu"),
         Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M),
     )
     square, chi, history = [], [], []
-    for frame, there in zip(told.frames, true.frames, strict=True):
+    for frame, there in zip(inputs.frames, true.frames, strict=True):
         result = navigator.update(frame)
         history.append(navigator.calibration)
         place = interpolate_truth(true.truth, there.timestamp_ns or 0)
@@ -156,27 +156,27 @@ def converged_s(flown: Flown, error: Error, truth: float) -> float | None:
     return since
 
 
-def named(told: Told, true: Told) -> list[Finding]:
+def named(inputs: FlightInputs, true: FlightInputs) -> list[Finding]:
     """What ``check`` finds."""
     first = interpolate_truth(true.truth, true.frames[0].timestamp_ns or 0)
     assert first is not None
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-    return diagnose(told.frames, told.frames.__getitem__, told.site(), told.camera, start=start).findings
+    return diagnose(inputs.frames, inputs.frames.__getitem__, inputs.site(), inputs.camera, start=start).findings
 
 
-def cured(told: Told, error: Error, found: Finding) -> Told:
-    """What is told without what was found."""
+def cured(inputs: FlightInputs, error: Error, found: Finding) -> FlightInputs:
+    """The inputs without what was found."""
     value = found.value or 0.0
     if error.name.startswith("focal") and found.cause == "height":  # the sentence names both
-        heights = [frame.height_agl_m for frame in told.frames if frame.height_agl_m is not None]
+        heights = [frame.height_agl_m for frame in inputs.frames if frame.height_agl_m is not None]
         value = 1.0 + value / float(np.median(heights))
-    return error.cure(value)(told)
+    return error.cure(value)(inputs)
 
 
-def row(error: Error, true: Told, method: str, right: Flown, found: list[Finding]) -> str:
+def row(error: Error, true: FlightInputs, method: str, right: Flown, found: list[Finding]) -> str:
     """A line of the table."""
-    told = error.spoil(true)
-    before = fly(told, true, method)
+    inputs = error.spoil(true)
+    before = fly(inputs, true, method)
     truth = error.size + error.own(true)
     value, since = error.measured(before.history[-1]), converged_s(before, error, truth)
     learnt = "-" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
@@ -184,7 +184,7 @@ def row(error: Error, true: Told, method: str, right: Flown, found: list[Finding
     rightly = [one for one in found if one.cause in error.causes and one.value is not None]
     if rightly:
         one = rightly[0]
-        after = fly(cured(told, error, one), true, method)
+        after = fly(cured(inputs, error, one), true, method)
         said = f"{one.cause} {one.value:.3g} ± {one.sigma or 0.0:.2g}"
         rest = f"{after.fixed}, {after.rms_m:.2f} m, NEES {after.nees:.2f}"
     else:
@@ -192,7 +192,7 @@ def row(error: Error, true: Told, method: str, right: Flown, found: list[Finding
     count = len(true.frames)
     return (
         f"{error.name:18s} {method:5s} learnt {learnt:16s} of {truth:.3g}  within {soon:7s} "
-        f"check: {said:24s} told {before.fixed} of {count}, {before.rms_m:.2f} m, NEES {before.nees:.2f}; "
+        f"check: {said:24s} as given {before.fixed} of {count}, {before.rms_m:.2f} m, NEES {before.nees:.2f}; "
         f"cured {rest}; right {right.fixed}, {right.rms_m:.2f} m"
     )
 

@@ -159,7 +159,7 @@ def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
     """
     factor = {"height_factor": 2.0} if "height_factor" in SiftOptions.__dataclass_fields__ else {}
     wrong = SiftOptions(**factor)
-    told = f"`height_factor={factor['height_factor']:g}`" if factor else "default options"
+    options_text = f"`height_factor={factor['height_factor']:g}`" if factor else "default options"
     unknown = {"heading_deg": None, "height_agl_m": None}
     return [
         ("as recorded", {}, SiftOptions()),
@@ -167,8 +167,8 @@ def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
         ("roll and pitch unknown", {"roll_deg": None, "pitch_deg": None}, SiftOptions()),
         ("heading unknown", {"heading_deg": None}, SiftOptions()),
         ("height unknown", {"height_agl_m": None}, SiftOptions()),
-        (f"height given as half, {told}", {"height_agl_m": 0.5}, wrong),
-        (f"height given as double, {told}", {"height_agl_m": 2.0}, wrong),
+        (f"height given as half, {options_text}", {"height_agl_m": 0.5}, wrong),
+        (f"height given as double, {options_text}", {"height_agl_m": 2.0}, wrong),
         ("heading and height unknown", unknown, SiftOptions()),
         ("nothing known but the start", {**unknown, "roll_deg": None, "pitch_deg": None}, SiftOptions()),
     ]

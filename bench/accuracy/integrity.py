@@ -1,4 +1,4 @@
-"""How often is a wrong place believed? Matches with an answer and without, by every method and score.
+"""How often is a wrong place accepted? Matches with an answer and without, by every method and score.
 
     python -m bench.accuracy.integrity [--matches N] [--resume] [--docs DIR]
 

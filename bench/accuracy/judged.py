@@ -45,7 +45,7 @@ _PSR_PX = 11.0
 class Row(NamedTuple):
     """One match. Of what found nothing, ``scores`` is empty; ``squared`` is NaN where the truth is not on the map.
 
-    ``right`` is of what was found, believed or not: within 10 m of the truth, or within 3 of its own sigmas.
+    ``right`` is of what was found, accepted or not: within 10 m of the truth, or within 3 of its own sigmas.
     """
 
     ground: str

@@ -3,7 +3,7 @@
     python -m bench.accuracy.kidnapped [--quick] [--starts N] [--seeds S ...]
 
 Short runs of successive frames, at 5 Hz, from random places over simulated towns and from all along the shared
-gazebo flights. Each begins with a fresh Navigator that is told height, roll and pitch, and neither place, heading
+gazebo flights. Each begins with a fresh Navigator that is given height, roll and pitch, and neither place, heading
 nor velocity. The same frames are flown over the map of another town, where nothing can be right. Prints one JSON
 object a row.
 """
@@ -66,8 +66,10 @@ def simulated(seed: int, starts: int, condition: str = "noon") -> Flight:
     )
     motion = wander(site, starts, rng)
     stamps = tuple((START_NS + np.rint(motion.time_s * 1e9).astype(np.int64)).tolist())
-    told = simulate_telemetry(motion, SensorNoise(), rng)
-    frames = [blind(f) for f in replace(plan, truth=motion, telemetry=told, timestamps_ns=stamps).iter_frames()]
+    telemetry = simulate_telemetry(motion, SensorNoise(), rng)
+    frames = [
+        blind(f) for f in replace(plan, truth=motion, telemetry=telemetry, timestamps_ns=stamps).iter_frames()
+    ]
     seen = list(zip(frames, motion.position_m[:, :2], strict=True))
     return Flight(
         f"town {seed}, {condition}", site, plan.camera, [seen[k : k + FRAMES] for k in range(0, len(seen), FRAMES)]

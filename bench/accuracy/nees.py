@@ -285,7 +285,7 @@ def chart(rows: list[Row]) -> Figure:
     left.axvspan(*BAND, color="#dddddd", zorder=0)
     right.axvspan(100 * COVERAGE[0], 100 * COVERAGE[1], color="#dddddd", zorder=0)
     left.set_yticks(places, [f"{r.flight}: {r.method}" for r in rows], fontsize=7)
-    left.set_xlabel("mean NEES of two dimensions; 2 is honest, less is cautious")
+    left.set_xlabel("mean NEES of two dimensions: 2 is consistent, less cautious")
     left.set_xlim(0.0, 5.0)
     right.set_xlabel("in the 95 % ellipse, %")
     return figure

@@ -286,8 +286,8 @@ def drift_per_100m(steps: Steps) -> float:
 
 
 def gap_rows(flight: Recorded) -> Iterator[str]:
-    told = any(frame.east_velocity_mps is not None for frame, _ in flight.frames)
-    for velocity in (NO_VELOCITY, PICTURES, *([TELEMETRY] if told else [])):
+    has_velocity = any(frame.east_velocity_mps is not None for frame, _ in flight.frames)
+    for velocity in (NO_VELOCITY, PICTURES, *([TELEMETRY] if has_velocity else [])):
         gaps = fly(flight, velocity)
         off_m, way_m = np.array([np.hypot(*off) for off in gaps.off_m]), sum(gaps.way_m)
         variance = np.square(gaps.sigma_m) + TRUTH_SIGMA_M.get(flight.name, 0.0) ** 2

@@ -29,7 +29,7 @@ class Coverage:
     off: int  # accepted more than 10 m and 3 sigma off
     within: float  # share within 3 sigma in the sense of Mahalanobis, of the centre
     within_axis: float  # the same, the worst of east, north and up
-    nees: float  # mean; 3 is honest
+    nees: float  # mean; 3 is consistent
     within_turn: float  # of the attitude
     nees_turn: float
 

@@ -40,7 +40,7 @@ class Run:
 
     relief_m: float
     day: str
-    told: bool
+    with_attitude: bool
     method: str
     seed: int
     summary: dict[str, Any]
@@ -71,11 +71,11 @@ def flights(seeds: tuple[int, ...], reliefs_m: tuple[float, ...], frames: int | 
                 if not ready:
                     site = plan.town.site()
                     ready = list(matchers(site, plan.camera, WAYS))
-                told = list(plan.iter_frames())
-                untold = [replace(frame, roll_deg=None, pitch_deg=None) for frame in told]
+                with_attitude = list(plan.iter_frames())
+                no_attitude = [replace(frame, roll_deg=None, pitch_deg=None) for frame in with_attitude]
                 for method, _, matcher in ready:
-                    yield Run(relief_m, day, True, method, seed, fly(plan, told, matcher, site))
-                    yield Run(relief_m, day, False, method, seed, fly(plan, untold, matcher, site))
+                    yield Run(relief_m, day, True, method, seed, fly(plan, with_attitude, matcher, site))
+                    yield Run(relief_m, day, False, method, seed, fly(plan, no_attitude, matcher, site))
 
 
 def pooled(runs: list[Run]) -> list[str]:
@@ -95,10 +95,16 @@ def pooled(runs: list[Run]) -> list[str]:
 def lines(runs: list[Run]) -> list[str]:
     """The table, a row for each height of the hills, day, method and with or without attitude."""
     rows = []
-    keys = dict.fromkeys((run.relief_m, run.day, run.method, run.told) for run in runs)
-    for relief_m, day, method, told in sorted(keys, key=lambda k: (k[0], DAYS.index(k[1]), k[2], not k[3])):
-        same = [r for r in runs if (r.relief_m, r.day, r.method, r.told) == (relief_m, day, method, told)]
-        who = method.upper() + ("" if told else ", attitude withheld")
+    keys = dict.fromkeys((run.relief_m, run.day, run.method, run.with_attitude) for run in runs)
+    for relief_m, day, method, with_attitude in sorted(
+        keys, key=lambda k: (k[0], DAYS.index(k[1]), k[2], not k[3])
+    ):
+        same = [
+            r
+            for r in runs
+            if (r.relief_m, r.day, r.method, r.with_attitude) == (relief_m, day, method, with_attitude)
+        ]
+        who = method.upper() + ("" if with_attitude else ", attitude withheld")
         rows.append([f"{relief_m:g} m", day, who, *pooled(same)])
     return table(["hills", "frames' day", "by", "RMS m", "worst m", "availability", "false", "NEES"], rows)
 
@@ -127,7 +133,7 @@ def main() -> None:
         short = {
             key: run.summary[key] for key in ("frames", "fixes", "rms_m", "max_m", "false_fixes", "nees_mean")
         }
-        print(json.dumps([run.relief_m, run.day, run.told, run.method, run.seed, short]), flush=True)
+        print(json.dumps([run.relief_m, run.day, run.with_attitude, run.method, run.seed, short]), flush=True)
     write(options.docs, runs)
 
 

@@ -57,7 +57,7 @@ class Scene:
     Attributes:
         name: of the scene.
         site: the map.
-        camera: as the matcher is told.
+        camera: as the matcher is given it.
         frames: with what the telemetry tells.
         truth: true positions of the vehicle.
         map_shift_m: (2,) how far east and north everything lies on the map of where it is.
@@ -81,17 +81,17 @@ def city(seed: int, frames: int | None) -> Scene:
     """A city from 120 m, its map without heights 5 m off, its camera tilted by 9 degrees that nothing tells."""
     rng = np.random.default_rng([seed, 5])
     town = build_town(seed, condition="overcast", changed=CITY_CHANGED)
-    told, style = _photographing(), FlightStyle(height_agl_m=CITY_HEIGHT_M)
+    calibrated, style = _photographing(), FlightStyle(height_agl_m=CITY_HEIGHT_M)
     side = rng.uniform(0.0, 2.0 * np.pi)
     tilt = enu_from_body(0.0, 0.0, 0.0).T @ enu_from_body(
         CITY_TILT_DEG * np.cos(side), CITY_TILT_DEG * np.sin(side), 0.0
     )
-    true = replace(told, mount=tilt @ told.mount)
+    true = replace(calibrated, mount=tilt @ calibrated.mount)
     plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, town=town, camera=true, style=style)
     toward = rng.uniform(0.0, 2.0 * np.pi)
     shift = CITY_SHIFT_M * np.array([np.cos(toward), np.sin(toward)])
     level = [replace(frame, roll_deg=None, pitch_deg=None) for frame in plan.iter_frames()]
-    return Scene("city", _web_map(seed, rng, shift), told, level, plan.truth_rows(), shift)
+    return Scene("city", _web_map(seed, rng, shift), calibrated, level, plan.truth_rows(), shift)
 
 
 def _web_map(seed: int, rng: np.random.Generator, shift_m: Array) -> OrthoMap:

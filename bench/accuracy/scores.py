@@ -69,11 +69,11 @@ class Flight:
 
 @dataclass(frozen=True)
 class Trial:
-    """One search: how far off the peak is, by how many sigmas it leads its rival, and whether it is believed."""
+    """One search: how far off the peak is, by how many sigmas it leads its rival, and whether it is accepted."""
 
     error_m: float
     lead: float
-    believed: bool
+    accepted: bool
 
 
 # --------------------------------------------------------------------------------------------------- inputs
@@ -152,8 +152,8 @@ def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDAr
     error_m = float(np.hypot(*(site.enu_from_pixel(nadir) - truth)))
     lead = (peak.score - peak.second_score) / score_sigma(pixels)
     at_prior = peak_features(peak, score_sigma(pixels), PriorAgreement(0.0, 1.0))
-    believed = judge_peak(peak, pixels, at_prior, None, options.rule) is None
-    return Trial(error_m, lead if error_m <= WRONG_M else -lead, believed)
+    accepted = judge_peak(peak, pixels, at_prior, None, options.rule) is None
+    return Trial(error_m, lead if error_m <= WRONG_M else -lead, accepted)
 
 
 def seasons(years: dict[int, Gray], pairs: list[tuple[int, int]], score: str) -> tuple[list[float], list[float]]:
@@ -193,7 +193,7 @@ def median_ms(score: str) -> float:
 
 
 def flown(trials: list[Trial]) -> str:
-    fixes = np.array([trial.error_m for trial in trials if trial.believed])
+    fixes = np.array([trial.error_m for trial in trials if trial.accepted])
     right = fixes[fixes <= WRONG_M]
     rms = f"{np.sqrt(np.mean(right**2)):.2f} m" if len(right) else "-"
     wrong, lead = len(fixes) - len(right), float(np.median([trial.lead for trial in trials]))
@@ -203,7 +203,7 @@ def flown(trials: list[Trial]) -> str:
 def chance(trials: list[Trial]) -> str:
     """The lead of places that are not there; it is negative by the sign of wrong ones."""
     highest = float(np.quantile([-trial.lead for trial in trials], 0.95))
-    return f"{sum(trial.believed for trial in trials)}, {highest:.2f}"
+    return f"{sum(trial.accepted for trial in trials)}, {highest:.2f}"
 
 
 def found(shares: list[float], leads: list[float]) -> str:

@@ -1,4 +1,4 @@
-"""Faults of what the engine is told: of telemetry, camera, clock, map and surface, each in two or three sizes."""
+"""Faults of the inputs: of telemetry, camera, clock, map and surface, each in two or three sizes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ FEET = 3.280839895
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """A flight as the engine is told of it.
+class FlightInputs:
+    """A flight as the engine is given it.
 
     Attributes:
         frames: with their telemetry.
@@ -34,7 +34,7 @@ class Told:
         surface_m: (H, W) heights on the map's grid, or None.
         affine: (2, 3) from pixels to ``crs``.
         crs: of the map.
-        truth: what is true, whatever is told.
+        truth: what is true, whatever the inputs say.
         georeference_sigma_m: accuracy that the map states.
     """
 
@@ -48,14 +48,14 @@ class Told:
     georeference_sigma_m: float | None = 0.5
 
     def site(self) -> OrthoMap:
-        """The map as it is told."""
+        """The map as it is given."""
         return OrthoMap.from_arrays(
             self.gray, self.affine, self.crs, surface_m=self.surface_m,
             georeference_sigma_m=self.georeference_sigma_m,
         )  # fmt: skip
 
 
-def load(folder: Path, map_name: str = "map.tif", step: int = 1, count: int | None = None) -> Told:
+def load(folder: Path, map_name: str = "map.tif", step: int = 1, count: int | None = None) -> FlightInputs:
     """A flight folder as it is; its map and surface are on one metric grid."""
     with rasterio.open(folder / map_name) as source:
         bands = source.read()
@@ -77,32 +77,34 @@ def load(folder: Path, map_name: str = "map.tif", step: int = 1, count: int | No
     flown = open_flight(folder / "frames", folder / "telemetry.csv", camera)
     chosen = range(0, len(flown), step)[:count]
     frames = [flown.read(index).frame for index in chosen]
-    return Told(frames, camera, np.ascontiguousarray(gray), surface, affine, crs, read_truth(folder / "truth.csv"))
+    return FlightInputs(
+        frames, camera, np.ascontiguousarray(gray), surface, affine, crs, read_truth(folder / "truth.csv")
+    )
 
 
 # ---------------------------------------------------------------------------------------------- telemetry
 
 
-def _angles(change: Angles) -> Callable[[Told], Told]:
+def _angles(change: Angles) -> Callable[[FlightInputs], FlightInputs]:
     """All roll, pitch and heading (N, 3) by another rule."""
 
-    def spoil(told: Told) -> Told:
-        angles = np.array([(f.roll_deg or 0.0, f.pitch_deg or 0.0, f.heading_deg or 0.0) for f in told.frames])
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        angles = np.array([(f.roll_deg or 0.0, f.pitch_deg or 0.0, f.heading_deg or 0.0) for f in inputs.frames])
         changed = change(angles)
         frames = [
             replace(f, roll_deg=float(r), pitch_deg=float(np.clip(p, -90, 90)), heading_deg=float(h % 360.0))
-            for f, (r, p, h) in zip(told.frames, changed, strict=True)
+            for f, (r, p, h) in zip(inputs.frames, changed, strict=True)
         ]
-        return replace(told, frames=frames)
+        return replace(inputs, frames=frames)
 
     return spoil
 
 
-def _each(change: Callable[[Frame], Frame]) -> Callable[[Told], Told]:
-    return lambda told: replace(told, frames=[change(frame) for frame in told.frames])
+def _each(change: Callable[[Frame], Frame]) -> Callable[[FlightInputs], FlightInputs]:
+    return lambda inputs: replace(inputs, frames=[change(frame) for frame in inputs.frames])
 
 
-def raised(change: Callable[[float], float]) -> Callable[[Told], Told]:
+def raised(change: Callable[[float], float]) -> Callable[[FlightInputs], FlightInputs]:
     def one(frame: Frame) -> Frame:
         if frame.height_agl_m is None:
             return frame
@@ -111,16 +113,16 @@ def raised(change: Callable[[float], float]) -> Callable[[Told], Told]:
     return _each(one)
 
 
-def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callable[[Told], Told]:
+def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callable[[FlightInputs], FlightInputs]:
     """Telemetry of some time ago; of its parts, the attitude or the rest."""
 
-    def spoil(told: Told) -> Told:
-        time_s = np.array([(f.timestamp_ns or 0) * 1e-9 for f in told.frames])
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        time_s = np.array([(f.timestamp_ns or 0) * 1e-9 for f in inputs.frames])
         columns = {}
         for name in (("roll_deg", "pitch_deg", "heading_deg") if attitude else ()) + (
             ("height_agl_m", "east_velocity_mps", "north_velocity_mps") if rest else ()
         ):
-            values = [getattr(f, name) for f in told.frames]
+            values = [getattr(f, name) for f in inputs.frames]
             if None in values:
                 continue
             column = np.array(values, np.float64)
@@ -130,14 +132,14 @@ def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callabl
             columns[name] = column % 360.0 if name == "heading_deg" else column
         frames = [
             replace(f, **{name: float(column[k]) for name, column in columns.items()})
-            for k, f in enumerate(told.frames)
+            for k, f in enumerate(inputs.frames)
         ]
-        return replace(told, frames=frames)
+        return replace(inputs, frames=frames)
 
     return spoil
 
 
-def _velocity(change: Callable[[float, float], tuple[float, float]]) -> Callable[[Told], Told]:
+def _velocity(change: Callable[[float, float], tuple[float, float]]) -> Callable[[FlightInputs], FlightInputs]:
     def one(frame: Frame) -> Frame:
         if frame.east_velocity_mps is None or frame.north_velocity_mps is None:
             return frame
@@ -147,16 +149,16 @@ def _velocity(change: Callable[[float, float], tuple[float, float]]) -> Callable
     return _each(one)
 
 
-def _stamps(factor: float) -> Callable[[Told], Told]:
+def _stamps(factor: float) -> Callable[[FlightInputs], FlightInputs]:
     """Stamps in another unit, or of another frame rate; the truth keeps its own, by position in the list."""
 
-    def spoil(told: Told) -> Told:
-        first = told.frames[0].timestamp_ns or 0
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        first = inputs.frames[0].timestamp_ns or 0
         frames = [
             replace(f, timestamp_ns=round(first * min(factor, 1.0) + ((f.timestamp_ns or 0) - first) * factor))
-            for f in told.frames
+            for f in inputs.frames
         ]
-        return replace(told, frames=frames)
+        return replace(inputs, frames=frames)
 
     return spoil
 
@@ -164,83 +166,83 @@ def _stamps(factor: float) -> Callable[[Told], Told]:
 # ------------------------------------------------------------------------------------------------- camera
 
 
-def lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[Told], Told]:
-    def spoil(told: Told) -> Told:
-        matrix = told.camera.matrix.copy()
+def lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[FlightInputs], FlightInputs]:
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        matrix = inputs.camera.matrix.copy()
         matrix[[0, 1], [0, 1]] *= focal
         matrix[:2, 2] += principal_px
-        return replace(told, camera=replace(told.camera, matrix=matrix))
+        return replace(inputs, camera=replace(inputs.camera, matrix=matrix))
 
     return spoil
 
 
-def mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Callable[[Told], Told]:
+def mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Callable[[FlightInputs], FlightInputs]:
     """The calibration's mount turned about the optical axis, and tilted about the body's right axis."""
 
-    def spoil(told: Told) -> Told:
+    def spoil(inputs: FlightInputs) -> FlightInputs:
         about_axis = cv2.Rodrigues(np.array([0.0, 0.0, np.radians(turn_deg)]))[0]
         about_right = cv2.Rodrigues(np.array([0.0, np.radians(tilt_deg), 0.0]))[0]
-        return replace(told, camera=replace(told.camera, mount=about_right @ told.camera.mount @ about_axis))
+        return replace(inputs, camera=replace(inputs.camera, mount=about_right @ inputs.camera.mount @ about_axis))
 
     return spoil
 
 
-def _pictures(change: Callable[[Array], Array]) -> Callable[[Told], Told]:
+def _pictures(change: Callable[[Array], Array]) -> Callable[[FlightInputs], FlightInputs]:
     return _each(lambda f: replace(f, image=np.ascontiguousarray(change(np.asarray(f.image)))))
 
 
-def _distorted(k1: float) -> Callable[[Told], Told]:
+def _distorted(k1: float) -> Callable[[FlightInputs], FlightInputs]:
     """Pictures of a lens with distortion, whose calibration says that it has none."""
 
-    def spoil(told: Told) -> Told:
-        camera = told.camera
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        camera = inputs.camera
         grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).reshape(-1, 1, 2)
         flat = cv2.undistortPoints(grid.astype(np.float64), camera.matrix, np.array([k1, 0, 0, 0, 0]))
         there = flat.reshape(-1, 2) * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
         lattice = there.reshape(camera.height_px, camera.width_px, 2).astype(np.float32)
         return _pictures(
             lambda image: cv2.remap(image, lattice, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        )(told)
+        )(inputs)
 
     return spoil
 
 
-def _rolling(readout_ms: float) -> Callable[[Told], Told]:
+def _rolling(readout_ms: float) -> Callable[[FlightInputs], FlightInputs]:
     """Rows read one after the other: the picture shears by the vehicle's own motion."""
 
-    def spoil(told: Told) -> Told:
+    def spoil(inputs: FlightInputs) -> FlightInputs:
         frames = []
-        for f in told.frames:
+        for f in inputs.frames:
             speed = np.array([f.east_velocity_mps or 0.0, f.north_velocity_mps or 0.0])
             heading = np.radians(f.heading_deg or 0.0)
             along = speed @ [np.sin(heading), np.cos(heading)], speed @ [np.cos(heading), -np.sin(heading)]
-            px_per_s = told.camera.focal_px / (f.height_agl_m or 100.0)
+            px_per_s = inputs.camera.focal_px / (f.height_agl_m or 100.0)
             dy, dx = along[0] * px_per_s * readout_ms * 1e-3, -along[1] * px_per_s * readout_ms * 1e-3
-            height = told.camera.height_px
+            height = inputs.camera.height_px
             shear = np.array([[1.0, dx / height, -dx / 2], [0.0, 1.0 + dy / height, -dy / 2]])
             image = cv2.warpAffine(
-                np.asarray(f.image), shear, (told.camera.width_px, height), borderMode=cv2.BORDER_REFLECT
+                np.asarray(f.image), shear, (inputs.camera.width_px, height), borderMode=cv2.BORDER_REFLECT
             )
             frames.append(replace(f, image=np.ascontiguousarray(image)))
-        return replace(told, frames=frames)
+        return replace(inputs, frames=frames)
 
     return spoil
 
 
-def _frozen(every_s: float, for_s: float) -> Callable[[Told], Told]:
-    def spoil(told: Told) -> Told:
-        frames, held, first = [], None, told.frames[0].timestamp_ns or 0
-        for f in told.frames:
+def _frozen(every_s: float, for_s: float) -> Callable[[FlightInputs], FlightInputs]:
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        frames, held, first = [], None, inputs.frames[0].timestamp_ns or 0
+        for f in inputs.frames:
             is_frozen = ((f.timestamp_ns or 0) - first) * 1e-9 % every_s >= every_s - for_s
             held = held if is_frozen and held is not None else f.image
             frames.append(replace(f, image=held))
-        return replace(told, frames=frames)
+        return replace(inputs, frames=frames)
 
     return spoil
 
 
-def _kept(every: int) -> Callable[[Told], Told]:
-    return lambda told: replace(told, frames=told.frames[::every])
+def _kept(every: int) -> Callable[[FlightInputs], FlightInputs]:
+    return lambda inputs: replace(inputs, frames=inputs.frames[::every])
 
 
 # -------------------------------------------------------------------------------------------- map, surface
@@ -248,26 +250,28 @@ def _kept(every: int) -> Callable[[Told], Told]:
 
 def _ground(
     shift_m: tuple[float, float] = (0.0, 0.0), scale: float = 1.0, turn_deg: float = 0.0, *, surface: str = "both"
-) -> Callable[[Told], Told]:
+) -> Callable[[FlightInputs], FlightInputs]:
     """What the map shows, moved on its own grid; with its surface model, without it, or that alone."""
 
-    def spoil(told: Told) -> Told:
-        height, width = told.gray.shape
-        gsd = float(abs(told.affine[0, 0]))
+    def spoil(inputs: FlightInputs) -> FlightInputs:
+        height, width = inputs.gray.shape
+        gsd = float(abs(inputs.affine[0, 0]))
         matrix = cv2.getRotationMatrix2D((width / 2.0, height / 2.0), -turn_deg, scale)
         matrix[:, 2] += np.array([shift_m[0], -shift_m[1]]) / gsd
-        gray, heights = told.gray, told.surface_m
+        gray, heights = inputs.gray, inputs.surface_m
         if surface != "only":
             gray = cv2.warpAffine(gray, matrix, (width, height), borderMode=cv2.BORDER_REFLECT)
         if heights is not None and surface != "none":
             heights = cv2.warpAffine(heights, matrix, (width, height), borderMode=cv2.BORDER_REPLICATE)
-        return replace(told, gray=np.ascontiguousarray(gray), surface_m=heights)
+        return replace(inputs, gray=np.ascontiguousarray(gray), surface_m=heights)
 
     return spoil
 
 
-def _heights(change: Callable[[Array], Array]) -> Callable[[Told], Told]:
-    return lambda told: told if told.surface_m is None else replace(told, surface_m=change(told.surface_m))
+def _heights(change: Callable[[Array], Array]) -> Callable[[FlightInputs], FlightInputs]:
+    return lambda inputs: (
+        inputs if inputs.surface_m is None else replace(inputs, surface_m=change(inputs.surface_m))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,14 +286,14 @@ class Fault:
 
     name: str
     causes: tuple[str, ...]
-    spoil: Callable[[Told], Told]
+    spoil: Callable[[FlightInputs], FlightInputs]
 
 
-def turned(*offsets_deg: float) -> Callable[[Told], Told]:
+def turned(*offsets_deg: float) -> Callable[[FlightInputs], FlightInputs]:
     return _angles(lambda angles: angles + np.array(offsets_deg))
 
 
-def _times(*factors: float) -> Callable[[Told], Told]:
+def _times(*factors: float) -> Callable[[FlightInputs], FlightInputs]:
     return _angles(lambda angles: angles * np.array(factors))
 
 
@@ -299,7 +303,7 @@ def _quarter_turned(image: Array) -> Array:
 
 
 _RADIANS = float(np.pi / 180.0)
-_TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
+_TELEMETRY: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
     "angles in radians:": ("radians", {
         "all": _angles(np.radians), "heading": _times(1, 1, _RADIANS), "tilt": _times(_RADIANS, _RADIANS, 1)}),
     "angles converted twice": ("degrees", {"": _angles(np.degrees)}),
@@ -322,7 +326,7 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
     "stamps in": ("stamps", {"milliseconds": _stamps(1e-6), "microseconds": _stamps(1e-3)}),
     "frame rate times": ("stamps velocity", {"1.5": _stamps(1 / 1.5), "0.5": _stamps(2.0)}),
 }  # fmt: skip
-_CAMERA: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
+_CAMERA: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
     "focal length off by": ("focal height", {
         "-20 %": lens(0.8), "-5 %": lens(0.95), "5 %": lens(1.05), "20 %": lens(1.2)}),
     "principal point off by": ("mount", {"10 px": lens(principal_px=10), "30 px": lens(principal_px=30)}),
@@ -337,7 +341,7 @@ _CAMERA: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
     "pictures frozen": ("frozen", {"5 of 15 s": _frozen(15, 5), "2 of 6 s": _frozen(6, 2)}),
     "one picture of": ("", {"3": _kept(3), "10": _kept(10)}),
 }  # fmt: skip
-_MAP: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
+_MAP: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
     "map shifted by": ("map", {"5 m": _ground((3, 4)), "8 m": _ground((8, 0)), "40 m": _ground((-32, 24))}),
     "map scaled by": ("height focal", {"2 %": _ground(scale=1.02), "10 %": _ground(scale=1.1)}),
     "map turned by": ("heading", {"2": _ground(turn_deg=2), "5": _ground(turn_deg=5)}),
@@ -351,7 +355,7 @@ _MAP: dict[str, tuple[str, dict[str, Callable[[Told], Told]]]] = {
 
 def faults() -> list[Fault]:
     """All of them, by what they are of; a map that is wrong does not say how good it is."""
-    rows = [Fault("none", (), lambda told: told)]
+    rows = [Fault("none", (), lambda inputs: inputs)]
     for table, stated in ((_TELEMETRY, True), (_CAMERA, True), (_MAP, False)):
         for name, (causes, sizes) in table.items():
             for size, spoil in sizes.items():
@@ -359,7 +363,9 @@ def faults() -> list[Fault]:
     return rows
 
 
-def _with_accuracy(spoil: Callable[[Told], Told], stated: bool) -> Callable[[Told], Told]:
+def _with_accuracy(
+    spoil: Callable[[FlightInputs], FlightInputs], stated: bool
+) -> Callable[[FlightInputs], FlightInputs]:
     if stated:
         return spoil
-    return lambda told: replace(spoil(told), georeference_sigma_m=None)
+    return lambda inputs: replace(spoil(inputs), georeference_sigma_m=None)

@@ -69,8 +69,8 @@ def _flown(name: str, count: int) -> tuple[OrthoMap, Camera, list[Photo]]:
     for row in flown.rows[:: max(1, len(flown) // count)][:count]:
         true = interpolate_truth(truth, row.timestamp_ns)
         if true is not None:
-            told = (row.heading_deg, row.roll_deg, row.pitch_deg)
-            frame = Frame(flown.source.read(row.frame), row.timestamp_ns, None, *told)
+            angles_deg = (row.heading_deg, row.roll_deg, row.pitch_deg)
+            frame = Frame(flown.source.read(row.frame), row.timestamp_ns, None, *angles_deg)
             photos.append(_photo(site, camera, frame, true, _up_m(site, true, ground_amsl_m(flown.rows))))
     return site, camera, photos
 
@@ -84,9 +84,9 @@ def _up_m(site: OrthoMap, truth: Truth, ground_amsl: float | None) -> float:
 
 def _photo(site: OrthoMap, camera: Camera, frame: Frame, truth: Truth, up_m: float) -> Photo:
     """The frame at its true place; angles that truth does not know come from the telemetry."""
-    told = frame.attitude or Attitude(0.0, 0.0, 0.0)
+    known_attitude = frame.attitude or Attitude(0.0, 0.0, 0.0)
     known = {name: getattr(truth, name) for name in ("roll_deg", "pitch_deg", "heading_deg")}
-    attitude = replace(told, **{name: value for name, value in known.items() if value is not None})
+    attitude = replace(known_attitude, **{name: value for name, value in known.items() if value is not None})
     east, north = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
     return Photo(camera.undistort(to_gray(frame)), np.array([east, north, up_m]), attitude)
 

@@ -117,7 +117,7 @@ class Browser:
             self.driver.execute_cdp_cmd("Input.dispatchKeyEvent", event)
 
     def complaints(self) -> list[str]:
-        """What the console was told of errors and warnings."""
+        """Errors and warnings on the console."""
         return [entry["message"] for entry in self.driver.get_log("browser")]
 
     def requests(self) -> list[str]:

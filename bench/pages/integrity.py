@@ -56,7 +56,7 @@ def section(rows: list[Row]) -> str:
     lines += paragraph("By kind; each cell: matches, share that got a fix, wrong fixes.")
     lines += table(["kind", *METHODS], _crossed(rows, (*ANSWERABLE, *UNANSWERABLE), lambda row: row.kind, _fixes))
     lines += paragraph("By ground; each cell: availability, wrong fixes of all matches, NEES, inside the ellipse.")
-    lines += table(["ground", *METHODS], _crossed(rows, grounds, lambda row: row.ground, _honest))
+    lines += table(["ground", *METHODS], _crossed(rows, grounds, lambda row: row.ground, _by_ground_cell))
     lines += paragraph(
         "One score alone compared with the probability. Where a peak was tested against its null-hypothesis "
         "template, that rival is in the second peak too. FPR: the share of wrong positions accepted where the "
@@ -128,7 +128,7 @@ def _fixes(of: list[Row]) -> str:
     return f"{len(of):,}, {_share(fixed / len(of))}, {sum(map(_is_wrong, of))}"
 
 
-def _honest(of: list[Row]) -> str:
+def _by_ground_cell(of: list[Row]) -> str:
     suitable = [row for row in of if row.kind in SUITABLE]
     if not suitable:
         return "-"
@@ -197,7 +197,7 @@ def calibration_error(stated: Array, right: Mask, bins: int = 10) -> float:
 
 
 def risk_chart(rows: list[Row], path: Path) -> None:
-    """Wrong ones among those believed, against the share of the suitable matches that is answered rightly."""
+    """Wrong ones among those accepted, against the share of the suitable matches that is answered rightly."""
     import matplotlib.pyplot as plt
 
     shown = [method for method, names in SCORES.items() if len(names) > 1]
@@ -212,11 +212,11 @@ def risk_chart(rows: list[Row], path: Path) -> None:
             coverage = np.cumsum((right & answered)[order]) / suitable
             risk = np.cumsum(~right[order]) / np.arange(1, len(order) + 1)
             axis.plot(100 * coverage, np.maximum(risk, 1e-5), label=name, lw=2 if index == 0 else 1.2)
-        axis.set(title=method, xlabel="suitable matches answered rightly, %", yscale="log", ylim=(1e-5, 1))
+        axis.set(title=method, xlabel="suitable matches with a right fix, %", yscale="log", ylim=(1e-5, 1))
         axis.axvline(100 * COVERAGE, color="0.7", lw=0.8, ls=":")
         axis.grid(alpha=0.3)
         axis.legend()
-    axes[0].set_ylabel("share of wrong ones among the believed")
+    axes[0].set_ylabel("share of wrong ones among the accepted")
     path.parent.mkdir(exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -92,6 +92,7 @@ def write(docs: Path, results: dict[str, Any]) -> None:
         *_latency_table(results["budgets"]["rows"]),
     ]
     lines += ["![latency against budget, by load](img/latency-budgets.png)", ""]
+    lines += [f"A frame is on time below the top of its bar, {GRACE_MS:g} ms above its budget.", ""]
     lines += ["## On time, beside busy processes", "", *_wrapped(HOGS), *_latency_table(results["hogs"])]
     lines += _embedded(results.get("embedded", []))
     lines += ["## On time, on a share of a core", "", *_wrapped(SLOW), *_slow_table(results["slow"])]

@@ -20,6 +20,7 @@ from bench import DOCS
 from bench.pages import sift
 from bench.pages.text import machine, table
 from bench.speed import growth, stages, whole_map
+from engine.report.figures import plain_log_ticks
 from engine.threads import set_threads
 
 STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
@@ -257,7 +258,7 @@ def _growth_section(curves: list[growth.Curve]) -> list[str]:
             c.unit,
             " ".join(f"{n:g}" for n in c.sizes),
             " ".join(f"{t:.2f}" for t in c.median_ms),
-            f"{c.exponent:.2f}",
+            _two_decimals(c.exponent),
         ]
         for c in curves
     ]
@@ -286,6 +287,7 @@ def _ratio_chart(rows: list[dict[str, Any]]) -> Figure:
         ax.bar(at, [own.get(size, np.nan) for size in sizes], 0.15, label=name)
     ax.axhline(1.0, color="black", linewidth=1)
     ax.set_yscale("log")
+    plain_log_ticks(ax.yaxis)
     ax.set_xticks(range(len(sizes)), sizes)
     ax.set_ylabel("times as fast as OpenCV")
     ax.set_xlabel("template in window, pixels a side, one thread")
@@ -294,13 +296,21 @@ def _ratio_chart(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
+def _two_decimals(value: float) -> str:
+    return f"{round(value, 2) + 0.0:.2f}"  # no -0.00
+
+
 def _growth_chart(curves: list[growth.Curve]) -> Figure:
     figure = Figure(figsize=(10, 6), layout="constrained")
     for index, curve in enumerate(curves):
         ax = figure.add_subplot(2, 3, index + 1)
         ax.loglog(curve.sizes, curve.median_ms, "o-", color="#0072b2")
+        ax.set_xticks(curve.sizes, [f"{size:g}" for size in curve.sizes], fontsize=8)
+        ax.minorticks_off()
         ax.set_ylim(min(curve.median_ms) / 3, max(curve.median_ms) * 3)
-        ax.set_title(f"{curve.name}: exponent {curve.exponent:.2f}", fontsize=10)
+        plain_log_ticks(ax.yaxis)
+        ax.tick_params(axis="y", labelsize=8)
+        ax.set_title(f"{curve.name}: exponent {_two_decimals(curve.exponent)}", fontsize=10)
         ax.set_xlabel(curve.unit, fontsize=8)
         ax.set_ylabel("median ms", fontsize=8)
         ax.grid(which="both", alpha=0.25)

@@ -67,6 +67,7 @@ def write(docs: Path, rows: list[Row], before: list[dict[str, Any]]) -> None:
     """Write the page below ``docs``."""
     lines = ["# The field, simulated", "", *paragraph(INTRO.format(machine=machine())), *paragraph(FIGURES)]
     lines += [f"![frames and maps of the scenes](img/{PICTURE})", ""]
+    lines += ["A scene a row, in the order of the tables: three frames, and its map on the right.", ""]
     former = {(row["scene"], row["method"], row["how"]): row for row in before}
     for scene in dict.fromkeys(row.scene for row in rows):
         lines += paragraph(f"**{TITLES[scene]}.**")

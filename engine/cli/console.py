@@ -162,4 +162,6 @@ def _text(value: Any, name: str) -> str:
         return f"{value:.7f}" if name.endswith(("lat_deg", "lon_deg", "bounds_deg")) else f"{value:.6g}"
     if isinstance(value, (list, tuple)):
         return ", ".join(_text(item, name) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_text(item, name)}" for key, item in value.items()) or "none"
     return "-" if value is None else str(value)

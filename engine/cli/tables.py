@@ -23,7 +23,7 @@ _SUMMARY = (
     ("95 % within", "r95_m", "{:.2f} m"),
     ("largest error", "max_m", "{:.2f} m"),
     ("false fixes", "false_fixes", "{}"),
-    ("mean NEES (2 is honest)", "nees_mean", "{:.2f}"),
+    ("mean NEES (consistent: 2)", "nees_mean", "{:.2f}"),
     ("height RMS error", "height_rms_m", "{:.2f} m"),
 )
 
@@ -33,7 +33,9 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     if as_json:
         console.print_json(summary)
         return
-    known = [(name, form, summary[key]) for name, key, form in _SUMMARY if summary.get(key) is not None]
+    hidden = {"false_fixes"} if summary.get("scored_fixes") == 0 else set()  # 0 of nothing reads as a result
+    shown_rows = [row for row in _SUMMARY if row[1] not in hidden]
+    known = [(name, form, summary[key]) for name, key, form in shown_rows if summary.get(key) is not None]
     # A wild value keeps to its column.
     pairs = [(name, form.replace(".2f", ".1e" if abs(v) >= 1e5 else ".2f").format(v)) for name, form, v in known]
     if summary.get("rms_m") is None:

@@ -1,4 +1,4 @@
-"""Causes: the single change of what the engine was told that makes it fit what the pictures show."""
+"""Causes: the single change of telemetry or calibration that makes them fit what the pictures show."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import MOUNTS, mount_rotation
-from engine.diagnosis.findings import Array, Finding, Told
+from engine.diagnosis.findings import Array, Finding, TelemetrySeries
+from engine.diagnosis.ground_motion import optical_centre, velocity
 from engine.diagnosis.sightings import Sighting
-from engine.diagnosis.ways import optical_centre, velocity
 from engine.geo import enu_from_body
 
 _SIGMA_DEG = np.array([1.2, 1.2, 1.5])  # of an attitude by features alone, against the telemetry's
@@ -27,29 +27,29 @@ IN_CALIBRATION = " in the calibration"
 """Ends a cure that is a line of a file, which not every flight has."""
 
 
-def findings(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
+def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
     """What does not fit; the telemetry's attitude, height, velocity and the map are tried one after the other.
 
     Args:
-        told: of the whole flight.
+        series: of the whole flight.
         seen: the poses of some of its pictures.
         map_sigma_m: georeferencing accuracy of the map.
     """
     if len(seen) < _LEAST:
         return []
-    turning = optical_centre(told, seen)
+    turning = optical_centre(series, seen)
     tries = (
-        _attitude(told, seen), _height(told, seen), turning or velocity(told, seen),
-        _place(told, seen, map_sigma_m),
+        _attitude(series, seen), _height(series, seen), turning or velocity(series, seen),
+        _place(series, seen, map_sigma_m),
     )  # fmt: skip
     return [found for found in tries if found is not None]
 
 
-def is_known(told: Told, seen: Sequence[Sighting]) -> tuple[str, ...]:
+def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ...]:
     """What of the telemetry was known at enough of the sightings to be compared."""
     index = [s.index for s in seen]
-    columns = {"attitude": told.angles_deg, "height": told.height_m[:, None], "velocity": told.velocity_mps,
-               "map": told.reference_m}  # fmt: skip
+    columns = {"attitude": series.angles_deg, "height": series.height_m[:, None], "velocity": series.velocity_mps,
+               "map": series.reference_m}  # fmt: skip
     return tuple(
         name for name, values in columns.items() if np.isfinite(values[index]).all(axis=1).sum() >= _LEAST
     )
@@ -102,10 +102,10 @@ _DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
 )  # fmt: skip
 
 
-def _attitude(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     index = np.array([s.index for s in seen])
     measured = np.array([(s.attitude.roll_deg, s.attitude.pitch_deg, s.attitude.heading_deg) for s in seen])
-    angles = told.angles_deg[index]
+    angles = series.angles_deg[index]
     if np.isfinite(angles).sum() < 2 * _LEAST:
         return None
     as_told = _cost(measured, angles)
@@ -116,8 +116,8 @@ def _attitude(told: Told, seen: Sequence[Sighting]) -> Finding | None:
         for cause, text, cure, change in _DISCRETE
     ]
     tried.append(_turned_heading(measured, angles))
-    tried.append(_turned_mount(measured, angles, told.mount))
-    tried.append(_late(measured, told, index))
+    tried.append(_turned_mount(measured, angles, series.mount))
+    tried.append(_late(measured, series, index))
     cost, finding = min((row for row in tried if math.isfinite(row[0])), key=lambda row: row[0])
     if cost < as_told - _GAIN:
         return finding
@@ -135,13 +135,13 @@ def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
 
 
 def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding]:
-    """One rotation between the told body and the one that the pictures show: the camera hangs otherwise."""
+    """One rotation between the telemetry's body and the one that the pictures show: the camera hangs otherwise."""
     known = np.isfinite(angles).all(axis=1)
     if known.sum() < _LEAST:
         return math.inf, Finding("mount", "", "")
     bodies = [enu_from_body(*row) for row in angles[known]]
     shown = [enu_from_body(*row) for row in measured[known]]
-    turns = [b.T @ s for b, s in zip(bodies, shown, strict=True)]  # shown = told @ turn
+    turns = [b.T @ s for b, s in zip(bodies, shown, strict=True)]  # shown = telemetry's @ turn
     median = _middle_rotation(turns)
     leftover = [_rotation_deg(median.T @ turn) for turn in turns]
     chi = np.minimum((np.array(leftover) / 1.5) ** 2 / 2.0, _OUTLIER)
@@ -156,7 +156,7 @@ def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, 
         text = f"the camera is turned by {quarter % 360} degrees against its mount"
         cure = f"--mount {names[0]}" if names else _mount_line(hung)
         return float(chi.mean()) + _PENALTY["discrete"], Finding("mount", text, cure, float(quarter), sigma_deg)
-    if tilt_deg < 1.0:  # about the vertical alone: told as a heading
+    if tilt_deg < 1.0:  # about the vertical alone: reported as a heading
         return math.inf, Finding("mount", "", "")
     axis = (mount @ np.array([0.0, 0.0, 1.0]), median @ mount @ np.array([0.0, 0.0, 1.0]))
     forward_deg = math.degrees(math.atan2(axis[1][0], axis[1][2]) - math.atan2(axis[0][0], axis[0][2]))
@@ -172,16 +172,16 @@ def _mount_line(mount: Array) -> str:
     return f"mount: [{', '.join(f'{v:.5f}' for v in mount.ravel())}]{IN_CALIBRATION}"
 
 
-def _late(measured: Array, told: Told, index: NDArray[np.intp]) -> tuple[float, Finding]:
+def _late(measured: Array, series: TelemetrySeries, index: NDArray[np.intp]) -> tuple[float, Finding]:
     nothing = math.inf, Finding("clock", "", "")
-    known = np.isfinite(told.angles_deg).all(axis=1) & np.isfinite(told.time_s)
-    if known.sum() < 2 * _LEAST or not np.all(np.diff(told.time_s[known]) > 0.0):
+    known = np.isfinite(series.angles_deg).all(axis=1) & np.isfinite(series.time_s)
+    if known.sum() < 2 * _LEAST or not np.all(np.diff(series.time_s[known]) > 0.0):
         return nothing
-    time_s, angles = told.time_s[known], told.angles_deg[known].copy()
+    time_s, angles = series.time_s[known], series.angles_deg[known].copy()
     angles[:, 2] = np.degrees(np.unwrap(np.radians(angles[:, 2])))
 
     def cost_of(shift_s: float) -> float:
-        at = told.time_s[index] + shift_s
+        at = series.time_s[index] + shift_s
         shifted = np.stack([np.interp(at, time_s, column) for column in angles.T], axis=1)
         return _cost(measured, shifted)
 
@@ -222,8 +222,8 @@ def _rotation_deg(rotation: Array) -> float:
 # -------------------------------------------------------------------------------------------------- height
 
 
-def _height(told: Told, seen: Sequence[Sighting]) -> Finding | None:
-    height = told.height_m[[s.index for s in seen]]
+def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
+    height = series.height_m[[s.index for s in seen]]
     measured = np.array([s.height_agl_m for s in seen])
     known = np.isfinite(height)
     if known.sum() < _LEAST:
@@ -260,14 +260,14 @@ def _height(told: Told, seen: Sequence[Sighting]) -> Finding | None:
 # ---------------------------------------------------------------------------------------------- position
 
 
-def _place(told: Told, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:
+def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:
     index = np.array([s.index for s in seen])
-    off = np.array([s.en_m for s in seen]) - told.reference_m[index]
+    off = np.array([s.en_m for s in seen]) - series.reference_m[index]
     known = np.isfinite(off).all(axis=1)
     if known.sum() < _LEAST:
         return None
     middle = np.median(off[known], axis=0)
-    sigma_m = math.hypot(float(np.median(told.reference_sigma_m[index][known])), map_sigma_m)
+    sigma_m = math.hypot(float(np.median(series.reference_sigma_m[index][known])), map_sigma_m)
     if float(np.hypot(*middle)) < 3.0 * sigma_m:
         return None
     text = (

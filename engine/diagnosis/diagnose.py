@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.covariance import map_sigma_of
 from engine.diagnosis.causes import findings, is_known
-from engine.diagnosis.findings import Diagnosis, Finding, Told
+from engine.diagnosis.findings import Diagnosis, Finding, TelemetrySeries
 from engine.diagnosis.sightings import sight
 from engine.evidence import position_of
 from engine.orthomap import OrthoMap
@@ -63,7 +63,7 @@ def diagnose(
     """
     count = len(telemetry)
     priors = [None] * count if priors is None else list(priors)
-    told = _told(telemetry, priors if reference is None else list(reference), site, camera)
+    series = _series(telemetry, priors if reference is None else list(reference), site, camera)
     chosen = np.unique(np.linspace(0, count - 1, min(LOOKED_AT, count)).round().astype(int)).tolist()
     frames = [picture(k) for k in chosen]
     static = [
@@ -71,14 +71,14 @@ def diagnose(
     ]
     if start is not None:
         priors[0] = start
-    seen = sight(frames, [_searched(k, priors, told.time_s, site) for k in chosen], site, camera)
+    seen = sight(frames, [_searched(k, priors, series.time_s, site) for k in chosen], site, camera)
     if seen.mirrored:
         cure = "take them from the camera before they are flipped"
         static.append(Finding("mirrored", "the pictures are mirrored", cure))
         return Diagnosis(static, len(chosen), len(seen.sightings), ())
     sightings = [replace(s, index=chosen[s.index]) for s in seen.sightings]
-    found = findings(told, sightings, map_sigma_of(site))
-    return Diagnosis(static + found, len(chosen), len(sightings), is_known(told, sightings))
+    found = findings(series, sightings, map_sigma_of(site))
+    return Diagnosis(static + found, len(chosen), len(sightings), is_known(series, sightings))
 
 
 def _searched(k: int, priors: Sequence[Prior | None], time_s: Array, site: OrthoMap) -> Prior | None:
@@ -98,16 +98,16 @@ def _searched(k: int, priors: Sequence[Prior | None], time_s: Array, site: Ortho
     return None if site.is_searchable else replace(prior, sigma_m=_MAX_SIGMA_M)
 
 
-def _told(
+def _series(
     telemetry: Sequence[Telemetry], reference: Sequence[Prior | None], site: OrthoMap, camera: Camera
-) -> Told:
+) -> TelemetrySeries:
     def column(*names: str) -> Array:
         rows = [[getattr(row, name) for name in names] for row in telemetry]
         return np.array([[np.nan if v is None else v for v in row] for row in rows], np.float64)
 
     factor = _unit(telemetry)[1]
     places = [None if prior is None else position_of(prior, site) for prior in reference]
-    return Told(
+    return TelemetrySeries(
         time_s=column("timestamp_ns")[:, 0] * factor * 1e-9,
         angles_deg=column("roll_deg", "pitch_deg", "heading_deg"),
         height_m=column("height_agl_m")[:, 0],

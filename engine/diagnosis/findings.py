@@ -1,4 +1,4 @@
-"""What a diagnosis says, and what it is told of a flight."""
+"""Findings of a diagnosis, and the telemetry that it compares with the pictures."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Diagnosis:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class TelemetrySeries:
     """What the telemetry says at every picture of a flight; NaN where it says nothing.
 
     Attributes:

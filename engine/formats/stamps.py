@@ -59,7 +59,7 @@ def read_stamps(rows: Sequence[CsvRow]) -> Stamps:
         rows: of a table with at least one of :data:`STAMP_COLUMNS`.
 
     Raises:
-        TelemetryError: a stamp is blank or none, does not increase, or its unit cannot be told.
+        TelemetryError: a stamp is blank or none, does not increase, or its unit cannot be recognised.
     """
     column = next((name for name in STAMP_COLUMNS if any(row.values[name] for row in rows)), STAMP_COLUMNS[0])
     dates = [_DATE.fullmatch(row.values[column]) for row in rows]

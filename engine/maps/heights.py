@@ -43,13 +43,18 @@ def surface_part(source: Source, grid: Grid) -> Window:
     """The part of a surface model under a map, in the model's pixels.
 
     Raises:
-        MapError: it has no heights, or does not overlap the map.
+        MapError: it has no heights (a picture, complex numbers), or does not overlap the map.
     """
-    dtype = source.dataset.dtypes[0]
+    dtypes = source.dataset.dtypes
+    dtype = dtypes[0]
     if isinstance(source.dataset, TileCache):
         raise MapError(f"surface: expected heights, got a folder of pictures, {source.path}")
     if np.dtype(dtype).kind not in "iuf":
         raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
+    if len(dtypes) >= 3 and set(dtypes) == {"uint8"}:  # the map given twice: its red would become relief
+        raise MapError(
+            f"surface: expected one band of heights, got a picture of {len(dtypes)} bands, {source.path}"
+        )
     low, high = overlap(grid, source.grid)
     if not (high > low).all():
         raise MapError(f"surface: expected one that overlaps the map, got {source.path}")

@@ -91,7 +91,7 @@ def driver_of(file: Path, argument: str) -> str:
     if _VRT_HEAD in head:
         return "VRT"
     formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG", "VRT"])
-    raise MapError(f"{argument}: expected a raster file of {formats}; {file} is neither")
+    raise MapError(f"{argument}: expected a raster file ({formats}), got {file}, which is none of these")
 
 
 def openable(path: Path, argument: str) -> tuple[str | Path, str]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
-from engine.report.figures import DPI, GRID
+from engine.report.figures import DPI, GRID, plain_log_ticks
 from engine.report.metrics import errors_en_m
 from engine.values import Truth
 
@@ -45,6 +45,7 @@ def draw_comparison(
         for index, (name, series) in enumerate(values.items()):
             _draw_cumulative(ax, series, len(tracks[name]), name, index)
         ax.set(xscale="log", xlabel=label, ylabel="share of all frames", ylim=(-0.02, 1.02))
+        plain_log_ticks(ax.xaxis)
         ax.grid(color=GRID, linewidth=0.6)
         ax.spines[["top", "right"]].set_visible(False)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)

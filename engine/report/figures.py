@@ -89,7 +89,8 @@ def _new_figure(plot_data: TrackPlotData, size_in: tuple[float, float], panels: 
         ax.set_axisbelow(True)
         ax.tick_params(labelsize=9)
     heading = [line for line in (plot_data.title, plot_data.figures) if line]
-    axes[0].set_title("\n".join(heading), fontsize=10.5, loc="left")
+    # Of the figure, not of the axes: those of a narrow map end before the line does.
+    figure.suptitle("\n".join(heading), fontsize=10.5, x=0.02, ha="left")
     return figure, list(axes)
 
 
@@ -102,6 +103,23 @@ def _legend(figure: Any, axes: Sequence[Any]) -> None:
         handles, labels = list(by_label.values()), list(by_label)
         columns = min(len(labels), 6)
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def plain_log_ticks(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers: 1, 2 and 5 of each decade, or 1 alone over more than two.
+
+    matplotlib's own labels of a short axis (2 x 10^1, 3 x 10^1, ...) overlap.
+
+    Args:
+        axis: ``xaxis`` or ``yaxis``, after everything is drawn on it.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    multiples = (1.0, 2.0, 5.0) if high <= 100.0 * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=multiples, numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _line(time: Array, values: Array) -> tuple[Array, Array]:

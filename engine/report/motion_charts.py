@@ -42,32 +42,32 @@ def draw_motion(
     if len(rows) < 2:
         return []
     by_frame = {row.frame: row for row in telemetry or ()}
-    told = [by_frame.get(row.frame) for row in rows]
+    stated = [by_frame.get(row.frame) for row in rows]
     true = truth_per_row(rows, truth or [])
     charts = []
     for name, words in _ANGLES.items():
         fix = column(notes, name) if notes else np.full(len(rows), np.nan)
-        charts.append(_angle(words, fix, column(told, name), column(true, name), plot_data))
+        charts.append(_angle(words, fix, column(stated, name), column(true, name), plot_data))
     if plot_data.time_label.startswith("time"):
         charts += [
-            _velocity(axis, column(told, f"{_AXES[axis]}_velocity_mps"), plot_data) for axis in range(len(_AXES))
+            _velocity(axis, column(stated, f"{_AXES[axis]}_velocity_mps"), plot_data) for axis in range(len(_AXES))
         ]
     return [chart for chart in charts if chart is not None]
 
 
-def _angle(words: str, fix: Array, told: Array, true: Array, plot_data: TrackPlotData) -> Chart | None:
+def _angle(words: str, fix: Array, stated: Array, true: Array, plot_data: TrackPlotData) -> Chart | None:
     """One angle; what the fixes do not measure and the telemetry does not say has no chart."""
-    if not (np.isfinite(fix).any() or np.isfinite(told).any()):
+    if not (np.isfinite(fix).any() or np.isfinite(stated).any()):
         return None
     if words == "Heading":  # near its neighbours, not broken at north
-        reference = next(a for a in (true, told, fix) if np.isfinite(a).any())
+        reference = next(a for a in (true, stated, fix) if np.isfinite(a).any())
         reference = _unwrapped(reference)
-        fix, told, true = (_nearest_turn(angle, reference) for angle in (fix, told, true))
+        fix, stated, true = (_nearest_turn(angle, reference) for angle in (fix, stated, true))
     caption = f"{words} (degrees)"
     error = fix - true
     if np.isfinite(error).any():
         caption += f", RMS error of the fixes {np.sqrt(np.nanmean(error**2)):.2f}"
-    return _chart(caption, fix, told, true, plot_data, 360.0 if words == "Heading" else None)
+    return _chart(caption, fix, stated, true, plot_data, 360.0 if words == "Heading" else None)
 
 
 def _unwrapped(heading_deg: Array) -> Array:
@@ -83,16 +83,16 @@ def _nearest_turn(angle_deg: Array, reference_deg: Array) -> Array:
     return np.asarray(angle_deg - 360.0 * np.round((angle_deg - reference_deg) / 360.0), np.float64)
 
 
-def _velocity(axis: int, told: Array, plot_data: TrackPlotData) -> Chart | None:
+def _velocity(axis: int, stated: Array, plot_data: TrackPlotData) -> Chart | None:
     errors = plot_data.errors
     fix = velocity_mps(plot_data.time, errors.fix_en_m[:, axis])
     true = velocity_mps(plot_data.time, errors.truth_en_m[:, axis])
-    if not (np.isfinite(fix).any() or np.isfinite(told).any()):
+    if not (np.isfinite(fix).any() or np.isfinite(stated).any()):
         return None
     caption = f"Velocity {_AXES[axis]} (m/s)"
     if np.isfinite(fix).any():
         caption += f", of fixes at least {_BASE_S:g} s apart"
-    return _chart(caption, fix, told, true, plot_data)
+    return _chart(caption, fix, stated, true, plot_data)
 
 
 def velocity_mps(time_s: Array, position_m: Array) -> Array:
@@ -122,16 +122,16 @@ def velocity_mps(time_s: Array, position_m: Array) -> Array:
 
 
 def _chart(
-    caption: str, fix: Array, told: Array, true: Array, plot_data: TrackPlotData, period: float | None = None
+    caption: str, fix: Array, stated: Array, true: Array, plot_data: TrackPlotData, period: float | None = None
 ) -> Chart:
     """Dots of the fixes on lines of telemetry and truth."""
-    values = np.concatenate([fix, told, true])
+    values = np.concatenate([fix, stated, true])
     low, high = np.percentile(values[np.isfinite(values)], [1, 99])
     margin = max(0.15 * (high - low), 0.5)
     limits: Limits = (float(low - margin), float(high + margin))
     area = ChartArea((float(plot_data.time[0]), float(plot_data.time[-1])), limits)
     marks = [
-        area.line(plot_data.time, told, "told"),
+        area.line(plot_data.time, stated, "telemetry"),
         area.dots(plot_data.time, fix, "fix"),
         area.line(plot_data.time, true, "truth"),
     ]

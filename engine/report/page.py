@@ -120,7 +120,7 @@ def _when(track: FinishedTrack, plot_data: TrackPlotData) -> str:
     if np.isfinite(plot_data.errors.truth_en_m).any():
         legend.append(("truth", '<path d="M0 7h22" class="line truth"/>'))
     if track.telemetry:
-        legend.append(("telemetry", '<path d="M0 7h22" class="line told"/>'))
+        legend.append(("telemetry", '<path d="M0 7h22" class="line telemetry"/>'))
     states = {"coasting": "on dead reckoning", "searching": "searching for a first fix", "lost": "lost"}
     seen = {note.state for note in track.notes or ()}
     legend += [

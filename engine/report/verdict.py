@@ -28,7 +28,7 @@ MEANINGS = {
 }
 """One sentence for each reason; ``docs/integrity.md`` has the rules behind them."""
 
-# Of honest fixes 1 % lie beyond three sigmas, and the mean NEES is 2.
+# Of fixes with a consistent covariance 1 % lie beyond three sigmas, and the mean NEES is 2.
 _BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
 _CAUTIOUS = 2.0  # sigmas so many times the errors are said to be
 

@@ -74,7 +74,7 @@ class CameraFiles:
         Args:
             frames: the pictures; None where they are not known before they are taken.
             names: of those pictures that are used; none is all.
-            progress: is told what a photograph's EXIF said.
+            progress: receives what a photograph's EXIF said.
 
         Raises:
             CalibrationError: the calibration cannot be read, or nothing says what the camera's focal length is.
@@ -109,7 +109,7 @@ class CameraFiles:
         Args:
             camera_source: as of :func:`engine.adapters.pictures.capture`; by ``hfov_deg`` it is opened until its
                 first picture says its size, and closed again.
-            progress: is told what is waited for, and what the camera then is.
+            progress: receives what is waited for, and what the camera then is.
 
         Raises:
             CalibrationError: the calibration cannot be read, or there is none.
@@ -146,6 +146,13 @@ def check_size(camera: Camera, shape: tuple[int, ...]) -> None:
     try:
         camera.check_size(shape)
     except CalibrationError as error:
-        raise CalibrationError(
-            f"{error}; if the pictures were made smaller or larger as a whole, `scale_calibration`"
-        ) from None
+        raise CalibrationError(f"{error}; {_way_out(camera, shape)}") from None
+
+
+def _way_out(camera: Camera, shape: tuple[int, ...]) -> str:
+    """What to do about a calibration for another size; one of another shape cannot be scaled."""
+    try:
+        camera.scaled_to(shape[1], shape[0])
+    except CalibrationError:
+        return "their shapes differ: give the calibration of these pictures"
+    return "if the pictures were made smaller or larger as a whole, add `scale_calibration`"

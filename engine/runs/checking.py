@@ -76,8 +76,8 @@ def _that_can_be_set(finding: Finding, has_gimbal: bool, has_calibration: bool) 
         return finding
     if has_gimbal:
         return replace(
-            finding, cure="a mount cannot be set beside a gimbal's angles: correct these, by --column roll_deg=, "
-            "--column pitch_deg= or --heading-offset-deg",
+            finding, cure="beside a gimbal's angles no mount is set: correct the angles, with --column "
+            "roll_deg=roll_deg+DEG, --column pitch_deg=pitch_deg+DEG or --heading-offset-deg DEG",
         )  # fmt: skip
     return (
         finding

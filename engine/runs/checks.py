@@ -121,10 +121,17 @@ def check_position(
     if position is None or position.lat_deg is None or position.lon_deg is None:
         return
     middle = site.frame
-    distance_m = Geod(ellps="WGS84").inv(middle.lon_deg, middle.lat_deg, position.lon_deg, position.lat_deg)[2]
+
+    def off_m(lat_deg: float, lon_deg: float) -> float:
+        return float(Geod(ellps="WGS84").inv(middle.lon_deg, middle.lat_deg, lon_deg, lat_deg)[2])
+
+    distance_m = off_m(position.lat_deg, position.lon_deg)
     extent_m = math.hypot(site.width_px, site.height_px) * site.gsd_m_per_px
-    if distance_m > extent_m + 3.0 * position.sigma_m:
+    limit_m = extent_m + 3.0 * position.sigma_m
+    if distance_m > limit_m:
+        is_swapped = abs(position.lon_deg) <= 90.0 and off_m(position.lon_deg, position.lat_deg) <= limit_m
+        hint = "; latitude and longitude are swapped?" if is_swapped else ""
         raise error(
             f"{name}: expected a place on the map {site.name}, got {position.lat_deg:g},{position.lon_deg:g}, "
-            f"{distance_m / 1000.0:,.1f} km from its middle ({middle.lat_deg:.5f},{middle.lon_deg:.5f})"
+            f"{distance_m / 1000.0:,.1f} km from its middle ({middle.lat_deg:.5f},{middle.lon_deg:.5f}){hint}"
         )

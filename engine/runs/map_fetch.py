@@ -211,7 +211,7 @@ def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
     elif radius_m is None:
         raise OptionError("radius_m: expected with LAT,LON; only around photographs it may be left out")
     else:
-        place = Place(*parse_place("around", settings.around), radius_m)
+        place = Place(*_place(settings.around), radius_m)
     return Wanted(
         place=place,
         gsd_m_per_px=GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px,
@@ -220,6 +220,23 @@ def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
         crs=settings.crs,
         image_format=settings.image_format,
     )
+
+
+def _place(around: str) -> tuple[float, float]:
+    """LAT,LON, in the right order.
+
+    Raises:
+        OptionError: it is no such pair; a name says why not.
+    """
+    try:
+        return parse_place("around", around)
+    except OptionError:
+        if any(part.strip()[:1].isalpha() for part in around.split(",")):
+            raise OptionError(
+                f"around: expected LAT,LON in degrees or a folder of photographs, got {around!r}; names of places "
+                "are not looked up"
+            ) from None
+        raise
 
 
 def _seen_by_photographs(folder: Path) -> tuple[Place, float]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from engine.errors import EngineError, MissingExtraError, require
 from engine.formats.flight import Flight
 from engine.formats.notes import read_notes
+from engine.formats.resampling import UTC_FROM_NS
 from engine.formats.track import TrackRow
 from engine.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
@@ -65,7 +67,12 @@ def write_results(
     motion = {"motion_consistency": motion_consistency(rows, telemetry, site.frame)}
     summary |= segments | motion | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
-        progress.message(f"no fix is scored: {record.truth} says nothing of the times of this flight")
+        fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
+        given = [row.timestamp_ns for row in truth or []]
+        progress.message(
+            f"no fix is scored: expected a truth at the times of the fixes, {_span(fixed)}, got {_span(given)} in "
+            f"{record.truth}"
+        )
     (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not report:
         return summary
@@ -79,6 +86,16 @@ def write_results(
         progress.message(f"no plots are drawn: {error}")
     _write_page(out / PAGE, finished_track(out, rows, truth, site, ground, summary, frames), frames)
     return summary
+
+
+def _span(stamps_ns: list[int]) -> str:
+    """First and last of some stamps, to be read: as dates where they are UTC, else as seconds."""
+    if not stamps_ns:
+        return "none"
+    ends = (min(stamps_ns), max(stamps_ns))
+    if ends[0] >= UTC_FROM_NS:
+        return " to ".join(f"{datetime.fromtimestamp(ns / 1e9, UTC):%Y-%m-%dT%H:%M:%SZ}" for ns in ends)
+    return f"{ends[0] / 1e9:.1f} to {ends[1] / 1e9:.1f} s"
 
 
 def finished_track(

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from engine.errors import OptionError
-from engine.formats.frames import open_frames, read_image
+from engine.errors import OptionError, TelemetryError
+from engine.formats.frames import PICTURE_SUFFIXES, open_frames, read_image
 from engine.matcher import SceneMatcher
 from engine.methods import METHODS
 from engine.methods.options import MatcherOptions
@@ -88,6 +88,7 @@ def locate_image(
         scale_calibration=scale_calibration,
     )
     site = open_map(map, surface, map_sigma_m, bounds=map_bounds, crs=map_crs, progress=progress)
+    _check_picture(Path(image))
     calibration = described.load(open_frames(image), progress=progress)
     check_position("near", prior, site, OptionError)
     pixels = read_image(image)
@@ -96,6 +97,14 @@ def locate_image(
         pixels, height_agl_m=height_agl_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg
     )
     return SceneMatcher(site, calibration, method, device, options).locate(frame, prior)
+
+
+def _check_picture(file: Path) -> None:
+    """Refuse what is no picture by its own name: a folder or a video serves other commands."""
+    if not file.exists():
+        raise TelemetryError(f"{file}: expected a picture, got no such file")
+    if not file.is_file() or file.suffix.lower() not in PICTURE_SUFFIXES:
+        raise TelemetryError(f"{file}: expected one picture ({', '.join(PICTURE_SUFFIXES)})")
 
 
 def _check_numbers(known: Mapping[str, float | None]) -> None:

@@ -65,16 +65,16 @@ def _die_with_the_writer_of(pipe: int) -> None:
 
 
 def _wait(worker: int) -> tuple[int, bool]:
-    """The exit code of a worker, below 0 the signal that killed it, and whether it was told to end."""
-    told = []
+    """The exit code of a worker, below 0 the signal that killed it, and whether it was asked to end."""
+    asked = []
 
     def pass_on(number: int, _frame: object) -> None:
-        told.append(number)
+        asked.append(number)
         os.kill(worker, number)
 
     before = signal.signal(signal.SIGINT, signal.SIG_IGN), signal.signal(signal.SIGTERM, pass_on)
     try:
-        return os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]), bool(told)
+        return os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]), bool(asked)
     finally:
         signal.signal(signal.SIGINT, before[0])
         signal.signal(signal.SIGTERM, before[1])

@@ -18,6 +18,7 @@ import rasterio
 import torch
 from PIL import Image
 
+from engine.cli import console
 from engine.cli.app import run
 from engine.errors import OptionError
 from engine.formats.geotiff import write_geotiff
@@ -683,3 +684,10 @@ def test_the_console_script_under_ctrl_c(tmp_path):
     assert printed == ""
     assert rest.endswith("scenematch: interrupted\n")
     assert "Traceback" not in rest
+
+
+def test_counts_of_a_result_are_words_for_people(capsys):
+    """As a bridge's, of what it did not send."""
+    console.facts({"withheld": {"no height": 1, "late": 16}, "refused": {}}, False, "bridge")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[-1].strip() for line in lines[1:]] == ["no height 1, late 16", "none"]

@@ -545,6 +545,8 @@ def test_around_photographs_the_map_holds_what_they_saw_as_fine_as_their_height_
     assert any(line.startswith("the photographs' place: 48.246") for line in said)
     with pytest.raises(OptionError, match="radius_m: expected with LAT,LON"):
         fetch_map(FetchSettings(around="48.25,16.44", source=f"{server.url}/wms"), tmp_path / "map.tif")
+    with pytest.raises(OptionError, match="got 'Duluth, MN'; names of places are not looked up"):
+        fetch_map(FetchSettings(around="Duluth, MN", radius_m=100.0, source=server.url), tmp_path / "map.tif")
     (tmp_path / "none").mkdir()
     photograph(tmp_path / "none" / "a.jpg")
     with pytest.raises(OptionError, match="around: expected LAT,LON or photographs with positions"):

@@ -427,6 +427,13 @@ def test_surface_that_lies_elsewhere_or_knows_nothing_is_refused(tmp_path):
         OrthoMap.open(path, tmp_path / "none.tif")
 
 
+def test_a_picture_is_no_surface(tmp_path):
+    """The map given twice: its red would be read as heights of up to 255 m."""
+    path = write(tmp_path / "map.tif", np.stack([noise(60, 60)] * 3))
+    with pytest.raises(MapError, match=r"surface: expected one band of heights, got a picture of 3 bands"):
+        OrthoMap.open(path, path)
+
+
 # --- pictures with a place ----------------------------------------------------------------------------------
 
 

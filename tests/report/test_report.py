@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from engine.formats.frames import read_image
 from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
-from engine.report.figures import draw_figures
+from engine.report.figures import draw_figures, plain_log_ticks
 from engine.report.metrics import Ground, errors_en_m, summarise
 from engine.values import Truth
 
@@ -125,7 +126,7 @@ def test_a_false_fix_is_wrong_by_10_m_and_by_3_of_its_own_sigmas(error_en_m, sig
     assert (summary["wrong_over_10m"], summary["false_fixes"]) == (wrong, false)
 
 
-def test_nees_of_an_honest_covariance_is_2():
+def test_nees_of_a_consistent_covariance_is_2():
     rng = np.random.default_rng(8)
     root = np.array([[2.0, 0.0], [0.9, 0.6]])
     covariance = root @ root.T
@@ -267,3 +268,41 @@ def test_the_map_lies_where_its_pixels_are(tmp_path, monkeypatch):
         / figures[0].dpi
     )
     assert image[round(image.shape[0] - 1 - edge[1]), round(edge[0])] < 200
+
+
+@pytest.mark.parametrize("span", [(2.8, 55.0), (0.9, 1.8), (0.0015, 2.0), (0.2, 19.0), (1.0, 900.0)])
+def test_labels_of_a_logarithmic_axis_are_plain_and_do_not_overlap(span):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.4, 3.0), layout="constrained")
+    ax = figure.add_subplot()
+    ax.plot(span, (0.0, 1.0))
+    ax.set_xscale("log")
+    plain_log_ticks(ax.xaxis)
+    FigureCanvasAgg(figure).draw()
+    inside = [t for t in ax.xaxis.get_ticklabels(which="both") if t.get_text() and _within(t, ax)]
+    boxes = sorted(label.get_window_extent().extents[[0, 2]].tolist() for label in inside)
+    assert boxes
+    assert all(right < left for (_, right), (left, _) in pairwise(boxes))
+    assert all(float(label.get_text()) == pytest.approx(label.get_position()[0]) for label in inside)
+
+
+def _within(label, ax):
+    low, high = ax.get_xlim()
+    return low <= label.get_position()[0] <= high
+
+
+def test_the_heading_of_a_narrow_path_is_not_cut_off(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **o: (save(self, path, **o), drawn.append(self)))
+    truth = [truth_at(0.5 * t, 30.0 * t, t) for t in range(10)]
+    rows = [fix_at(0.5 * t, 30.0 * t, t) for t in range(10)]
+    draw_figures(tmp_path, rows, truth, title="ncc (engine profile)")
+    for figure in drawn:
+        box = figure.get_tightbbox()
+        assert box.x0 >= 0
+        assert box.x1 <= figure.get_figwidth()

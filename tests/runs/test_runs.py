@@ -9,11 +9,13 @@ import pytest
 import torch
 
 import engine.runs
-from engine import OptionError
+from engine import OptionError, TelemetryError
+from engine.cli.tables import print_summary
 from engine.errors import BackendError, MissingExtraError, require
 from engine.features import sift
 from engine.formats.ros.bags import import_rosbags
 from engine.formats.track import read_track
+from engine.formats.truth import read_truth
 from engine.runs import (
     BridgeFiles,
     BridgeSettings,
@@ -26,6 +28,7 @@ from engine.runs import (
     compare,
     evaluate,
     export_track,
+    locate_image,
     run_demo,
     run_mavlink_bridge,
     simulate,
@@ -85,6 +88,26 @@ def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     assert (tmp_path / "out" / "report.html").read_bytes() == page  # with the pictures of the same frames
 
 
+def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(flight, tmp_path, capsys):
+    progress, out = Recorded(), tmp_path / "out"
+    summary = track(FlightFiles.in_folder(str(flight)), out, report=False)
+    first, *rows = (flight / "truth.csv").read_text().splitlines()
+    stamps = [int(row.split(",")[0]) for row in rows]
+    later = [
+        f"{1_700_000_000_000_000_000 + t},{row.split(',', 1)[1]}" for t, row in zip(stamps, rows, strict=True)
+    ]
+    (tmp_path / "truth.csv").write_text("\n".join([first, *later]) + "\n", encoding="utf-8")
+    again = evaluate(out, tmp_path / "truth.csv", progress=progress)
+    assert (summary["scored_fixes"], again["scored_fixes"]) == (FRAMES, 0)
+    last = progress.messages[-1]
+    assert last.startswith(
+        f"no fix is scored: expected a truth at the times of the fixes, {stamps[0] / 1e9:.1f} to "
+    )
+    assert "got 2023-11-14T22:13:21Z to 2023-11-14T22:13:22Z in " in last
+    print_summary(again, False, "track", out)
+    assert "false fixes" not in capsys.readouterr().out
+
+
 def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     progress = Recorded()
     files = FlightFiles(
@@ -139,10 +162,20 @@ def test_errors_name_arguments(flight, tmp_path):
     )
     far = TrackSettings(start="0,0")
     assert refused(track, files, tmp_path / "out", far).startswith("start: expected a place on the map")
+    place = next(iter(read_truth(flight / "truth.csv")))
+    swapped = TrackSettings(start=f"{place.lon_deg},{place.lat_deg}")
+    assert refused(track, files, tmp_path / "out", swapped).endswith("; latitude and longitude are swapped?")
+    assert "swapped" not in refused(track, files, tmp_path / "out", far)
     assert refused(compare, files, tmp_path / "out", {"far": far}).startswith("start: expected a place on the map")
     assert refused(export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
     assert refused(WorldSettings, surface="dsm.tif") == "surface: expected with `map` only, got dsm.tif"
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_no_picture_is_not_located(flight, tmp_path):
+    for file, said in ((tmp_path / "a.jpg", "no such file"), (flight, "one picture")):
+        with pytest.raises(TelemetryError, match=f"expected .*{said}"):
+            locate_image(file, flight / "map.tif", camera=flight / "camera.yaml")
 
 
 def test_the_public_names_are_sorted_and_there():

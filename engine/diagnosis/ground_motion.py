@@ -1,4 +1,4 @@
-"""Ways between sightings, against the velocity: its unit and axes, and places that move with the heading."""
+"""Ground motion between sightings against the velocity: unit, axes, and places that move with the heading."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from engine.diagnosis.findings import Array, Finding, Told
+from engine.diagnosis.findings import Array, Finding, TelemetrySeries
 from engine.diagnosis.sightings import Sighting
 
 _OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
@@ -23,9 +23,9 @@ _MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
 _VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
 
 
-def velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     """The unit, the axes and the sign of a velocity that does not fit the ways between sightings."""
-    legs = _legs(told, seen)
+    legs = _legs(series, seen)
     if legs is None:
         return None
     moved, reckoned, sigma, _ = legs
@@ -64,9 +64,9 @@ def velocity(told: Told, seen: Sequence[Sighting]) -> Finding | None:
     return Finding("velocity", text, cure, factor)
 
 
-def _legs(told: Told, seen: Sequence[Sighting]) -> tuple[Array, Array, Array, Array] | None:
+def _legs(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[Array, Array, Array, Array] | None:
     """The legs between sightings: movements (N, 2), the velocity's, sigmas (N,), and what turned (N, 2, 2)."""
-    known = [(a, b, leg) for a, b in pairwise(seen) if (leg := _leg(told, a, b)) is not None]
+    known = [(a, b, leg) for a, b in pairwise(seen) if (leg := _leg(series, a, b)) is not None]
     if len(known) < _LEAST:
         return None
     moved, reckoned, sigma = (np.array(column) for column in zip(*(leg for _, _, leg in known), strict=True))
@@ -81,9 +81,9 @@ def _heading_rotation(seen: Sighting) -> Array:
     return np.array([[sine, cosine], [cosine, -sine]])
 
 
-def optical_centre(told: Told, seen: Sequence[Sighting]) -> Finding | None:
+def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     """Places that are off forwards or to the right: at every turn of the vehicle they move."""
-    legs = _legs(told, seen)
+    legs = _legs(series, seen)
     if legs is None:
         return None
     moved, reckoned, sigma, turned = legs
@@ -108,12 +108,12 @@ def optical_centre(told: Told, seen: Sequence[Sighting]) -> Finding | None:
         return None
     if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
         return None
-    return _named(aside_m, sigma_m, height_m, told)
+    return _named(aside_m, sigma_m, height_m, series)
 
 
-def _named(aside_m: Array, sigma_m: float, height_m: float, told: Told) -> Finding:
+def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySeries) -> Finding:
     size_m = float(np.hypot(*aside_m))
-    off_px = told.focal_px / height_m * (told.mount.T @ [*aside_m, 0.0])[:2]
+    off_px = series.focal_px / height_m * (series.mount.T @ [*aside_m, 0.0])[:2]
     text = (
         f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of where they are, whichever way "
         "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
@@ -124,10 +124,10 @@ def _named(aside_m: Array, sigma_m: float, height_m: float, told: Told) -> Findi
     )
 
 
-def _leg(told: Told, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
+def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
     """The movement between two sightings, the one that the velocity says, and the standard deviation of both."""
     between = slice(a.index, b.index + 1)
-    time_s, velocity = told.time_s[between], told.velocity_mps[between]
+    time_s, velocity = series.time_s[between], series.velocity_mps[between]
     seconds = float(time_s[-1] - time_s[0])
     if not (np.isfinite(velocity).all() and np.isfinite(time_s).all()) or not seconds > 0.0:
         return None
