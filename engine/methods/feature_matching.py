@@ -22,7 +22,7 @@ from engine.methods.options import SiftOptions
 from engine.methods.point_finding import PointFinder
 from engine.methods.query import Query
 from engine.methods.relief import ground_relief
-from engine.methods.views import MapView, TelemetryHypothesis, level_at, map_px_per_pixel, slant_m
+from engine.methods.views import MapView, TelemetryHypothesis, map_px_per_pixel, slant_m
 from engine.methods.votes import Vote, similarity, vote
 from engine.orthomap import OrthoMap
 from engine.pose import PoseStart
@@ -94,14 +94,6 @@ def match_views(
     if isinstance(source, PointFinder):
         return _by_reduced(query, source, options, views)
     return _by_frame(query, source, options, views, hypothesis)
-
-
-def is_doubled(query: Query, options: SiftOptions) -> bool:
-    """Whether a frame drawn at its own height is so small that its keypoints are found at twice its size."""
-    height_m = query.telemetry.height_agl_m
-    assert height_m is not None  # it is drawn by it
-    per_px = map_px_per_pixel(query, height_m) / 2.0 ** level_at(query, height_m, options.scale)
-    return options.upsample > 1 and query.gray.size * per_px**2 <= _UPSAMPLED_PX
 
 
 # ----------------------------------------------------------------------------------- by the orthophoto

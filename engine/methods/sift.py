@@ -12,13 +12,13 @@ from engine.indexes.landmarks import LandmarkMap
 from engine.indexes.prepared import PreparedMap
 from engine.indexes.samples import SampleMap
 from engine.methods.explanation import Explanation, explain_features
-from engine.methods.feature_matching import is_doubled
 from engine.methods.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.scheduler import OutOfTime
+from engine.methods.views import coarser_scale
 from engine.orthomap import OrthoMap
 from engine.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
@@ -87,7 +87,7 @@ class Sift(Method):
     def locate(self, query: Query) -> Result:
         """A refined fix by few features, else one by all at the highest resolution that there is time for.
 
-        Few features take half the time of all, and refinement makes up for what their pose lacks in accuracy.
+        Few features take a fifth of the time, and refinement makes up for what their pose lacks in accuracy.
         Where it does not, their pose is the fix only if there is no time for all of them.
         """
         few = self._by_few_features(query, {_REFINEMENT: query.gray.size} if self._has_time(query) else {})
@@ -108,21 +108,21 @@ class Sift(Method):
         return few if few is not None and self._is_certain(few) else self._by_all_features(query)
 
     def _by_few_features(self, query: Query, following: Mapping[str, float]) -> Fix | None:
-        """A fix by half as many keypoints of a picture that is not doubled, None where that is not accepted.
-
-        Of a picture that is not doubled anyway they would not be searched faster.
+        """A fix by half as many keypoints, a level coarser and not doubled; None where that is not accepted.
 
         Args:
             query: the frame.
             following: work of the steps after it, for which there must be time as well.
         """
         works = {_FEW: self._work_px(query)[1.0], **following}
-        if not self._can_refine(query) or not is_doubled(query, self.options):
+        height_m = query.telemetry.height_agl_m
+        if height_m is None or not self._can_refine(query) or not query.scheduler.can_afford_all(works):
             return None
-        if not query.scheduler.can_afford_all(works):
+        scale = coarser_scale(query, height_m, self.options.scale)
+        if scale is None:
             return None
         with query.scheduler.costed(_FEW, works[_FEW]):
-            found = FeatureMatcher(query, self.landmarks, self._few).find_at_once()
+            found = FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
         return None if isinstance(found, NoFix) or found.confidence < self.options.min_confidence else found.fix
 
     def _is_certain(self, fix: Fix) -> bool:

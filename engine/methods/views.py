@@ -108,6 +108,14 @@ def level_at(query: Query, height_m: float, scale: float) -> int:
     return level_for(1.0, map_px_per_pixel(query, height_m, scale) * _NO_LARGER, query.site.levels)
 
 
+def coarser_scale(query: Query, height_m: float, scale: float) -> float | None:
+    """The scale to reduce a frame to for one level above that of another scale; None where the map has none."""
+    level = level_at(query, height_m, scale) + 1
+    if level >= query.site.levels:
+        return None
+    return map_px_per_pixel(query, height_m) / 2.0**level * (1.0 - 1e-9)  # not below the level by rounding
+
+
 def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
     """A window on a level, or where it is too large a coarser one; ``per_px`` map pixels are one of the frame."""
     site = query.site
