@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,9 @@ class Auto(Method):
         first = at_once or self.ncc.correlate(query, try_turns=False)  # SIFT finds the heading by itself
         # A wrong attitude displaces the peak; refinement, which measures it, leads back.
         refined = at_once or self.ncc.refine(query, first)
-        second = self._second(query, refined)
+        if isinstance(refined, Fix) and refined.stage == "refined":
+            first = refined
+        second = self._second(query, first if isinstance(refined, Fix) else refined)
         if isinstance(first, NoFix):
             if isinstance(second, Fix):
                 return second
@@ -82,8 +85,6 @@ class Auto(Method):
             return replace(first if second.reason is Reason.LATE else second, candidates=both)
         if isinstance(second, NoFix):
             return refined
-        if isinstance(refined, Fix) and refined.stage == "refined":
-            first = refined
         apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
         if not are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2):
             if float(np.hypot(*apart_m)) < self.ncc.options.rule.exclusion_m:
@@ -103,13 +104,20 @@ class Auto(Method):
             if not isinstance(first, Fix):
                 return self.sift.locate(query)
             with query.scheduler.with_fix():
-                return self.sift.confirm(query)
+                return self.sift.confirm(query, partial(_agree, first))
         except OutOfTime:
             return query.refuse(Reason.LATE, "the budget was spent before there was a second fix", "sift")
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
+
+
+def _agree(first: Fix, second: Fix) -> bool:
+    """Whether two fixes are of one place and height, by their covariances."""
+    apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+    covariance_m2 = first.relative_covariance_m2 + second.relative_covariance_m2
+    return are_consistent(apart_m, covariance_m2) and _agree_in_height(first, second)
 
 
 def _agree_in_height(first: Fix, second: Fix) -> bool:

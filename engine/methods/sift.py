@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from engine.align import SIDE_STEP_PX
@@ -102,10 +102,18 @@ class Sift(Method):
         has_failed = refined is not None and refined.stage != "refined"
         return self._refined(query, result) if isinstance(result, Fix) and is_fine and not has_failed else result
 
-    def confirm(self, query: Query) -> Result:
-        """A fix to compare with that of another method: not refined by the grey levels that the other goes by."""
+    def confirm(self, query: Query, agrees: Callable[[Fix], bool]) -> Result:
+        """A fix to compare with that of another method: not refined by the grey levels that the other goes by.
+
+        Args:
+            query: the frame.
+            agrees: whether a fix agrees with the other method's. One by few features that does not is replaced by
+                one of all.
+        """
         few = self._by_few_features(query, {})
-        return few if few is not None and self._is_certain(few) else self._by_all_features(query)
+        if few is not None and self._is_certain(few) and agrees(few):
+            return few
+        return self._by_all_features(query)
 
     def _by_few_features(self, query: Query, following: Mapping[str, float]) -> Fix | None:
         """A fix by half as many keypoints, a level coarser and not doubled; None where that is not accepted.

@@ -27,7 +27,7 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
     frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
     own, compared = Ncc.correlate, Sift.confirm
     seen = []
-    monkeypatch.setattr(Sift, "confirm", lambda self, query: seen.append(compared(self, query)) or seen[-1])
+    monkeypatch.setattr(Sift, "confirm", lambda self, *args: seen.append(compared(self, *args)) or seen[-1])
 
     def off(self, query, *args, **kwargs):
         fix = own(self, query, *args, **kwargs)
@@ -45,3 +45,23 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
     else:
         assert isinstance(result, NoFix)
         assert result.reason is Reason.INCONSISTENT
+
+
+def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, camera, monkeypatch):
+    """All of them are; a pose of few, a level coarser, is off by more."""
+    frame, prior = (
+        ground.frame(camera, NADIR, 150.0, heading_deg=20.0, roll_deg=0.0, pitch_deg=0.0),
+        ground.prior(NADIR),
+    )
+    few = Sift._by_few_features
+    matcher = SceneMatcher(site, camera, "auto", "cpu")
+    expected = matcher.locate(frame, prior)
+
+    def off(self, query, following):
+        fix = few(self, query, following)
+        return replace(fix, north_m=fix.north_m + 4.0, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+
+    monkeypatch.setattr(Sift, "_by_few_features", off)
+    result = matcher.locate(frame, prior)
+    assert result.stage == expected.stage == "verified"
+    assert (result.east_m, result.north_m) == (expected.east_m, expected.north_m)
