@@ -90,17 +90,19 @@ class Sift(Method):
         Few features take a fifth of the time, and refinement makes up for what their pose lacks in accuracy.
         Where it does not, their pose is the fix only if there is no time for all of them.
         """
-        few = self._by_few_features(query, {_REFINEMENT: query.gray.size} if self._has_time(query) else {})
-        refined = None if few is None else self._refined(query, few)
-        if refined is not None and refined.stage == "refined":
-            if self._is_certain(refined) or refined.score >= _CONFIRMED:
+        following = {_REFINEMENT: float(query.gray.size)} if self._has_time(query) else {}
+        few, is_in_vain = self._by_few_features(query, following), False
+        if few is not None:
+            refined = self._refined(query, few)
+            is_in_vain = refined.stage != "refined"
+            if not is_in_vain and (self._is_certain(few) or refined.score >= _CONFIRMED):
                 return refined
-        elif refined is not None and self._is_certain(refined) and not self._has_time(query):
-            return replace(refined, stage="coarse")
+            if is_in_vain and self._is_certain(few) and not self._has_time(query):
+                return replace(few, stage="coarse")
         result = self._by_all_features(query)
-        is_fine = isinstance(result, Fix) and result.stage == "fine"
-        has_failed = refined is not None and refined.stage != "refined"
-        return self._refined(query, result) if isinstance(result, Fix) and is_fine and not has_failed else result
+        if is_in_vain or isinstance(result, NoFix) or result.stage == "coarse":
+            return result
+        return self._refined(query, result)
 
     def confirm(self, query: Query, agrees: Callable[[Fix], bool]) -> Result:
         """A fix to compare with that of another method: not refined by the grey levels that the other goes by.
@@ -124,7 +126,9 @@ class Sift(Method):
         """
         works = {_FEW: self._work_px(query)[1.0], **following}
         height_m = query.telemetry.height_agl_m
-        if height_m is None or not self._can_refine(query) or not query.scheduler.can_afford_all(works):
+        if query.prior is None or height_m is None or not self._can_refine(query):
+            return None
+        if not query.scheduler.can_afford_all(works):
             return None
         scale = coarser_scale(query, height_m, self.options.scale)
         if scale is None:
@@ -160,7 +164,7 @@ class Sift(Method):
         if not options.refine or not options.use_attitude or options.matcher is not None:
             return False
         is_known = known.height_agl_m is not None and known.grid_heading_deg is not None and known.has_tilt
-        return is_known and query.prior is not None and query.site.has_surface and not query.frame.is_doubted
+        return is_known and query.site.has_surface and not query.frame.is_doubted
 
     def _refined(self, query: Query, fix: Fix) -> Fix:
         """The fix with its pose refined, where that is possible and affordable."""
