@@ -15,12 +15,13 @@ from engine.confidence import PeakFeatures, PoseFeatures
 from engine.covariance import score_sigma
 from engine.errors import OptionError
 from engine.geo import chi_square
-from engine.values import Peak, Reason, check_positive
+from engine.values import Fix, Peak, Reason, check_positive
 
 Array = NDArray[np.float64]
 
 CONSISTENT_CHI_SQUARE = 13.8
 """Chi-square of the difference of two positions that chance exceeds once in a thousand, two degrees of freedom."""
+_HEIGHT_CHI_SQUARE = 16.0  # of the difference of two heights, one degree of freedom
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,3 +173,17 @@ def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
         bool: False where chance alone would set them so far apart less than once in a thousand.
     """
     return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
+
+
+def agree_in_height(first: Fix, second: Fix) -> bool:
+    """Whether two poses are equally high; refinement may stay at a wrong height that the telemetry holds it to.
+
+    Args:
+        first: one; where it did not measure its height, it agrees with any.
+        second: the other.
+    """
+    if first.up_m is None or second.up_m is None:
+        return True
+    variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
+    variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # one error, of both
+    return (first.up_m - second.up_m) ** 2 <= _HEIGHT_CHI_SQUARE * variance_m2

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.acceptance import are_consistent
+from engine.acceptance import agree_in_height, are_consistent
 from engine.device import Device
 from engine.methods.explanation import Explanation
 from engine.methods.method import Method
@@ -20,8 +20,6 @@ from engine.methods.scheduler import OutOfTime
 from engine.methods.sift import Sift
 from engine.orthomap import OrthoMap
 from engine.values import Fix, NoFix, Reason, Result, Window
-
-_HEIGHT_GATE = 16.0  # chi-square of one degree of freedom
 
 
 class Auto(Method):
@@ -91,7 +89,7 @@ class Auto(Method):
                 return _vaguer(second, apart_m)
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
-        if not _agree_in_height(first, second):
+        if not agree_in_height(first, second):
             return _vaguer(second, apart_m)
         fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
         # Both compare one picture with one map under one prior, so their odds are not multiplied.
@@ -117,16 +115,7 @@ def _agree(first: Fix, second: Fix) -> bool:
     """Whether two fixes are of one place and height, by their covariances."""
     apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
     covariance_m2 = first.relative_covariance_m2 + second.relative_covariance_m2
-    return are_consistent(apart_m, covariance_m2) and _agree_in_height(first, second)
-
-
-def _agree_in_height(first: Fix, second: Fix) -> bool:
-    """Whether two poses are equally high; refinement may stay at a wrong height that the telemetry holds it to."""
-    if first.up_m is None or second.up_m is None:
-        return True
-    variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
-    variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # one error, of both
-    return (first.up_m - second.up_m) ** 2 <= _HEIGHT_GATE * variance_m2
+    return are_consistent(apart_m, covariance_m2) and agree_in_height(first, second)
 
 
 def _vaguer(second: Fix, apart_m: NDArray[np.float64]) -> Fix:

@@ -177,15 +177,8 @@ class Ncc(Method):
             heading_deg = result.attitude.heading_deg
             frame = replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
             query = replace(query, frame=frame)
-        work_px = float(query.gray.size)
-        if not query.scheduler.can_afford("refinement", work_px):
-            query.scheduler.note_refusal("refinement", keeps_cost=True)
-            return result
-        try:
-            with query.scheduler.with_fix(), query.scheduler.costed("refinement", work_px):
-                return Refinement(query, self.samples, self.options).refine(result)
-        except OutOfTime:
-            return result
+        refinement = Refinement(query, self.samples, self.options)
+        return query.scheduler.improved(result, "refinement", float(query.gray.size), refinement.refine)
 
     def _can_refine(self, query: Query) -> bool:
         """Whether poses are refined: a height that was searched for is not the frame's."""

@@ -119,7 +119,8 @@ class SiftOptions:
         use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
             features alone hardly separate a tilt from a displacement.
         min_confidence: probability of :func:`engine.confidence.probability` below which a pose is not accepted.
-        null_test_below: confidence below which the pose must also beat the null hypothesis, its frame mirrored.
+        null_test_below: confidence below which the pose must also beat the null hypothesis, its frame mirrored, or
+            be confirmed by the refinement with a high correlation.
         refine: refine the pose densely after PnP, where height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
         errors: what is assumed of the telemetry and the map.

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.acceptance import are_consistent
+from engine.acceptance import agree_in_height, are_consistent
 from engine.align import shrink
 from engine.covariance import tilt_covariance
 from engine.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, correlation_at, covariance_of, refine
@@ -32,13 +32,18 @@ _TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes where th
 # wrong ones 0.32; with it true poses over a town in snow reached 0.29.
 _MIN_CORRELATION_WITHOUT_TILT = 0.45
 _MIN_CORRELATION = 0.2
-# At once, where no coarser level leads to the pose: by day the frames of three simulated flights reached 0.8 and
-# more, in the evening on a map of noon half of them 0.6, and a wrong pose under a wrong tilt 0.34.
-_MIN_CORRELATION_AT_ONCE = 0.45
-# Tilt that may be wrong where the picture does not confirm the pose: under angles that are off by 1.5 degrees half
-# of the frames of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; under
-# right ones each was confirmed.
-_UNCONFIRMED_TILT_DEG = 1.5
+MIN_CORRELATION_AT_ONCE = 0.45
+"""Least correlation at once, where no coarser level leads to the pose.
+
+By day the frames of three simulated flights reached 0.8 and more, in the evening on a map of noon half of them
+0.6, and a wrong pose under a wrong tilt 0.34.
+"""
+UNCONFIRMED_TILT_DEG = 1.5
+"""Tilt that may be wrong where the picture does not confirm the pose.
+
+Under angles that are off by 1.5 degrees half of the frames of a simulated flight were not confirmed, and their
+peaks were up to 7.6 m off at 150 m; under right ones each was confirmed.
+"""
 # Standard deviations of an attitude that the picture does not confirm.
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
@@ -79,7 +84,7 @@ class Refinement:
             return fix
         if has_tilt:
             assert query.telemetry.height_agl_m is not None
-            doubt_m = query.telemetry.height_agl_m * math.radians(_UNCONFIRMED_TILT_DEG)
+            doubt_m = query.telemetry.height_agl_m * math.radians(UNCONFIRMED_TILT_DEG)
             return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
@@ -89,13 +94,10 @@ class Refinement:
         prior = self._prior(fix)
         return self._refined(fix, prior, self._at_once(prior))
 
-    def refine_pose(self, fix: Fix) -> Fix | None:
-        """The fix of a pose by features refined, from one level coarser where that is necessary; None if it fails.
-
-        Features displace no peak: where the picture does not confirm the telemetry, their pose stands.
-        """
+    def refine_from_coarser(self, fix: Fix) -> Fix | None:
+        """The same from a level above the frame's own, where a few pixels reach farther."""
         prior = self._prior(fix)
-        return self._refined(fix, prior, self._at_once(prior) or self._through_levels(prior, _COARSER))
+        return self._refined(fix, prior, self._through_levels(prior, _COARSER))
 
     def _doubting(self) -> Refinement:
         """The same, of a frame whose attitude is hardly known."""
@@ -143,7 +145,8 @@ class Refinement:
             allowed_m2 += (height_m * math.radians(errors.tilt_deg)) ** 2 * np.eye(2)
         if not are_consistent(moved, allowed_m2):
             return None
-        return self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
+        refined = self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
+        return refined if agree_in_height(fix, refined) else None
 
     @property
     def _knows_tilt(self) -> bool:
@@ -154,7 +157,7 @@ class Refinement:
         return self._knows_tilt and not self.query.site.has_surface
 
     def _at_once(self, prior: GaussianPrior) -> DenseFit | None:
-        return self._through_levels(prior, 0, _MIN_CORRELATION_AT_ONCE)
+        return self._through_levels(prior, 0, MIN_CORRELATION_AT_ONCE)
 
     def _through_levels(
         self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None

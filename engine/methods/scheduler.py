@@ -15,7 +15,7 @@ from engine.budget import Deadline
 from engine.device import Device, synchronise
 from engine.methods.costs import Costs
 from engine.methods.preemption import thread_usage, waited_ms
-from engine.values import Timings
+from engine.values import Fix, Timings
 
 _T = TypeVar("_T")
 
@@ -80,6 +80,17 @@ class Scheduler:
             yield
         finally:
             self._has_fix = False
+
+    def improved(self, fix: Fix, step: str, work: float, improve: Callable[[Fix], _T]) -> Fix | _T:
+        """What a step makes of a fix that is there already; the fix itself where there is no time for the step."""
+        if not self.can_afford(step, work):
+            self.note_refusal(step, keeps_cost=True)
+            return fix
+        try:
+            with self.with_fix(), self.costed(step, work):
+                return improve(fix)
+        except OutOfTime:
+            return fix
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable
 from dataclasses import replace
+
+import numpy as np
 
 from engine.align import SIDE_STEP_PX
 from engine.device import Device
@@ -16,7 +19,7 @@ from engine.methods.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseC
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
-from engine.methods.refinement import Refinement
+from engine.methods.refinement import MIN_CORRELATION_AT_ONCE, UNCONFIRMED_TILT_DEG, Refinement
 from engine.methods.scheduler import OutOfTime
 from engine.methods.views import coarser_scale
 from engine.orthomap import OrthoMap
@@ -25,8 +28,6 @@ from engine.values import Fix, NoFix, Reason, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
 _FEW_SHARE = 0.5  # of the keypoints, where a pose is refined from few
-# Correlation at a refined pose that takes the place of the null hypothesis, as where NCC refines at once.
-_CONFIRMED = 0.45
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
 
@@ -72,12 +73,13 @@ class Sift(Method):
         # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
         longest_px = 3 * max(query.gray.shape)
         prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), torch.device(query.device))
-        self._by_few_features(query, {})
+        self._by_few_features(query)
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed("sift", work_px):
                 result = self._at_scale(query, share)
-            if isinstance(result, Fix):
+            if isinstance(result, Fix) and self._can_refine(query):
                 self._refined(query, result)
+                Refinement(query, self.samples, self._enhancement).refine_from_coarser(result)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map."""
@@ -88,21 +90,17 @@ class Sift(Method):
         """A refined fix by few features, else one by all at the highest resolution that there is time for.
 
         Few features take a fifth of the time, and refinement makes up for what their pose lacks in accuracy.
-        Where it does not, their pose is the fix only if there is no time for all of them.
         """
-        following = {_REFINEMENT: float(query.gray.size)} if self._has_time(query) else {}
-        few, is_in_vain = self._by_few_features(query, following), False
-        if few is not None:
-            refined = self._refined(query, few)
-            is_in_vain = refined.stage != "refined"
-            if not is_in_vain and (self._is_certain(few) or refined.score >= _CONFIRMED):
-                return refined
-            if is_in_vain and self._is_certain(few) and not self._has_time(query):
-                return replace(few, stage="coarse")
-        result = self._by_all_features(query)
-        if is_in_vain or isinstance(result, NoFix) or result.stage == "coarse":
-            return result
-        return self._refined(query, result)
+        few = self._by_few_features(query)
+        if few is None:
+            result = self._by_all_features(query)
+            return self._refined(query, result) if isinstance(result, Fix) else result
+        refined = self._refined(query, few)
+        is_refined, is_certain = refined.stage == "refined", self._is_certain(few)
+        if is_refined and (is_certain or refined.score >= MIN_CORRELATION_AT_ONCE):
+            return refined
+        result = self._by_all_after(query, few) if is_certain else self._by_all_features(query)
+        return self._refined(query, result) if is_refined and isinstance(result, Fix) else result
 
     def confirm(self, query: Query, agrees: Callable[[Fix], bool]) -> Result:
         """A fix to compare with that of another method: not refined by the grey levels that the other goes by.
@@ -112,35 +110,58 @@ class Sift(Method):
             agrees: whether a fix agrees with the other method's. One by few features that does not is replaced by
                 one of all.
         """
-        few = self._by_few_features(query, {})
+        few = self._by_few_features(query)
         if few is not None and self._is_certain(few) and agrees(few):
             return few
         return self._by_all_features(query)
 
-    def _by_few_features(self, query: Query, following: Mapping[str, float]) -> Fix | None:
-        """A fix by half as many keypoints, a level coarser and not doubled; None where that is not accepted.
-
-        Args:
-            query: the frame.
-            following: work of the steps after it, for which there must be time as well.
-        """
-        works = {_FEW: self._work_px(query)[1.0], **following}
-        height_m = query.telemetry.height_agl_m
-        if query.prior is None or height_m is None or not self._can_refine(query):
+    def _by_few_features(self, query: Query) -> Fix | None:
+        """A fix by half as many keypoints, a level coarser and not doubled; None where that is not accepted."""
+        scale = self._few_scale(query)
+        if scale is None or not self._has_time_for_few(query):
             return None
-        if not query.scheduler.can_afford_all(works):
-            return None
-        scale = coarser_scale(query, height_m, self.options.scale)
-        if scale is None:
-            return None
-        with query.scheduler.costed(_FEW, works[_FEW]):
+        with query.scheduler.costed(_FEW, self._work_px(query)[1.0]):
             found = FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
         return None if isinstance(found, NoFix) or found.confidence < self.options.min_confidence else found.fix
+
+    def _few_scale(self, query: Query) -> float | None:
+        """The scale of the frame at which few features are sought; None where it is not asked or the map ends."""
+        height_m = query.telemetry.height_agl_m
+        if query.prior is None or height_m is None or not self.options.upright or not self._can_refine(query):
+            return None
+        return coarser_scale(query, height_m, self.options.scale)
+
+    def _has_time_for_few(self, query: Query) -> bool:
+        """Whether there is time for few features first and then for all of them, or only for few."""
+        scheduler, works = query.scheduler, self._work_px(query)
+        if scheduler.can_afford_all({_FEW: works[1.0], "sift": min(works.values())}):
+            return True
+        if scheduler.first_affordable("sift", works) is None and scheduler.can_afford(_FEW, works[1.0]):
+            return True
+        scheduler.note_refusal(_FEW)
+        return False
 
     def _is_certain(self, fix: Fix) -> bool:
         """Whether a pose is so probable that no null hypothesis is asked."""
         assert fix.confidence is not None  # each pose has one
         return fix.confidence >= self.options.null_test_below
+
+    def _by_all_after(self, query: Query, few: Fix) -> Result:
+        """A fix by all features, or that of few where there is no time: its covariance for a tilt that is wrong.
+
+        Few features of a coarse picture follow the telemetry's attitude, which nothing has confirmed.
+        """
+        try:
+            with query.scheduler.with_fix():
+                result = self._by_all_features(query)
+        except OutOfTime:
+            result = query.refuse_late(METHOD, "sift")
+        if isinstance(result, Fix) or result.reason is not Reason.LATE:
+            return result
+        assert query.telemetry.height_agl_m is not None  # or few features had not been sought
+        doubt_m = query.telemetry.height_agl_m * math.radians(UNCONFIRMED_TILT_DEG)
+        covariance_m2 = few.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0])
+        return replace(few, covariance_m2=covariance_m2, stage="coarse")
 
     def _by_all_features(self, query: Query) -> Result:
         """A fix by all keypoints, not refined, at the highest resolution of the frame that there is time for."""
@@ -154,10 +175,6 @@ class Sift(Method):
         with query.scheduler.costed(step, works[share]):
             return self._at_scale(query, share)
 
-    def _has_time(self, query: Query) -> bool:
-        """Whether there is time for all features, at some resolution."""
-        return query.scheduler.first_affordable("sift", self._work_px(query)) is not None
-
     def _can_refine(self, query: Query) -> bool:
         """Whether poses are refined: by a telemetry that is trusted, over a surface model."""
         options, known = self.options, query.telemetry
@@ -168,18 +185,14 @@ class Sift(Method):
 
     def _refined(self, query: Query, fix: Fix) -> Fix:
         """The fix with its pose refined, where that is possible and affordable."""
-        work_px = float(query.gray.size)
         if not self._can_refine(query):
             return fix
-        if not query.scheduler.can_afford(_REFINEMENT, work_px):
-            query.scheduler.note_refusal(_REFINEMENT, keeps_cost=True)
-            return fix
         refinement = Refinement(query, self.samples, self._enhancement)
-        try:
-            with query.scheduler.with_fix(), query.scheduler.costed(_REFINEMENT, work_px):
-                return refinement.refine_pose(fix) or fix
-        except OutOfTime:
-            return fix
+
+        def improve(fix: Fix) -> Fix:
+            return refinement.refine_at_once(fix) or refinement.refine_from_coarser(fix) or fix
+
+        return query.scheduler.improved(fix, _REFINEMENT, float(query.gray.size), improve)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

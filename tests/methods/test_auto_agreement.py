@@ -57,8 +57,8 @@ def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, cam
     matcher = SceneMatcher(site, camera, "auto", "cpu")
     expected = matcher.locate(frame, prior)
 
-    def off(self, query, following):
-        fix = few(self, query, following)
+    def off(self, query):
+        fix = few(self, query)
         return replace(fix, north_m=fix.north_m + 4.0, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
 
     monkeypatch.setattr(Sift, "_by_few_features", off)

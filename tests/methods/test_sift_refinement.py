@@ -87,7 +87,8 @@ def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypa
 def test_where_refinement_fails_all_features_give_the_pose(ground, camera, matcher, plain, monkeypatch):
     frame, prior = shot(ground, camera), ground.prior(NADIR)
     expected = plain.locate(frame, prior)
-    monkeypatch.setattr(Refinement, "refine_pose", lambda _self, _fix: None)
+    for name in ("refine_at_once", "refine_from_coarser"):
+        monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
     fix = matcher.locate(frame, prior)
     assert fix.stage == "fine"
     assert (fix.east_m, fix.north_m, fix.up_m) == (expected.east_m, expected.north_m, expected.up_m)
@@ -98,7 +99,7 @@ def test_a_refinement_that_is_abandoned_leaves_the_fix(ground, camera, matcher, 
     def out_of_time(_self, _fix):
         raise OutOfTime
 
-    monkeypatch.setattr(Refinement, "refine_pose", out_of_time)
+    monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
     fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
     assert isinstance(fix, Fix)
     assert fix.stage == "fine"
@@ -147,12 +148,86 @@ def test_foreign_ground_is_refused_as_before(ground, camera, matcher):
     assert result.reason in (Reason.BAD_POSE, Reason.TOO_FEW_MATCHES, Reason.AMBIGUOUS)
 
 
-def test_no_frame_but_the_first_samples_the_map(ground, camera, matcher):
-    frame, prior = shot(ground, camera), ground.prior(NADIR)
-    matcher.locate(frame, prior)
+@pytest.mark.parametrize("heading_off_deg", [0.0, 6.0])
+def test_after_the_warm_up_nothing_is_prepared_in_flight(ground, site, camera, heading_off_deg):
+    """Also where refinement has to begin on a coarser level."""
+    matcher = SceneMatcher(site, camera, "sift", "cpu")
+    matcher.warmup()
     before = dict(matcher.cache_counters)
-    matcher.locate(frame, prior)
+    frame = shot(ground, camera)
+    matcher.locate(replace(frame, heading_deg=frame.heading_deg + heading_off_deg), ground.prior(NADIR))
     assert matcher.cache_counters == before
+
+
+@pytest.mark.parametrize("wrong", [{"roll_deg": 5.0}, {"pitch_deg": 0.0}], ids=str)
+def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site, camera, wrong, monkeypatch):
+    """There is time for nothing else; a tilt that is off by 2 degrees displaces them by metres."""
+    matcher = SceneMatcher(site, camera, "sift", "cpu")
+    matcher._costs = FixedCosts()
+    matcher._costs.upper_bound_ms = lambda step, work: 0.0 if step == "sift by few features" else 1e9
+    chi_squares = []
+    for place in PLACES:
+        frame = replace(shot(ground, camera, place), **wrong)
+        fix = matcher.locate(frame, ground.prior(place), Budget(total_ms=1000.0))
+        assert isinstance(fix, Fix)
+        assert fix.stage == "coarse"
+        off_m = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(place)
+        chi_squares.append(off_m @ np.linalg.solve(fix.covariance_m2[:2, :2], off_m))
+    assert np.mean(chi_squares) / 2.0 < 2.0
+
+
+def costs_of(**ms):
+    """Costs by step, whatever the work."""
+    costs = FixedCosts()
+    costs.upper_bound_ms = lambda step, work: ms.get(step.replace(" ", "_"), 0.0)
+    return costs
+
+
+def test_few_features_leave_the_time_for_all(ground, camera, site, monkeypatch):
+    """A frame whose few features may fail is not lost to them: with time for one of both it is all features'."""
+    matcher, tried = SceneMatcher(site, camera, "sift", "cpu"), []
+    matcher._costs = costs_of(sift_by_few_features=600.0, sift=1000.0)
+    honest = FeatureMatcher.find_at_once
+    monkeypatch.setattr(FeatureMatcher, "find_at_once", lambda self: tried.append(self) or honest(self))
+    for total_ms, few in ((1300.0, 0), (1700.0, 1), (800.0, 1)):
+        tried.clear()
+        assert isinstance(
+            matcher.locate(shot(ground, camera), ground.prior(NADIR), Budget(total_ms=total_ms)), Fix
+        )
+        assert len(tried) == few
+
+
+def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, matcher, monkeypatch):
+    def out_of_time(_self, _query):
+        raise OutOfTime
+
+    for name in ("refine_at_once", "refine_from_coarser"):
+        monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
+    monkeypatch.setattr(Sift, "_by_all_features", out_of_time)
+    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
+    assert isinstance(fix, Fix)
+    assert fix.stage == "coarse"
+
+
+def test_few_features_that_were_too_dear_once_are_tried_again(ground, camera, site):
+    matcher = SceneMatcher(site, camera, "sift", "cpu")
+    matcher.warmup()
+    dear_ms = 40.0 * matcher._costs.upper_bound_ms("sift", ground.gray.size)
+    matcher._costs._models["sift by few features"].ms *= 1e3
+    frame, prior = shot(ground, camera), ground.prior(NADIR)
+    before_ms = matcher._costs.upper_bound_ms("sift by few features", frame.image[..., 0].size)
+    for _ in range(10):
+        matcher.locate(frame, prior, Budget(total_ms=min(dear_ms, before_ms / 2.0)))
+    after_ms = matcher._costs.upper_bound_ms("sift by few features", frame.image[..., 0].size)
+    assert after_ms < before_ms
+
+
+def test_a_pose_refined_to_another_height_is_not_taken(ground, camera, matcher, plain):
+    """Refinement is held to the telemetry's height, the features measure their own."""
+    frame = replace(shot(ground, camera), height_agl_m=162.0)
+    fix, by_features = (one.locate(frame, ground.prior(NADIR)) for one in (matcher, plain))
+    sigma_m = np.sqrt(fix.covariance_m2[2, 2] + by_features.covariance_m2[2, 2])
+    assert abs(fix.up_m - by_features.up_m) < 4.0 * sigma_m
 
 
 def test_upsampling_is_once_or_twice():
