@@ -185,9 +185,9 @@ def sigmas_off(ground, fix):
 def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
     """Each error of the telemetry alone moves the fix of the peak by a metre; the picture knows better."""
     true = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0)
-    told = replace(true, roll_deg=3.5, pitch_deg=-2.4, heading_deg=26.0, height_agl_m=152.0)
-    peak = located(flat_site, camera, told, ground.prior(NADIR), refine=False)
-    fix = located(flat_site, camera, told, ground.prior(NADIR))
+    stated = replace(true, roll_deg=3.5, pitch_deg=-2.4, heading_deg=26.0, height_agl_m=152.0)
+    peak = located(flat_site, camera, stated, ground.prior(NADIR), refine=False)
+    fix = located(flat_site, camera, stated, ground.prior(NADIR))
     assert (peak.stage, peak.up_m, fix.stage, fix.method) == ("fine", None, "refined", "ncc")
     assert np.hypot(*sigmas_off(ground, peak)[0]) > 1.0
     assert np.hypot(*sigmas_off(ground, fix)[0]) < 0.15
@@ -201,8 +201,8 @@ def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
 
 def test_without_a_surface_model_the_covariance_stays_as_wide_as_the_tilt_is_doubtful(ground, camera):
     true = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0)
-    told = replace(true, roll_deg=3.4, pitch_deg=-2.3)
-    fix = located(ground.site, camera, told, ground.prior(NADIR))
+    stated = replace(true, roll_deg=3.4, pitch_deg=-2.3)
+    fix = located(ground.site, camera, stated, ground.prior(NADIR))
     assert fix.sigma_m > 0.7 * HEIGHT_M * np.tan(np.radians(0.5))
     assert sigmas_off(ground, fix)[1] < 9.0
 

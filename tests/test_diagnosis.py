@@ -254,6 +254,8 @@ def test_heights_that_are_coarse_are_not_wrong():
     poses = [replace(one, height_agl_m=120.0 + 4.0 * (-1) ** k) for k, one in enumerate(seen(outliers=0))]
     assert findings(series(height_m=np.full(N, 116.5)), poses, 1.0) == []
     assert [f.cause for f in findings(series(height_m=np.full(N, 110.0)), poses, 1.0)] == ["height"]
+    exact = [replace(one, height_agl_m=120.0) for one in poses]
+    assert [f.cause for f in findings(series(height_m=np.full(N, 115.8)), exact, 1.0)] == ["height"]
 
 
 def test_positions_of_what_the_middle_shows_are_no_shifted_map():

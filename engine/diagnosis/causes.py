@@ -28,8 +28,8 @@ _GAIN, _GAIN_SHARE = 0.6, 0.5  # by which a change must lessen it, the lesser of
 _PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
 _LEAST = 3
 _ANGLES = ("roll", "pitch", "heading")
-# Of a height; a smaller offset is named only where single pictures contradict the height.
-_LEAST_HEIGHT_SHARE = 0.04
+# An offset below both, in shares of the height and in sigmas, is named only where single pictures contradict it.
+_LEAST_HEIGHT_SHARE, _LEAST_HEIGHT_SIGMAS = 0.04, 5.0
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
 IN_CALIBRATION = " in the calibration"
@@ -254,14 +254,14 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
 
     off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
     by_offset, by_factor = cost(height + off_m), cost(height * factor)
-    is_small = abs(off_m) < _LEAST_HEIGHT_SHARE * float(np.median(measured))
+    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
+    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
+    is_small = abs(off_m) < min(_LEAST_HEIGHT_SHARE * float(np.median(measured)), _LEAST_HEIGHT_SIGMAS * sigma_m)
     if cost(height) < _MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
         return None
     if min(by_offset, by_factor) > cost(height) - _GAIN:
         text = "the height does not fit the pictures, and no offset or factor would make it"
         return Finding("height", text, "look at the telemetry's height")
-    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
-    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
     if abs(factor / _FEET - 1.0) < 0.04:
         text = "the height is in feet"
         return Finding("height_feet", text, '--column "height_agl_m=0.3048*height_agl_m"', factor)
