@@ -104,8 +104,8 @@ def test_a_probability_of_98_is_refused(name):
 def test_what_is_assumed_of_telemetry_is_said_in_one_place():
     errors = AssumedErrors(height_m=3.0, height_share=0.04, tilt_deg=0.5, unknown_tilt_deg=4.0)
     assert errors.height_sigma_m(100.0) == pytest.approx(5.0)
-    told = {(None, None): (4.0, 4.0), (1.0, None): (0.5, 4.0), (None, 1.0): (4.0, 0.5), (0.0, 0.0): (0.5, 0.5)}
-    for (roll, pitch), sigmas in told.items():
+    stated = {(None, None): (4.0, 4.0), (1.0, None): (0.5, 4.0), (None, 1.0): (4.0, 0.5), (0.0, 0.0): (0.5, 0.5)}
+    for (roll, pitch), sigmas in stated.items():
         assert errors.tilts_deg(GridPose(100.0, 0.0, roll, pitch)) == sigmas
 
 
@@ -216,13 +216,13 @@ def test_a_fix_by_correlation_needs_height_and_heading():
 
 def test_a_turned_patch_pulls_its_peak_only_where_its_parts_come_apart():
     """By hand: what 240 x 320 px move by when turned by 1 degree, against a peak 0.8 / 0.02 = 40 px^2 wide."""
-    told = AssumedErrors(heading_deg=1.0, height_m=1e-9, height_share=1e-9)
+    stated = AssumedErrors(heading_deg=1.0, height_m=1e-9, height_share=1e-9)
     apart = math.radians(1.0) ** 2 * (240**2 + 320**2) / 24.0
-    pull = misalignment_covariance_px2(peak(0.8), (240, 320), 150.0, told)
+    pull = misalignment_covariance_px2(peak(0.8), (240, 320), 150.0, stated)
     np.testing.assert_allclose(pull, apart**2 / (apart + 40.0) * np.eye(2), rtol=1e-9)
-    sharp = misalignment_covariance_px2(peak(0.8, bend=((-80.0, 0.0), (0.0, -80.0))), (240, 320), 150.0, told)
+    sharp = misalignment_covariance_px2(peak(0.8, bend=((-80.0, 0.0), (0.0, -80.0))), (240, 320), 150.0, stated)
     assert sharp[0, 0] == pytest.approx(apart, rel=0.01)  # the parts cannot agree: anywhere between them
-    assert misalignment_covariance_px2(peak(0.8), (24, 32), 150.0, told)[0, 0] < 1e-3 * pull[0, 0]
+    assert misalignment_covariance_px2(peak(0.8), (24, 32), 150.0, stated)[0, 0] < 1e-3 * pull[0, 0]
 
 
 def test_what_a_map_says_of_itself_counts_more_than_what_is_assumed_of_any():
@@ -232,5 +232,5 @@ def test_what_a_map_says_of_itself_counts_more_than_what_is_assumed_of_any():
     frank = OrthoMap.from_arrays(gray, grid, "EPSG:32633", georeference_sigma_m=0.05, slope_sigma_deg=0.02)
     assumed = AssumedErrors(map_m=0.7, tilt_deg=0.2)
     assert with_map_accuracy(silent, assumed) == assumed
-    told = with_map_accuracy(frank, assumed)
-    assert (told.map_m, told.surface_slope_deg, told.tilt_deg) == (0.05, 0.02, 0.2)
+    stated = with_map_accuracy(frank, assumed)
+    assert (stated.map_m, stated.surface_slope_deg, stated.tilt_deg) == (0.05, 0.02, 0.2)

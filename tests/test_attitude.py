@@ -26,8 +26,10 @@ def flight(*, lag_s=0.0, offset_deg=(0.0, 0.0), interval_s=0.1, size=1.0, every=
         time_s = k * interval_s
         stamp = int(time_s * 1e9)
         roll, pitch = (size * angle for angle in swing(time_s))
-        told = [size * a + o + rng.normal(0, 0.1) for a, o in zip(swing(time_s - lag_s), offset_deg, strict=True)]
-        frame = Frame(PICTURE, stamp, 100.0, 0.0, *told)
+        stated = [
+            size * a + o + rng.normal(0, 0.1) for a, o in zip(swing(time_s - lag_s), offset_deg, strict=True)
+        ]
+        frame = Frame(PICTURE, stamp, 100.0, 0.0, *stated)
         if k % every:
             rows.append(attitude_row(frame, NoFix(reason=Reason.AMBIGUOUS)))
             continue

@@ -136,7 +136,7 @@ def test_what_neighbours_share_widens_the_covariance(scene, camera):
 def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, flat_site):
     prepared = PreparedMap(flat_site, torch.device("cpu"), radius_px=12)
     window = Window(100, 120, 200, 160)
-    found = SampleMap(flat_site, prepared).find(window, 0)
+    found = SampleMap(flat_site, prepared.enhanced).find(window, 0)
     picture = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image
     for axis, step in enumerate(np.eye(2) * flat_site.gsd_m_per_px):
         at = [flat_site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
@@ -185,9 +185,9 @@ def sigmas_off(ground, fix):
 def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
     """Each error of the telemetry alone moves the fix of the peak by a metre; the picture knows better."""
     true = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0)
-    told = replace(true, roll_deg=3.5, pitch_deg=-2.4, heading_deg=26.0, height_agl_m=152.0)
-    peak = located(flat_site, camera, told, ground.prior(NADIR), refine=False)
-    fix = located(flat_site, camera, told, ground.prior(NADIR))
+    stated = replace(true, roll_deg=3.5, pitch_deg=-2.4, heading_deg=26.0, height_agl_m=152.0)
+    peak = located(flat_site, camera, stated, ground.prior(NADIR), refine=False)
+    fix = located(flat_site, camera, stated, ground.prior(NADIR))
     assert (peak.stage, peak.up_m, fix.stage, fix.method) == ("fine", None, "refined", "ncc")
     assert np.hypot(*sigmas_off(ground, peak)[0]) > 1.0
     assert np.hypot(*sigmas_off(ground, fix)[0]) < 0.15
@@ -201,8 +201,8 @@ def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
 
 def test_without_a_surface_model_the_covariance_stays_as_wide_as_the_tilt_is_doubtful(ground, camera):
     true = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0)
-    told = replace(true, roll_deg=3.4, pitch_deg=-2.3)
-    fix = located(ground.site, camera, told, ground.prior(NADIR))
+    stated = replace(true, roll_deg=3.4, pitch_deg=-2.3)
+    fix = located(ground.site, camera, stated, ground.prior(NADIR))
     assert fix.sigma_m > 0.7 * HEIGHT_M * np.tan(np.radians(0.5))
     assert sigmas_off(ground, fix)[1] < 9.0
 
@@ -278,7 +278,7 @@ def test_a_tilt_that_nobody_tells_is_refused_and_not_guessed(ground, flat_site, 
 
 def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(flat_site):
     prepared = PreparedMap(flat_site, torch.device("cpu"), 8)
-    samples = SampleMap(flat_site, prepared)
+    samples = SampleMap(flat_site, prepared.enhanced)
     window = Window(100, 60, 200, 160)
     first, second = samples.find(window, 0), samples.find(window, 0)
     assert samples.created == 1
@@ -296,7 +296,9 @@ def test_rough_ground_counts_less(ground):
     heights = np.zeros(ground.gray.shape, np.float32)
     heights[200:260, 200:260] = 12.0
     site = OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=heights)
-    samples = SampleMap(site, PreparedMap(site, torch.device("cpu"), 8)).find(Window(160, 160, 140, 140), 0)
+    samples = SampleMap(site, PreparedMap(site, torch.device("cpu"), 8).enhanced).find(
+        Window(160, 160, 140, 140), 0
+    )
     x, y = site.pixel_from_enu(samples.points_m[:, :2]).T
     wall = (np.minimum(abs(x - 199.5), abs(x - 259.5)) < 1.0) & (y > 203) & (y < 256)
     level = (np.abs(x - 230) > 34) | (np.abs(y - 230) > 34)

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from engine.camera import mount_rotation
-from engine.diagnosis import diagnose
+from engine.diagnosis import Diagnosis, diagnose
 from engine.diagnosis.causes import findings, is_known
+from engine.diagnosis.contradictions import contradictions
 from engine.diagnosis.findings import TelemetrySeries
 from engine.diagnosis.sightings import Sighting
 from engine.geo import attitude_from_rotation, enu_from_body
+from engine.runs.checking import as_rows
 from engine.sim import plan_flight
 from engine.values import Attitude, Prior
 from tests.support.towns import drawn_town, site_of
@@ -205,3 +207,65 @@ def test_pictures_say_it_by_themselves():
     assert "frozen" in [
         found.cause for found in diagnose(still, still.__getitem__, site, camera, start=start).findings
     ]
+
+
+def radians_near_north(turning):
+    """Headings in radians, at so many of the sixteen sightings far from north; with the poses."""
+    true = np.full(N, 2.0)
+    true[0 : 5 * turning] = 80.0
+    poses = [
+        replace(one, attitude=replace(one.attitude, heading_deg=float(true[one.index] + RNG.normal(0.0, 0.5))))
+        for one in seen(outliers=0)
+    ]
+    return series(angles_deg=np.column_stack([ANGLES[:, :2], np.radians(true)])), poses
+
+
+@pytest.mark.parametrize("turning", [3, 6, 9, 13])
+def test_headings_in_radians_are_named_where_most_of_them_are_near_north(turning):
+    wrong, poses = radians_near_north(turning)
+    (found,) = findings(wrong, poses, 1.0)
+    assert (found.cause, found.cure) == ("radians", '--column "heading_deg=57.29578*heading_deg"')
+    counted = {one.field: (one.pictures, one.compared) for one in contradictions(wrong, poses)}
+    assert counted == {"roll": (0, 16), "pitch": (0, 16), "heading": (turning, 16), "height": (0, 16),
+                       "velocity": (0, 15)}  # fmt: skip
+
+
+def test_the_share_that_contradicts_and_the_field_are_said():
+    wrong, poses = radians_near_north(6)
+    found = Diagnosis(findings(wrong, poses, 1.0), 16, 16, is_known(wrong, poses), contradictions(wrong, poses))
+    assert as_rows(found)[-1][1].endswith("; 6 of 16 (38%) contradict the heading")
+    wrong, poses = radians_near_north(1)  # one picture may be placed wrong
+    found = Diagnosis(findings(wrong, poses, 1.0), 16, 16, is_known(wrong, poses), contradictions(wrong, poses))
+    assert found.findings == []
+    assert as_rows(found)[-1][1].endswith("they fit what is said of attitude, height, velocity, but 1 of 16 (6%) "
+                                          "contradicts the heading")  # fmt: skip
+
+
+def test_a_field_that_no_change_mends_is_suspected_by_its_name():
+    headings = ANGLES[:, 2].copy()
+    headings[::4] = RNG.uniform(0.0, 360.0, len(headings[::4]))
+    (found,) = findings(series(angles_deg=np.column_stack([ANGLES[:, :2], headings])), seen(outliers=0), 1.0)
+    assert found.cause == "attitude"
+    assert found.text.startswith("heading of the telemetry and of the pictures differ")
+
+
+def test_heights_that_are_coarse_are_not_wrong():
+    """Steps of 5 m with an offset below 4 %, which no single picture contradicts."""
+    poses = [replace(one, height_agl_m=120.0 + 4.0 * (-1) ** k) for k, one in enumerate(seen(outliers=0))]
+    assert findings(series(height_m=np.full(N, 116.5)), poses, 1.0) == []
+    assert [f.cause for f in findings(series(height_m=np.full(N, 110.0)), poses, 1.0)] == ["height"]
+    exact = [replace(one, height_agl_m=120.0) for one in poses]
+    assert [f.cause for f in findings(series(height_m=np.full(N, 115.8)), exact, 1.0)] == ["height"]
+
+
+def test_positions_of_what_the_middle_shows_are_no_shifted_map():
+    """Of a camera that is tilted, where the telemetry knows of no tilt."""
+    tilted = [replace(one, attitude=Attitude(5.0, 0.0, 0.0)) for one in seen(outliers=0)]
+    shown = PLACES + np.array(
+        [-120.0 * np.tan(np.radians(5.0)), 0.0]
+    )  # right side down: the nadir camera looks left
+    angles = np.column_stack([np.full((N, 2), np.nan), np.zeros(N)])
+    known = {"reference_m": shown, "reference_sigma_m": np.full(N, 1.0)}
+    assert findings(series(angles_deg=angles, **known), tilted, 1.0) == []
+    known["reference_m"] = shown + np.array([0.0, 30.0])
+    assert [f.cause for f in findings(series(angles_deg=angles, **known), tilted, 1.0)] == ["map"]

@@ -171,8 +171,8 @@ def test_benchmarks_that_a_page_names_are_there(page):
 
 
 def test_every_reason_is_explained():
-    told = set(re.findall(r"`(\w+)`", " ".join(line for line in read("docs/integrity.md").split("\n\n")[2:3])))
-    assert {reason.value for reason in Reason} <= told
+    stated = set(re.findall(r"`(\w+)`", " ".join(line for line in read("docs/integrity.md").split("\n\n")[2:3])))
+    assert {reason.value for reason in Reason} <= stated
 
 
 def test_defaults_are_those_of_the_code():
@@ -190,11 +190,11 @@ def test_columns_of_the_track_are_listed():
 
 
 def test_every_command_has_its_section():
-    told = set(re.findall(r"^## (.+)$", read("docs/command-line.md"), re.MULTILINE))
+    stated = set(re.findall(r"^## (.+)$", read("docs/command-line.md"), re.MULTILINE))
     commands = {(info.callback.__name__ if info.callback else "") for info in app.registered_commands}
     for group in app.registered_groups:
         commands |= {f"{group.name} {info.name}" for info in group.typer_instance.registered_commands}
-    assert told == commands
+    assert stated == commands
 
 
 def command_options():
@@ -214,8 +214,8 @@ def command_options():
 def test_every_option_is_in_the_lines_of_its_command(command, options):
     section = read("docs/command-line.md").split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
     lines = next(iter(re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)), "")
-    told = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force", "--threads"}
-    assert told == set(options)
+    stated = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force", "--threads"}
+    assert stated == set(options)
 
 
 def test_the_changelog_names_the_version():

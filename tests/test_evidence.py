@@ -50,12 +50,12 @@ class Script:
 def flown(answers, seconds, start=None, priors=None):
     """The reasons, or "fix", of frames that are so many seconds apart, without velocities."""
     script = Script(*answers)
-    navigator, told = Navigator(script, start), []
+    navigator, stated = Navigator(script, start), []
     for k in range(len(answers)):
         frame = Frame(IMAGE, round(k * seconds * SECOND), 100.0, 0.0)
         result = navigator.update(frame, None if priors is None else priors[k])
-        told.append("fix" if isinstance(result, Fix) else result.reason.value)
-    return told, script.priors, navigator
+        stated.append("fix" if isinstance(result, Fix) else result.reason.value)
+    return stated, script.priors, navigator
 
 
 # Bayes' rule
@@ -101,21 +101,21 @@ def telemetry(places, sigma_m=15.0):
 
 
 def test_photographs_with_positions_of_their_own_are_fixes_one_by_one():
-    told, priors, navigator = flown([(*place, 0.98) for place in WAY], 14.0, priors=telemetry(WAY))
-    assert told == ["fix"] * 6
+    stated, priors, navigator = flown([(*place, 0.98) for place in WAY], 14.0, priors=telemetry(WAY))
+    assert stated == ["fix"] * 6
     assert [prior.sigma_m for prior in priors] == [15.0] * 6
     assert navigator.state.value == "tracking"
 
 
 def test_photographs_alone_are_fixes_where_each_is_probable():
-    told, priors, _ = flown([(*place, 0.9995) for place in WAY], 14.0)
-    assert told == ["fix"] * 6
+    stated, priors, _ = flown([(*place, 0.9995) for place in WAY], 14.0)
+    assert stated == ["fix"] * 6
     assert priors[0] is None
 
 
 def test_improbable_photographs_confirm_each_other_where_a_vehicle_can_fly_between_them():
-    told, _, _ = flown([(*place, 0.98) for place in WAY], 14.0)
-    assert told == ["unconfirmed"] + ["fix"] * 5
+    stated, _, _ = flown([(*place, 0.98) for place in WAY], 14.0)
+    assert stated == ["unconfirmed"] + ["fix"] * 5
     scattered = [(3000.0 * (k % 2), 2000.0 * (k % 3), 0.98) for k in range(6)]
     assert "fix" not in flown(scattered, 14.0)[0]
 
@@ -128,8 +128,8 @@ def test_one_match_of_high_probability_is_refused_where_what_was_flown_contradic
 def test_a_match_far_from_its_own_telemetry_is_refused_until_others_agree():
     """The telemetry may be the one that is wrong; then the matches outweigh it one after the other."""
     astray = telemetry([(400.0, 400.0)] * 6)
-    told, _, _ = flown([(0.0, 0.0, 0.98)] * 6, 0.2, priors=astray)
-    assert (told[:2], told[-1]) == (["unconfirmed"] * 2, "fix")
+    stated, _, _ = flown([(0.0, 0.0, 0.98)] * 6, 0.2, priors=astray)
+    assert (stated[:2], stated[-1]) == (["unconfirmed"] * 2, "fix")
 
 
 def test_telemetry_that_leads_nowhere_is_left_in_turns():

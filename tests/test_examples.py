@@ -56,8 +56,8 @@ def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
     port, start = free_port(), read_truth(flight / "truth.csv")[0]
     link, place = f"udpin:127.0.0.1:{port}", [str(start.lat_deg), str(start.lon_deg)]
     command = [sys.executable, str(EXAMPLES / "beside_autopilot.py"), firmware, link, *place]
-    told = {"cwd": flight, "env": os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}, "stdout": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, **told) as bridge:
+    stated = {"cwd": flight, "env": os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **stated) as bridge:
         try:
             came = fly(flight, port, firmware)
             said, _ = bridge.communicate(timeout=60)

@@ -47,7 +47,7 @@ IMAGE = np.zeros((4, 6), np.uint8)
 
 
 class Clock:
-    """Time that passes when it is told to."""
+    """Time that passes when it is asked to."""
 
     def __init__(self):
         self.now_ns = 5_000

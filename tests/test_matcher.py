@@ -59,7 +59,7 @@ def prior(ground):
     return ground.prior(NADIR)
 
 
-def told(image, height_agl_m=150.0, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0):
+def with_telemetry(image, height_agl_m=150.0, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0):
     return Frame(image, 77, height_agl_m, heading_deg, roll_deg, pitch_deg)
 
 
@@ -122,7 +122,7 @@ def test_the_covariance_of_a_fix_is_finite_symmetric_and_positive_definite(match
 def test_the_same_question_has_the_same_answer_in_any_order(ground, camera, frame, prior, method, profile):
     options = MatcherOptions(profile=profile)
     other = ground.frame(camera, NADIR + 12.0, heading_deg=200.0, timestamp_ns=77)
-    flat = told(np.full((300, 300), 90, np.uint8))
+    flat = with_telemetry(np.full((300, 300), 90, np.uint8))
     questions = [(frame, prior), (flat, prior), (other, ground.prior(NADIR + 12.0)), (frame, None)]
     forwards = SceneMatcher(ground.site, camera, method, "cpu", options)
     backwards = SceneMatcher(ground.site, camera, method, "cpu", options)
@@ -172,7 +172,7 @@ def test_sift_needs_neither_height_nor_heading(matchers, ground, frame, prior):
     bare = Frame(frame.image, 77)
     for given in (prior, None):
         fix = matchers["sift"].locate(bare, given)
-        assert distance_px(fix) < 2.0  # tilt and place are told apart by features alone
+        assert distance_px(fix) < 2.0  # tilt and place are separated by features alone
         assert fix.up_m == pytest.approx(150.0, abs=1.5)
         assert fix.attitude.heading_deg == pytest.approx(25.0, abs=1.0)
 
@@ -192,7 +192,7 @@ def test_colour_and_grey_frames_agree(matchers, sim_site, sim_flight, method):
 def test_torch_and_numpy_images_agree(matchers, frame, prior, method, colour):
     image = np.dstack([frame.image] * 3) if colour else frame.image
     results = [
-        matchers[method].locate(told(picture), prior)
+        matchers[method].locate(with_telemetry(picture), prior)
         for picture in (image, torch.from_numpy(image), np.asfortranarray(image))
     ]
     assert distance_px(results[0]) < 0.3
@@ -209,7 +209,9 @@ def test_a_distorted_frame_finds_the_place_of_the_ideal_one(ground, frame, prior
     at = ideal.reshape(300, 300, 2).astype(np.float32)
     bent = cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     for method in METHODS:
-        assert distance_px(SceneMatcher(ground.site, lens, method, "cpu").locate(told(bent), prior)) < 0.3
+        assert (
+            distance_px(SceneMatcher(ground.site, lens, method, "cpu").locate(with_telemetry(bent), prior)) < 0.3
+        )
 
 
 def test_warmup_leaves_no_trace(ground, camera, frame, prior):
@@ -222,10 +224,10 @@ def test_auto_is_ncc_where_it_can_be_and_sift_where_it_must(matchers, ground, ca
     auto = matchers["auto"]
     assert auto.locate(frame, prior).method == "ncc"
     for height, heading in ((None, 25.0), (150.0, None), (None, None)):
-        fix = auto.locate(told(frame.image, height, heading), prior)
+        fix = auto.locate(with_telemetry(frame.image, height, heading), prior)
         assert distance_px(fix) < 2.5
         assert fix.method == "sift"
-    wrong = told(frame.image, heading_deg=205.0)  # NCC finds nothing under this heading
+    wrong = with_telemetry(frame.image, heading_deg=205.0)  # NCC finds nothing under this heading
     assert isinstance(matchers["ncc"].locate(wrong, prior), NoFix)
     free = MatcherOptions(sift=SiftOptions(use_attitude=False))
     fix = SceneMatcher(ground.site, camera, "auto", "cpu", free).locate(wrong, prior)
@@ -350,7 +352,7 @@ def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_nor
 
 @pytest.mark.parametrize("mounted_deg", [0.0, 30.0, 60.0])
 def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, mounted_deg):
-    """Of roll, pitch and heading by turns; of the two tilts each by whether it was told."""
+    """Of roll, pitch and heading by turns; of the two tilts each by whether it was given."""
     lifted = cv2.Rodrigues(np.radians([0.0, mounted_deg, 0.0]))[0] @ camera.mount  # about the body's right
     frame = Frame(np.zeros((8, 8), np.uint8), 0, 100.0, 40.0, None, 3.0)
     known = GridPose(frame.height_agl_m, frame.heading_deg, frame.roll_deg, frame.pitch_deg)
@@ -406,7 +408,7 @@ def test_a_matcher_of_ones_own_that_finds_nothing_is_refused(ground, camera, fra
 def test_a_frame_of_one_grey_level_has_no_texture(matchers, prior, method, level):
     for given in (prior, None):
         assert_refused(
-            matchers[method].locate(told(np.full((300, 300), level, np.uint8)), given), Reason.NO_TEXTURE
+            matchers[method].locate(with_telemetry(np.full((300, 300), level, np.uint8)), given), Reason.NO_TEXTURE
         )
 
 
@@ -463,17 +465,23 @@ def test_an_explanation_asks_about_the_middle_of_its_window(matchers, ground, fr
 
 
 def test_ncc_needs_the_height(matchers, frame, prior):
-    assert_refused(matchers["ncc"].locate(told(frame.image, height_agl_m=None), prior), Reason.NO_HEIGHT, "ncc")
+    assert_refused(
+        matchers["ncc"].locate(with_telemetry(frame.image, height_agl_m=None), prior), Reason.NO_HEIGHT, "ncc"
+    )
 
 
 def test_ncc_needs_the_heading(matchers, frame, prior):
-    assert_refused(matchers["ncc"].locate(told(frame.image, heading_deg=None), prior), Reason.NO_HEADING, "ncc")
+    assert_refused(
+        matchers["ncc"].locate(with_telemetry(frame.image, heading_deg=None), prior), Reason.NO_HEADING, "ncc"
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("tilt", [(80.0, 0.0), (0.0, -70.0), (180.0, 0.0)])
 def test_an_extreme_tilt_is_refused(matchers, frame, prior, method, tilt):
-    assert_refused(matchers[method].locate(told(frame.image, 150.0, 25.0, *tilt), prior), Reason.TILTED, method)
+    assert_refused(
+        matchers[method].locate(with_telemetry(frame.image, 150.0, 25.0, *tilt), prior), Reason.TILTED, method
+    )
 
 
 @pytest.mark.parametrize("height_m", [0.01, 2.0, 5e3, 65_535.0, 1e7])
@@ -481,12 +489,12 @@ def test_an_extreme_tilt_is_refused(matchers, frame, prior, method, tilt):
 def test_a_height_that_cannot_be_leads_nowhere_else(matchers, frame, prior, method, height_m):
     """NCC refuses; SIFT, which measures height, may still find the place."""
     for given in (prior, None):
-        result = matchers[method].locate(told(frame.image, height_m), given)
+        result = matchers[method].locate(with_telemetry(frame.image, height_m), given)
         assert isinstance(result, NoFix) or (result.method == "sift" and distance_px(result) < 4.0)
 
 
 def test_more_ground_than_the_map_is_outside_the_map(matchers, frame, prior):
-    assert_refused(matchers["ncc"].locate(told(frame.image, 65_535.0), prior), Reason.OUTSIDE_MAP, "ncc")
+    assert_refused(matchers["ncc"].locate(with_telemetry(frame.image, 65_535.0), prior), Reason.OUTSIDE_MAP, "ncc")
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
@@ -516,7 +524,7 @@ def test_noise_is_refused(matchers, prior, method):
     for _ in range(5):
         image = rng.integers(0, 256, (300, 300), dtype=np.uint8)
         for given in (prior, None):
-            assert isinstance(matchers[method].locate(told(image), given), NoFix)
+            assert isinstance(matchers[method].locate(with_telemetry(image), given), NoFix)
 
 
 def test_a_map_that_repeats_itself_is_ambiguous(ground, camera):
@@ -526,7 +534,7 @@ def test_a_map_that_repeats_itself_is_ambiguous(ground, camera):
     small = Camera.from_fov(300, 300, 60.0)
     image = cv2.resize(np.tile(tile, (4, 4))[250:424, 250:424], (300, 300), interpolation=cv2.INTER_CUBIC)
     height_m = 150.0 * 174 * site.gsd_m_per_px / (2 * 150 * np.tan(np.pi / 6))
-    result = SceneMatcher(site, small, "ncc", "cpu").locate(told(image, height_m, 0.0, 0.0, 0.0))
+    result = SceneMatcher(site, small, "ncc", "cpu").locate(with_telemetry(image, height_m, 0.0, 0.0, 0.0))
     assert_refused(result, Reason.AMBIGUOUS, "ncc")
     assert result.score > 0.8
 
@@ -538,7 +546,7 @@ def test_a_map_that_repeats_itself_is_ambiguous(ground, camera):
 def test_a_frame_of_another_resolution_does_not_fit_the_calibration(matchers, shape):
     for matcher in matchers.values():
         with pytest.raises(CalibrationError, match=rf"calibrated for 300 x 300, .* {shape[1]} x {shape[0]}"):
-            matcher.locate(told(np.zeros(shape, np.uint8)))
+            matcher.locate(with_telemetry(np.zeros(shape, np.uint8)))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
@@ -615,7 +623,7 @@ def test_the_papers_profile_turns_by_the_heading_less_the_maps(camera):
     matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(profile="paper"))
     image = ground.picture(camera, NADIR, 150.0, heading_deg=40.0)
     scores = {
-        heading: matcher.locate(told(image, 150.0, heading, 0.0, 0.0), ground.prior(NADIR)).score
+        heading: matcher.locate(with_telemetry(image, 150.0, heading, 0.0, 0.0), ground.prior(NADIR)).score
         for heading in (35.0, 37.5, 40.0, 42.5, 45.0)
     }
     assert max(scores, key=scores.get) == 40.0
@@ -624,14 +632,14 @@ def test_the_papers_profile_turns_by_the_heading_less_the_maps(camera):
 @pytest.mark.parametrize("method", METHODS)
 def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, prior, method):
     matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
-    assert_refused(matcher.locate(told(frame.image, None), prior), Reason.NO_HEIGHT, method)
+    assert_refused(matcher.locate(with_telemetry(frame.image, None), prior), Reason.NO_HEIGHT, method)
     assert_refused(matcher.locate(frame, Prior(east_m=9e3, north_m=0.0, sigma_m=5.0)), Reason.OUTSIDE_MAP, method)
-    flat = matcher.locate(told(np.zeros((300, 300), np.uint8)), prior)
+    flat = matcher.locate(with_telemetry(np.zeros((300, 300), np.uint8)), prior)
     assert isinstance(flat, Fix) or flat.reason is Reason.TOO_FEW_MATCHES  # NCC always has a peak
     if method == "ncc":
-        assert_refused(matcher.locate(told(frame.image, heading_deg=None), prior), Reason.NO_HEADING)
+        assert_refused(matcher.locate(with_telemetry(frame.image, heading_deg=None), prior), Reason.NO_HEADING)
         for height in (0.01, 65_535.0, 1e7):
-            assert_refused(matcher.locate(told(frame.image, height), prior), Reason.OUTSIDE_MAP)
+            assert_refused(matcher.locate(with_telemetry(frame.image, height), prior), Reason.OUTSIDE_MAP)
 
 
 # The map's projection does not matter

@@ -111,9 +111,9 @@ def test_errors_are_as_large_as_the_covariance_says():
         off, shown = rng.normal(size=3) * [0.37, 0.37, 1.0], []
         for place_m, seconds in (((0.0, 0.0), 0.0), (moved_m, INTERVAL_S)):
             image = noisy(picture(place_m, true), 4.0, rng)
-            told = Attitude(true.roll_deg + off[0], true.pitch_deg + off[1], (true.heading_deg + off[2]) % 360.0)
+            stated = Attitude(true.roll_deg + off[0], true.pitch_deg + off[1], (true.heading_deg + off[2]) % 360.0)
             height_m = HEIGHT_M + (shown[0].height_agl_m - HEIGHT_M if shown else rng.normal(0.0, 1.3))
-            shown.append(frame(image, seconds, told, height_m))
+            shown.append(frame(image, seconds, stated, height_m))
         motion = motion_between(*shown)
         assert isinstance(motion, GroundMotion), motion
         off_mps = motion.velocity_mps - moved_m / INTERVAL_S
@@ -257,10 +257,10 @@ def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word():
     drift = DriftModel(0.5, 3.0, 15.0)
     for sigma_mps, expected_m in ((None, 0.5), (0.1, 0.1), (2.0, 2.0)):
         reckoning = DeadReckoning(2.0, 0.2)
-        told = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
-        begin = reckoning.sample(still(0.0, **told), None)
-        reckoning.append(still(0.0, **told), begin)
-        assert drift.sigma_m(begin, reckoning.sample(still(1.0, **told), None)) == pytest.approx(expected_m)
+        stated = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
+        begin = reckoning.sample(still(0.0, **stated), None)
+        reckoning.append(still(0.0, **stated), begin)
+        assert drift.sigma_m(begin, reckoning.sample(still(1.0, **stated), None)) == pytest.approx(expected_m)
 
 
 class Blind:

@@ -94,10 +94,10 @@ def test_the_topics_of_the_bridge_are_those_of_the_models_and_the_node():
     published = {model.findtext(".//sensor/topic"), model.findtext(".//camera_info_topic"), "/clock",
                  model.findtext(".//odom_topic")}  # fmt: skip
     assert {row["gz_topic_name"] for row in bridged.values()} == published
-    told = yaml.safe_load((ROS2 / "config/node.yaml").read_text())["/**"]["ros__parameters"]
+    stated = yaml.safe_load((ROS2 / "config/node.yaml").read_text())["/**"]["ros__parameters"]
     for name in (name for name in RosTopics.__slots__ if name != "odometry_type"):
-        assert told[f"{name}_topic"] == getattr(RosTopics(), name)
-    assert {told["image_topic"], told["camera_info_topic"]} <= set(bridged)
+        assert stated[f"{name}_topic"] == getattr(RosTopics(), name)
+    assert {stated["image_topic"], stated["camera_info_topic"]} <= set(bridged)
 
 
 class Parameters:
@@ -124,10 +124,10 @@ def test_the_node_of_ros_2_takes_the_parameters_of_its_file():
     ros, matching = module.settings_of(node)
     assert (ros.map, ros.version, ros.topics.image, matching.method, matching.deadline_ms) == (
         "site.tif", 2, "down/image_raw", "ncc", 200.0)  # fmt: skip
-    told = yaml.safe_load((ROS2 / "config/node.yaml").read_text())["/**"]["ros__parameters"]
-    assert {**node.asked, "threads": 1} == told  # names, types and defaults; threads is asked for by main
+    stated = yaml.safe_load((ROS2 / "config/node.yaml").read_text())["/**"]["ros__parameters"]
+    assert {**node.asked, "threads": 1} == stated  # names, types and defaults; threads is asked for by main
     assert {name: type(value) for name, value in node.asked.items()} == {
-        name: type(value) for name, value in told.items() if name != "threads"}  # fmt: skip
+        name: type(value) for name, value in stated.items() if name != "threads"}  # fmt: skip
     with pytest.raises(OptionError, match="map: expected a file"):
         module.settings_of(Parameters())
 

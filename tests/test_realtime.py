@@ -105,9 +105,9 @@ def test_what_is_not_permitted_is_told_with_its_cure(monkeypatch, call, asked, w
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, call, refuse)
-    with pytest.raises(BackendError) as told:
+    with pytest.raises(BackendError) as stated:
         set_realtime(asked)
-    assert all(word in str(told.value) for word in words)
+    assert all(word in str(stated.value) for word in words)
     with pytest.raises(BackendError):  # before a pipeline depends on it
         Live(lambda _: None, print, options=LiveOptions(realtime=asked))  # type: ignore[arg-type,return-value]
 

@@ -50,8 +50,8 @@ def seen(ground, camera, shape):
         sink_m = up - shape(hits[..., 0], hits[..., 1])
         hits = nadir + down[..., :2] * (sink_m[..., None] / -down[..., 2:])
     image = np.clip(np.rint(ground.levels(hits[..., 0], hits[..., 1])), 0, 255).astype(np.uint8)
-    told = {name: angle + off for (name, angle), off in zip(ATTITUDE.items(), (0.5, -0.4, 1.0), strict=True)}
-    return Frame(image, timestamp_ns=0, height_agl_m=HEIGHT_M + 2.0, **told), up
+    stated = {name: angle + off for (name, angle), off in zip(ATTITUDE.items(), (0.5, -0.4, 1.0), strict=True)}
+    return Frame(image, timestamp_ns=0, height_agl_m=HEIGHT_M + 2.0, **stated), up
 
 
 def site_on(ground, shape):
@@ -70,14 +70,14 @@ def off_m(ground, fix):
     return float(np.hypot(*(np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR))))
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("somewhere", [True, False])
-def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, told, somewhere):
+def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, stated, somewhere):
     """The map's ground lies up to 40 m off the ground below, and the height is above the latter."""
     site, frame, up_m = scene
     prior = None if somewhere else ground.prior(NADIR)
     fix = SceneMatcher(site, camera, "ncc", "cpu").locate(
-        frame if told else replace(frame, roll_deg=None, pitch_deg=None), prior
+        frame if stated else replace(frame, roll_deg=None, pitch_deg=None), prior
     )
     assert isinstance(fix, Fix), fix
     assert fix.stage == "refined"

@@ -31,8 +31,8 @@ def flown(off_deg=(0.0, 0.0, 0.0), off_m=0.0, frames=40, seed=1, ground_m=GROUND
     shown = None
     for k in range(frames):
         true = np.array([3.0 * math.sin(0.3 * k), 2.0 * math.cos(0.2 * k), (40.0 + k) % 360.0])
-        told = true + off_deg
-        roll, pitch, heading = told.tolist()
+        stated = true + off_deg
+        roll, pitch, heading = stated.tolist()
         frame = Frame(IMAGE, round(k * 2e8), HEIGHT_M + off_m, heading % 360.0, roll, pitch)
         shown = errors.corrected(frame, 0.2 * k, late=False)
         measured = true + rng.normal(0.0, 0.4, 3)

@@ -65,9 +65,9 @@ def test_a_frame_with_its_true_heading_lies_on_the_map(make, polar, frame, metho
 
 def test_the_planes_heading_in_its_place_is_off(make, polar, frame):
     """What the above would be without: the test can fail."""
-    told = replace(frame, heading_deg=PLANE_DEG)
+    stated = replace(frame, heading_deg=PLANE_DEG)
     peak = make("ncc", ncc=NccOptions(refine=False))  # refinement measures the heading
-    assert peak.locate(told, polar.prior(NADIR)).score < 0.9
+    assert peak.locate(stated, polar.prior(NADIR)).score < 0.9
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
@@ -83,8 +83,8 @@ def test_a_heading_that_was_searched_for_is_the_true_one(make, polar, frame, kno
 
 def test_an_explanation_lays_the_frame_by_its_true_heading(make, frame):
     scores = [
-        make("ncc").explain(told, Window(300, 100, 340, 400)).surface.score
-        for told in (frame, replace(frame, heading_deg=PLANE_DEG))
+        make("ncc").explain(stated, Window(300, 100, 340, 400)).surface.score
+        for stated in (frame, replace(frame, heading_deg=PLANE_DEG))
     ]
     assert scores[0] > 0.97
     assert scores[1] < 0.93

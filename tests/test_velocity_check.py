@@ -28,7 +28,7 @@ def match_at(place_m, confidence=0.9999, sigma_m=0.3):
                confidence=confidence)  # fmt: skip
 
 
-def flown(told=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=1, confidence=0.9999, check=None):
+def flown(stated=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=1, confidence=0.9999, check=None):
     """A vehicle that turns and brakes: the check, and the times of the frames that it does not believe."""
     check, rng = check or VelocityCheck(), np.random.default_rng(seed)
     place, doubted, phase = np.zeros(2), [], rng.uniform(0, 2 * math.pi)
@@ -37,7 +37,7 @@ def flown(told=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=1,
         course = phase + 0.8 * math.sin(0.2 * time_s + phase)
         speed = speed_mps * (0.6 + 0.4 * math.cos(0.3 * time_s))
         velocity = speed * np.array([math.sin(course), math.cos(course)])
-        said = told(velocity + rng.normal(0.0, 0.2, 2))
+        said = stated(velocity + rng.normal(0.0, 0.2, 2))
         frame = Frame(IMAGE, None, east_velocity_mps=float(said[0]), north_velocity_mps=float(said[1]))
         fix = match_at(place + rng.normal(0.0, 0.3, 2), confidence)
         if check.note(fix, frame, time_s):
@@ -87,7 +87,7 @@ def test_matches_that_jump_do_not_outweigh_a_velocity():
 
 def test_frames_without_a_velocity_and_pauses_say_nothing():
     check = VelocityCheck()
-    bare, told = Frame(IMAGE, None), Frame(IMAGE, None, east_velocity_mps=7.0, north_velocity_mps=0.0)
+    bare, stated = Frame(IMAGE, None), Frame(IMAGE, None, east_velocity_mps=7.0, north_velocity_mps=0.0)
     assert not any(check.note(match_at((0.0, 7.0 * k)), bare, float(k)) for k in range(20))
-    assert not any(check.note(match_at((0.0, 42.0 * k)), told, 6.0 * k) for k in range(20))
+    assert not any(check.note(match_at((0.0, 42.0 * k)), stated, 6.0 * k) for k in range(20))
     assert check.shown(replace(bare, height_agl_m=3.0)).height_agl_m == 3.0

@@ -1,14 +1,18 @@
-"""Options that several commands share, and what is done with the threads that they name."""
+"""Options that several commands share, what they name, and how they are typed again for the next command."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from engine.cli import console
+
 if TYPE_CHECKING:
     from engine.formats.corrections import Corrections
+    from engine.runs.inputs import FlightFiles
 
 MapOption = Annotated[Path, typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.")]
 FramesOption = Annotated[
@@ -191,3 +195,28 @@ def corrections(
             angles=angles, columns=tuple(columns or ()), heading_offset_deg=heading_offset_deg,
             height_offset_m=height_offset_m, offset_s=offset_s,
         )  # fmt: skip
+
+
+def flight_options(files: FlightFiles, *, settings: Path | None = None, start: str | None = None) -> str:
+    """The files of a flight with all that was given of them, as options of `check` and `track` are typed."""
+    from engine.formats.corrections import Corrections
+
+    values: dict[str, object] = {field.name: getattr(files, field.name) for field in fields(files)}
+    given, nothing = files.corrections, Corrections()
+    is_scaled = values.pop("scale_calibration")
+    values |= {"corrections": None, "settings": settings, "start": start}
+    values |= {"every": files.every if files.every > 1 else None, "log_offset_s": files.log_offset_s or None}
+    for name in ("angles", "heading_offset_deg", "height_offset_m"):
+        values[name] = getattr(given, name) if getattr(given, name) != getattr(nothing, name) else None
+    values["telemetry_offset_s"] = given.offset_s or None
+    columns = [f"--column {console.quoted(rule)}" for rule in given.columns]
+    return " ".join([console.options(**values), *columns, *(["--scale-calibration"] if is_scaled else [])])
+
+
+def after_track(
+    files: FlightFiles, out: Path, fixes: int, *, settings: Path | None = None, start: str | None = None
+) -> str:
+    """What comes after a track: its export, or where it has no fix, what shows why."""
+    if fixes:
+        return f"export {console.quoted(out)} --format geojson"
+    return f"check {flight_options(files, settings=settings, start=start)}"

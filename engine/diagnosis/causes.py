@@ -9,18 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import MOUNTS, mount_rotation
+from engine.diagnosis.contradictions import (
+    SIGMA_DEG,
+    attitude_deg,
+    contradictions,
+    height_sigma_m,
+    is_alarming,
+    wrapped_deg,
+)
 from engine.diagnosis.findings import Array, Finding, TelemetrySeries
 from engine.diagnosis.ground_motion import optical_centre, velocity
 from engine.diagnosis.sightings import Sighting
 from engine.geo import enu_from_body
 
-_SIGMA_DEG = np.array([1.2, 1.2, 1.5])  # of an attitude by features alone, against the telemetry's
 _OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
 _MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
-_GAIN = 0.6  # by which a change must lessen it
+_GAIN, _GAIN_SHARE = 0.6, 0.5  # by which a change must lessen it, the lesser of the two
 _PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
-_HEIGHT_SHARE, _HEIGHT_M = 0.02, 1.5  # of a height by features alone
 _LEAST = 3
+_ANGLES = ("roll", "pitch", "heading")
+# An offset below both, in shares of the height and in sigmas, is named only where single pictures contradict it.
+_LEAST_HEIGHT_SHARE, _LEAST_HEIGHT_SIGMAS = 0.04, 5.0
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
 IN_CALIBRATION = " in the calibration"
@@ -48,7 +57,9 @@ def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: flo
 def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ...]:
     """What of the telemetry was known at enough of the sightings to be compared."""
     index = [s.index for s in seen]
-    columns = {"attitude": series.angles_deg, "height": series.height_m[:, None], "velocity": series.velocity_mps,
+    tilt_is_known = np.isfinite(series.angles_deg[index, :2]).any()
+    angles = {"attitude": series.angles_deg} if tilt_is_known else {"heading": series.angles_deg[:, 2:]}
+    columns = {**angles, "height": series.height_m[:, None], "velocity": series.velocity_mps,
                "map": series.reference_m}  # fmt: skip
     return tuple(
         name for name, values in columns.items() if np.isfinite(values[index]).all(axis=1).sum() >= _LEAST
@@ -58,13 +69,9 @@ def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ..
 # ------------------------------------------------------------------------------------------------ attitude
 
 
-def _wrapped(angles_deg: Array) -> Array:
-    return np.asarray((angles_deg + 180.0) % 360.0 - 180.0, np.float64)
-
-
 def _cost(measured_deg: Array, told_deg: Array) -> float:
     """Mean chi-square of a component, each limited."""
-    chi = (_wrapped(measured_deg - told_deg) / _SIGMA_DEG) ** 2
+    chi = (wrapped_deg(measured_deg - told_deg) / SIGMA_DEG) ** 2
     known = np.isfinite(chi)
     return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
 
@@ -104,12 +111,13 @@ _DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
 
 def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     index = np.array([s.index for s in seen])
-    measured = np.array([(s.attitude.roll_deg, s.attitude.pitch_deg, s.attitude.heading_deg) for s in seen])
+    measured = np.array([attitude_deg(s) for s in seen])
     angles = series.angles_deg[index]
     if np.isfinite(angles).sum() < 2 * _LEAST:
         return None
     as_told = _cost(measured, angles)
-    if as_told < _MISFIT:
+    contradicted = _contradicted(series, seen, _ANGLES)
+    if as_told < _MISFIT and not contradicted:
         return None
     tried: list[tuple[float, Finding]] = [
         (_cost(measured, change(angles)) + _PENALTY["discrete"], Finding(cause, text, cure))
@@ -119,10 +127,20 @@ def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | No
     tried.append(_turned_mount(measured, angles, series.mount))
     tried.append(_late(measured, series, index))
     cost, finding = min((row for row in tried if math.isfinite(row[0])), key=lambda row: row[0])
-    if cost < as_told - _GAIN:
+    if cost < as_told - min(_GAIN, _GAIN_SHARE * as_told):
         return finding
-    text = "roll, pitch and heading do not fit the pictures, and no single change of them would make them"
-    return Finding("attitude", text, "look at the telemetry's attitude, its clock and its units")
+    suspected = _listed(contradicted or _ANGLES)
+    text = f"{suspected} of the telemetry and of the pictures differ, and no single change would make them fit"
+    return Finding("attitude", text, f"look at {suspected}: the unit, the sign, the clock")
+
+
+def _contradicted(series: TelemetrySeries, seen: Sequence[Sighting], fields: Sequence[str]) -> list[str]:
+    """Those of the fields that too many pictures contradict."""
+    return [one.field for one in contradictions(series, seen) if one.field in fields and is_alarming(one)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
@@ -201,9 +219,9 @@ def _median_angle(angles_deg: Array) -> tuple[float, float]:
     if not known.size:
         return 0.0, math.inf
     middle = math.atan2(np.sin(known).sum(), np.cos(known).sum())
-    off = _wrapped(np.degrees(known - middle))
+    off = wrapped_deg(np.degrees(known - middle))
     spread = 1.4826 * float(np.median(np.abs(off - np.median(off))))
-    middle_deg = float(_wrapped(np.array(math.degrees(middle) + float(np.median(off)))))
+    middle_deg = float(wrapped_deg(np.array(math.degrees(middle) + float(np.median(off)))))
     return middle_deg, max(spread, 0.3) * 1.25 / math.sqrt(known.size)
 
 
@@ -229,20 +247,21 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
     if known.sum() < _LEAST:
         return None
     height, measured = height[known], measured[known]
-    sigma = np.hypot(_HEIGHT_SHARE * measured, _HEIGHT_M)
+    sigma = height_sigma_m(measured)
 
     def cost(expected: Array) -> float:
         return float(np.minimum(((measured - expected) / sigma) ** 2, _OUTLIER).mean())
 
     off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
     by_offset, by_factor = cost(height + off_m), cost(height * factor)
-    if cost(height) < _MISFIT:
+    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
+    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
+    is_small = abs(off_m) < min(_LEAST_HEIGHT_SHARE * float(np.median(measured)), _LEAST_HEIGHT_SIGMAS * sigma_m)
+    if cost(height) < _MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
         return None
     if min(by_offset, by_factor) > cost(height) - _GAIN:
         text = "the height does not fit the pictures, and no offset or factor would make it"
         return Finding("height", text, "look at the telemetry's height")
-    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
-    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
     if abs(factor / _FEET - 1.0) < 0.04:
         text = "the height is in feet"
         return Finding("height_feet", text, '--column "height_agl_m=0.3048*height_agl_m"', factor)
@@ -262,11 +281,16 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
 
 def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:
     index = np.array([s.index for s in seen])
-    off = np.array([s.en_m for s in seen]) - series.reference_m[index]
+    reference_m = series.reference_m[index]
+    off = np.array([s.en_m for s in seen]) - reference_m
     known = np.isfinite(off).all(axis=1)
     if known.sum() < _LEAST:
         return None
     middle = np.median(off[known], axis=0)
+    if not np.isfinite(series.angles_deg[index, :2]).any():
+        # Who knows of no tilt may give positions of what the picture's middle shows.
+        shown = np.array([_shown_m(s, series.mount) for s in seen]) - reference_m
+        middle = min(middle, np.median(shown[known], axis=0), key=np.linalg.norm)
     sigma_m = math.hypot(float(np.median(series.reference_sigma_m[index][known])), map_sigma_m)
     if float(np.hypot(*middle)) < 3.0 * sigma_m:
         return None
@@ -276,3 +300,9 @@ def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float
     )
     return Finding("map", text, "look at the map's georeference, or at the datum of the positions",
                    float(np.hypot(*middle)), sigma_m)  # fmt: skip
+
+
+def _shown_m(seen: Sighting, mount: Array) -> Array:
+    """(2,) east and north of what the picture's middle shows, on level ground."""
+    axis = enu_from_body(*attitude_deg(seen)) @ mount[:, 2]
+    return seen.en_m + axis[:2] / max(-float(axis[2]), 0.1) * seen.height_agl_m

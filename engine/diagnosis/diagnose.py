@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.covariance import map_sigma_of
 from engine.diagnosis.causes import findings, is_known
+from engine.diagnosis.contradictions import contradictions
 from engine.diagnosis.findings import Diagnosis, Finding, TelemetrySeries
 from engine.diagnosis.sightings import sight
 from engine.evidence import position_of
@@ -78,7 +79,8 @@ def diagnose(
         return Diagnosis(static, len(chosen), len(seen.sightings), ())
     sightings = [replace(s, index=chosen[s.index]) for s in seen.sightings]
     found = findings(series, sightings, map_sigma_of(site))
-    return Diagnosis(static + found, len(chosen), len(sightings), is_known(series, sightings))
+    compared, contradicted = is_known(series, sightings), contradictions(series, sightings)
+    return Diagnosis(static + found, len(chosen), len(sightings), compared, contradicted)
 
 
 def _searched(k: int, priors: Sequence[Prior | None], time_s: Array, site: OrthoMap) -> Prior | None:

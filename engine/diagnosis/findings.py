@@ -32,6 +32,21 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
+class Contradiction:
+    """How many placed pictures contradict one field of the telemetry, by more than three standard deviations.
+
+    Attributes:
+        field: "roll", "pitch", "heading", "height" or "velocity".
+        pictures: that contradict it; of the velocity the ways from one picture to the next.
+        compared: pictures at which it was known.
+    """
+
+    field: str
+    pictures: int
+    compared: int
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnosis:
     """What was found of a flight's inputs.
 
@@ -40,12 +55,14 @@ class Diagnosis:
         looked_at: pictures that were looked at.
         seen: of them, those whose pose the picture showed by itself.
         compared: what of the telemetry was known and held against them.
+        contradicted: by how many pictures, for each field of the telemetry that was known.
     """
 
     findings: list[Finding]
     looked_at: int
     seen: int
     compared: tuple[str, ...]
+    contradicted: tuple[Contradiction, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,6 +64,15 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
     return Finding("velocity", text, cure, factor)
 
 
+def leg_differences(series: TelemetrySeries, seen: Sequence[Sighting]) -> Array:
+    """(N,) by how many standard deviations each way between two pictures differs from that of the velocity."""
+    legs = _legs(series, seen)
+    if legs is None:
+        return np.zeros(0)
+    moved, reckoned, sigma, _ = legs
+    return np.asarray(np.abs(moved - reckoned).max(axis=1) / sigma, np.float64)
+
+
 def _legs(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[Array, Array, Array, Array] | None:
     """The legs between sightings: movements (N, 2), the velocity's, sigmas (N,), and what turned (N, 2, 2)."""
     known = [(a, b, leg) for a, b in pairwise(seen) if (leg := _leg(series, a, b)) is not None]

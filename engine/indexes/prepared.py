@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.device import Device, Picture, placed
+from engine.device import Device, Picture, on_host, placed
 from engine.ncc_fft import Search, prepare
 from engine.orthomap import OrthoMap
 from engine.scores import enhance
 from engine.values import Window
+
+FloatImage = NDArray[np.float32]
 
 CELL_PX = 256
 """Regions begin and end on multiples of this, and at least half of it beyond the requested window, so that the
@@ -85,6 +87,12 @@ class PreparedMap:
             return Region(aligned, replace(search, counts=None), None)
         return Region(aligned, search, region.valid[part], region.mask[part])
 
+    def enhanced(self, window: Window, level: int) -> tuple[FloatImage, NDArray[np.bool_] | None]:
+        """The same as :func:`enhanced_part`, of what is prepared."""
+        region = self.cut(window, level)
+        inner = np.s_[window.y0 - region.window.y0 :, window.x0 - region.window.x0 :]
+        return on_host(region.search.image)[inner], None if region.mask is None else region.mask[inner]
+
     def _region(self, window: Window, level: int) -> Region:
         with self._lock:
             region = self._cached(window, level)
@@ -123,27 +131,44 @@ class PreparedMap:
             del self._regions[key]
 
     def _prepare(self, window: Window, level: int) -> Region:
-        """Enhance with the neighbourhood beyond the region, so that regions join seamlessly."""
-        rows, columns = self._site.level_shape(level)
-        margin = self._radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing
-        x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
-        x1 = min(columns, window.x0 + window.width_px + margin)
-        y1 = min(rows, window.y0 + window.height_px + margin)
-        wide = Window(x0, y0, x1 - x0, y1 - y0)
-        mask: NDArray[np.bool_] | None = None
-        if not self._site.fully_valid:
-            mask = self._site.valid(wide, level)
-            mask = None if mask.all() else mask
-        gray = self._site.gray(wide, level)
-        picture = enhance(gray, radius_px=self._radius_px, score=self._score, valid=mask)
-        inner = np.s_[
-            window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
-        ]
-        image = placed(np.ascontiguousarray(picture[inner]), self._device)
-        if mask is None or mask[inner].all():
+        picture, mask = enhanced_part(self._site, self._radius_px, self._score, window, level)
+        image = placed(picture, self._device)
+        if mask is None:
             return Region(window, prepare(image), None)
-        own = np.ascontiguousarray(mask[inner])
-        return Region(window, prepare(image, valid=own), placed(own, self._device), own)
+        return Region(window, prepare(image, valid=mask), placed(mask, self._device), mask)
+
+
+def enhanced_part(
+    site: OrthoMap, radius_px: int, score: str, window: Window, level: int
+) -> tuple[FloatImage, NDArray[np.bool_] | None]:
+    """A window of a level enhanced with the neighbourhood beyond it, so that windows join seamlessly.
+
+    Args:
+        site: the map.
+        radius_px: of the local normalisation, see :func:`engine.scores.enhance`.
+        score: see :func:`engine.scores.enhance`.
+        window: in pixels of the level, inside it.
+        level: of the map's pyramid.
+
+    Returns:
+        (H, W) float32, and (H, W) bool, False on nodata; None where all pixels are valid.
+    """
+    rows, columns = site.level_shape(level)
+    margin = radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing
+    x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
+    x1 = min(columns, window.x0 + window.width_px + margin)
+    y1 = min(rows, window.y0 + window.height_px + margin)
+    wide = Window(x0, y0, x1 - x0, y1 - y0)
+    mask: NDArray[np.bool_] | None = None
+    if not site.fully_valid:
+        mask = site.valid(wide, level)
+        mask = None if mask.all() else mask
+    picture = enhance(site.gray(wide, level), radius_px=radius_px, score=score, valid=mask)
+    inner = np.s_[
+        window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
+    ]
+    own = None if mask is None or mask[inner].all() else np.ascontiguousarray(mask[inner])
+    return np.ascontiguousarray(picture[inner]), own
 
 
 def _contains(region: Window, window: Window) -> bool:

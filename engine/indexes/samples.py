@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import cv2
@@ -10,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.dense import Samples
-from engine.device import on_host
-from engine.indexes.prepared import WHOLE_LEVEL_PX, PreparedMap
+from engine.indexes.prepared import WHOLE_LEVEL_PX, FloatImage
 from engine.indexes.recently_used import RecentlyUsed
 from engine.orthomap import OrthoMap
 from engine.values import Window
+
+Enhanced = Callable[[Window, int], tuple[FloatImage, NDArray[np.bool_] | None]]
 
 BLOCK_PX = 4
 """One sample is taken of every block of this side: the pixel with the steepest gradient."""
@@ -30,11 +32,12 @@ class SampleMap:
 
     Args:
         site: the map.
-        prepared: the same map, enhanced.
+        enhanced: a window of a level of the same map, enhanced, and its mask; see
+            :func:`engine.indexes.prepared.enhanced_part`.
     """
 
-    def __init__(self, site: OrthoMap, prepared: PreparedMap) -> None:
-        self._site, self._prepared = site, prepared
+    def __init__(self, site: OrthoMap, enhanced: Enhanced) -> None:
+        self._site, self._enhanced = site, enhanced
         self._cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
 
     @property
@@ -89,16 +92,14 @@ class SampleMap:
         return found
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
-        region = self._prepared.cut(cell, level)
-        inner = np.s_[cell.y0 - region.window.y0 :, cell.x0 - region.window.x0 :]
-        picture = on_host(region.search.image)[inner]
+        picture, mask = self._enhanced(cell, level)
         across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
         rows, columns = _steepest(cv2.magnitude(across, down), shape)
         xy_px = self._site.full_from_level(np.stack([columns + cell.x0, rows + cell.y0], axis=-1), level)
         weights = np.ones(len(rows))
-        if region.mask is not None:
-            weights = region.mask[inner][rows, columns].astype(np.float64)
+        if mask is not None:
+            weights = mask[rows, columns].astype(np.float64)
         height_m = self._site.surface_at(xy_px)
         weights *= self._site.roughness_weight_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
         points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from engine.align import SIDE_STEP_PX
 from engine.device import Device
 from engine.features import prepare_plans
 from engine.indexes.landmarks import LandmarkMap
-from engine.indexes.prepared import PreparedMap
+from engine.indexes.prepared import enhanced_part
 from engine.indexes.samples import SampleMap
 from engine.methods.explanation import Explanation, explain_features
 from engine.methods.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
@@ -54,8 +55,8 @@ class Sift(Method):
         )
         self._enhancement = replace(options.ncc, errors=options.sift.errors)
         if samples is None:
-            prepared = PreparedMap(site, device, options.ncc.enhance_radius_px, options.ncc.score)
-            samples = SampleMap(site, prepared)
+            radius_px, score = options.ncc.enhance_radius_px, options.ncc.score
+            samples = SampleMap(site, partial(enhanced_part, site, radius_px, score))
         self.samples = samples
 
     @property

@@ -109,7 +109,24 @@ def as_rows(found: Diagnosis, *, corrected: bool = False) -> list[tuple[str, str
     if found.seen < _LEAST_SEEN:
         seen += ", too few to say more: is it the map of this place and season, the calibration of this camera?"
     elif not out and found.compared:
-        seen += f"; they fit what is said of {', '.join(found.compared)}"
+        seen += f"; they fit what is said of {', '.join(found.compared)}{_contradicted(found, ', but ')}"
     elif not out:
         seen += "; there is no telemetry to compare them with"
+    else:
+        seen += _contradicted(found, "; ")
     return [*out, ("pictures", seen)]
+
+
+def _contradicted(found: Diagnosis, before: str) -> str:
+    """Which share of the pictures contradicts which field, the largest first; "" where none does."""
+    shares = sorted(
+        (one for one in found.contradicted if one.pictures),
+        key=lambda one: one.pictures / one.compared, reverse=True,
+    )  # fmt: skip
+    ways = {"velocity": " ways between them"}
+    texts = [
+        f"{one.pictures} of {one.compared}{ways.get(one.field, '')} ({one.pictures / one.compared:.0%}) "
+        f"{'contradicts' if one.pictures == 1 else 'contradict'} the {one.field}"
+        for one in shares
+    ]
+    return before + ", ".join(texts) if texts else ""

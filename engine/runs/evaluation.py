@@ -94,7 +94,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
     try:
         values = {"method": record.method, "profile": record.profile} | dict(record.changed)
         settings = options_from_mapping(TrackSettings, nested(values))
-        files = _recorded_files(record)
+        files = recorded_files(record)
         flight = files.open_flight(settings.telemetry_columns)
         stamps = [row.timestamp_ns for row in flight.rows]
         recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
@@ -106,7 +106,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         return ReportFrames(why_missing=f"{error}.")
 
 
-def _recorded_files(record: RunRecord) -> FlightFiles:
+def recorded_files(record: RunRecord) -> FlightFiles:
     """The files of a finished run.
 
     Raises:
@@ -117,6 +117,7 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         raise TelemetryError("the record of the run lacks its frames")
     return FlightFiles(
         map=record.map,
+        surface=record.surface,
         camera=record.camera,
         frames=record.frames,
         telemetry=record.telemetry,
@@ -125,6 +126,9 @@ def _recorded_files(record: RunRecord) -> FlightFiles:
         image_topic=record.image_topic,
         odometry_topic=record.odometry_topic,
         every=record.every or 1,
+        map_sigma_m=record.map_sigma_m,
+        map_bounds=record.map_bounds,
+        map_crs=record.map_crs,
         hfov_deg=record.hfov_deg,
         mount=record.mount,
         camera_pitch_deg=record.camera_pitch_deg,

@@ -34,7 +34,8 @@ from engine.values import Fix, NoFix, Prior, Reason
 if TYPE_CHECKING:  # rerun is optional
     from engine.report.live_view import LiveView
 
-_FEW_SHARE = 0.5  # of the frames; with fewer fixed the inputs are checked
+# Of the frames: with fewer fixed the inputs are checked, and with few the check is kept even where all fits.
+_CHECKED_SHARE, _FEW_SHARE = 0.9, 0.5
 
 
 def track(
@@ -89,25 +90,28 @@ def track(
     # From the rows as they stand in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
     record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
-    if diagnosis and settings.profile == "engine" and _are_few(rows):
-        record = replace(record, diagnosis=_diagnosis(files, settings, inputs, progress))
+    share = _fixed_share(rows)
+    if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
+        record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
     return write_results(out, rows, inputs.truth, site, ground, record, shown, report=report, progress=progress)
 
 
-def _are_few(rows: Sequence[TrackRow]) -> bool:
-    """Whether few frames were fixed; those that came too late say nothing of the inputs."""
+def _fixed_share(rows: Sequence[TrackRow]) -> float:
+    """Which share of the frames was fixed; those that came too late say nothing of the inputs."""
     answered = [row for row in rows if row.reason != Reason.LATE.value]
-    return sum(row.fixed for row in answered) < _FEW_SHARE * len(answered)
+    return sum(row.fixed for row in answered) / len(answered) if answered else 1.0
 
 
 def _diagnosis(
-    files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, progress: Progress
+    files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, share: float, progress: Progress
 ) -> dict[str, str] | None:
     """What of the inputs does not fit; None where that cannot be said, which is no reason to lose a track."""
-    progress.message("few frames were fixed: looking for what does not fit")
+    progress.message(f"{share:.0%} of the frames were fixed: looking for what does not fit")
     try:
         found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
     except (EngineError, MemoryError, KeyboardInterrupt):
+        return None
+    if not found.findings and share >= _FEW_SHARE:
         return None
     return dict(as_rows(found, corrected=not files.corrections.changes_nothing))
 

@@ -42,6 +42,7 @@ from engine.adapters.mavlink_out import (
     timesync_message,
     withhold_reason,
 )
+from engine.adapters.mavlink_requests import AutopilotRequests
 from engine.adapters.mavlink_status import MIN_RATE_HZ
 from engine.adapters.packets import (
     AUTOPILOT_COMPONENT,
@@ -816,7 +817,10 @@ class Standin:
 
     BOOT_NS = 5_000_000_000
 
-    def __init__(self, port, *, origin=None, key=None, system=1, local=True, receiver=None, flags=None):
+    def __init__(
+        self, port, *, origin=None, key=None, system=1, local=True, receiver=None, flags=None, uptime_ns=BOOT_NS
+    ):
+        self.uptime_ns = uptime_ns  # when it is heard first
         self.mav = autopilot(key, system=system)
         self.parser = mavlink.MAVLink(None)
         self.parser.robust_parsing = True
@@ -839,7 +843,7 @@ class Standin:
         self.socket.close()
 
     def boot_ns(self):
-        return time.monotonic_ns() - self.begin_ns + self.BOOT_NS
+        return time.monotonic_ns() - self.begin_ns + self.uptime_ns
 
     def send(self, message):
         if not self.silent:
@@ -890,7 +894,7 @@ class Standin:
 
 
 class Matched:
-    """A navigator whose every frame is a fix; it re-localises when told."""
+    """A navigator whose every frame is a fix; it re-localises when asked to."""
 
     def __init__(self):
         self.reset_count, self.frames, self.result = 0, [], None
@@ -903,14 +907,14 @@ class Matched:
 def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
     for index in range(2):
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.zeros((8, 8), np.uint8))
-    told_ns = []
+    begun_ns = []
 
     def wait():
         time.sleep(0.2)
-        told_ns.append(time.monotonic_ns())
+        begun_ns.append(time.monotonic_ns())
 
     first, second = (captured_ns for _, captured_ns in replay(tmp_path, None, rate_hz=50.0, wait=wait))
-    assert [first >= told for told in told_ns] == [True]
+    assert [first >= at_ns for at_ns in begun_ns] == [True]
     assert second - first == 20_000_000
     for index in (2, 3):
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((8, 8), index, np.uint8))
@@ -1014,15 +1018,52 @@ def test_fixes_come_at_4_hz_or_more(bridge_to):
     assert hz >= MIN_RATE_HZ
 
 
-@pytest.mark.slow
-def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_to):
+def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_to, monkeypatch):
+    """After 3 s of an autopilot that has had time to find a receiver, here a tenth of it."""
+    monkeypatch.setattr(mavlink_requests, "_ORIGIN_TIMEOUT_NS", 300_000_000)
+    monkeypatch.setattr(mavlink_requests, "_PERIOD_NS", 100_000_000)
     made = bridge_to(origin=ORIGIN)
-    with Standin(made.port) as pilot:
+    with Standin(made.port, uptime_ns=30_000_000_000) as pilot:
         fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
         given = pilot.of("SET_GPS_GLOBAL_ORIGIN")
         assert [(m.latitude, m.longitude, m.altitude) for m, _ in given[:1]] == [(336400000, 729900000, 510000)]
         assert given[0][1] < pilot.of("VISION_POSITION_ESTIMATE")[0][1]
     assert made.bridge.status.withheld["no origin"] > 0
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "armed", "receiver", "expected_s"),
+    [
+        (30.0, False, False, 4.0),  # the first request after 3 s
+        (5.0, False, False, 15.0),  # it may find a receiver until 20 s after its start
+        (5.0, True, False, 4.0),  # none is looked for in flight
+        (30.0, False, True, 61.0),  # a receiver may get its fix for a minute
+    ],
+)
+def test_an_origin_is_set_when_no_receiver_will_set_a_better_one(begin_s, armed, receiver, expected_s):
+    """By a clock of the test's own, asked every 0.1 s: how long after the vehicle is first heard."""
+    requests = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False)
+    now_ns = 10**15
+    requests.restart(now_ns)
+    for tenths in range(1000):
+        telemetry = SimpleNamespace(
+            origin=None, has_receiver=receiver, armed=armed, uptime_ms=begin_s * 1000.0 + 100.0 * tenths
+        )
+        sent = requests.due(telemetry, now_ns + tenths * 100_000_000)
+        if any(message.get_type() == "SET_GPS_GLOBAL_ORIGIN" for message in sent):
+            assert tenths / 10.0 == expected_s
+            return
+    pytest.fail("no origin was set in 100 s")
+
+
+def test_an_origin_that_is_lost_is_set_again_only_after_the_wait():
+    requests = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False)
+    requests.restart(0)
+    for second in range(60):
+        known = ORIGIN if second < 40 else None
+        telemetry = SimpleNamespace(origin=known, has_receiver=False, armed=False, uptime_ms=10**6)
+        sent = [message.get_type() for message in requests.due(telemetry, 10**15 + second * 10**9)]
+        assert ("SET_GPS_GLOBAL_ORIGIN" in sent) == (second >= 43)
 
 
 def test_an_origin_that_is_there_is_not_set_again(bridge_to):
@@ -1189,8 +1230,8 @@ def test_a_cameras_velocity_arrives_without_the_autopilots(bridge_to, by_camera)
 
         fly(made.bridge, seen)
     frame = made.navigator.frames[-1]
-    told = (frame.east_velocity_mps, frame.north_velocity_mps)
-    assert told == (pytest.approx((-4.0, 3.0)) if by_camera else (None, None))
+    stated = (frame.east_velocity_mps, frame.north_velocity_mps)
+    assert stated == (pytest.approx((-4.0, 3.0)) if by_camera else (None, None))
 
 
 def test_the_first_fixes_are_held_against_the_receiver(bridge_to):

@@ -139,7 +139,7 @@ def test_bytes_as_rospy_and_rclpy_have_them(maker, kind):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "stated"),
     [
         ({"encoding": "32FC1"}, "got '32FC1'"),
         ({"encoding": "bayer_rggb8", "width": 1, "height": 1}, "2 x 2 pixels of a Bayer mosaic"),
@@ -150,11 +150,11 @@ def test_bytes_as_rospy_and_rclpy_have_them(maker, kind):
         ({"height": 2**31, "step": 2**31}, "got 36 bytes"),
     ],
 )
-def test_pictures_that_are_none_are_named(maker, changes, told):
+def test_pictures_that_are_none_are_named(maker, changes, stated):
     message = maker.image(NOW_NS, "", np.zeros((4, 3, 3), np.uint8))
     for name, value in changes.items():
         setattr(message, name, value)
-    with pytest.raises(TelemetryError, match=told):
+    with pytest.raises(TelemetryError, match=stated):
         image_from_message(message)
 
 
@@ -240,10 +240,10 @@ def a_range(maker, range_m):
                       field_of_view=0.1, min_range=0.5, max_range=50.0, range=range_m)  # fmt: skip
 
 
-@pytest.mark.parametrize(("range_m", "told"), [(12.0, 12.0), (0.1, None), (60.0, None), (math.inf, None),
+@pytest.mark.parametrize(("range_m", "stated"), [(12.0, 12.0), (0.1, None), (60.0, None), (math.inf, None),
                                                (math.nan, None), (-math.inf, None)])  # fmt: skip
-def test_ranges_beyond_reach_are_unknown(maker, range_m, told):
-    assert range_from_message(a_range(maker, range_m)) == told
+def test_ranges_beyond_reach_are_unknown(maker, range_m, stated):
+    assert range_from_message(a_range(maker, range_m)) == stated
 
 
 def test_a_range_of_any_sensor_says_nothing(maker):
@@ -324,7 +324,7 @@ def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, chi
 
 
 @pytest.mark.parametrize(
-    ("variances", "told_mps"),
+    ("variances", "sigma_mps"),
     [
         ((0.04, 0.09, 0.01), math.hypot(0.3, math.radians(1.0) * 10.0)),  # the heading is off by a degree
         ((1e-12, 1e-12, 1e-12), math.radians(1.0) * 10.0),
@@ -334,18 +334,18 @@ def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, chi
         ((0.04, 30.0, 0.04), None),  # lost
     ],
 )
-def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, told_mps):
+def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, sigma_mps):
     message = odometry_message(maker, NOW_NS, (0.0, 0.0, 90.0), (10.0, 0.0, 0.0), variances=variances)
-    told = body_velocity_from_message(wired(ros, message))
-    if told_mps is None:
-        assert told is None
+    stated = body_velocity_from_message(wired(ros, message))
+    if sigma_mps is None:
+        assert stated is None
     else:
-        assert told == pytest.approx((10.0, 0.0, 0.0, told_mps), abs=1e-9)
+        assert stated == pytest.approx((10.0, 0.0, 0.0, sigma_mps), abs=1e-9)
         heard = RosTelemetry()
         heard.odometry(message, 0)
         heard.imu(maker.imu(NOW_NS, "", 0.0, 0.0, 90.0))
         frame = heard.vehicle(NOW_NS).frame(np.zeros((4, 6), np.uint8), NOW_NS)
-        assert frame.velocity_sigma_mps == (pytest.approx(told_mps) if told_mps else None)
+        assert frame.velocity_sigma_mps == (pytest.approx(sigma_mps) if sigma_mps else None)
 
 
 def test_a_velocity_takes_the_place_of_an_odometry_that_is_silent(maker):
@@ -387,11 +387,11 @@ def test_an_odometry_that_says_nothing(maker):
 
 
 @pytest.mark.parametrize(
-    ("variances", "told_mps"),
+    ("variances", "sigma_mps"),
     [(None, None), ((0.0, 0.0, 0.0), None), ((0.04, 0.09, 0.01), 0.3)],
 )
 @pytest.mark.parametrize("frame", ["base_link", "/base_link", "uav1/base_link"])
-def test_a_twist_by_itself_is_turned_as_an_odometrys(ros, maker, frame, variances, told_mps):
+def test_a_twist_by_itself_is_turned_as_an_odometrys(ros, maker, frame, variances, sigma_mps):
     rng = np.random.default_rng(6)
     for angles in random_angles(10):
         enu_mps, heard = rng.normal(0.0, 8.0, 3), RosTelemetry()
@@ -401,8 +401,8 @@ def test_a_twist_by_itself_is_turned_as_an_odometrys(ros, maker, frame, variance
         now = heard.vehicle(NOW_NS)
         assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
         turned_mps = math.radians(1.0) * np.linalg.norm(enu_mps)  # the heading is off by a degree
-        told = None if told_mps is None else pytest.approx(math.hypot(told_mps, turned_mps))
-        assert now.velocity_sigma_mps == told
+        stated = None if sigma_mps is None else pytest.approx(math.hypot(sigma_mps, turned_mps))
+        assert now.velocity_sigma_mps == stated
 
 
 @pytest.mark.parametrize("frame", ["", "odom", "map", "base_link_frd", "dvl_link", "base_link/"])
@@ -561,7 +561,7 @@ class StandIn:
 
 
 class Answers:
-    """A navigator that answers as it is told."""
+    """A navigator that answers as it was set up to."""
 
     def __init__(self, make):
         self.make, self.frames = make, []
@@ -619,10 +619,10 @@ def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
         status = bridge.status
     assert not node.of("pose")
     assert not node.of("fix")
-    told = [message.status[0] for message in node.of("diagnostics")]
-    assert [status.level for status in told] == [1] * len(told)
+    stated = [message.status[0] for message in node.of("diagnostics")]
+    assert [status.level for status in stated] == [1] * len(stated)
     assert status.refused == {**{reason.value: 1 for reason in Reason}, "not finite": 2}
-    assert {pair.key: pair.value for pair in told[0].values}["reason"] == next(iter(Reason)).value
+    assert {pair.key: pair.value for pair in stated[0].values}["reason"] == next(iter(Reason)).value
 
 
 def test_nobody_looks_at_the_window(maker, sim_site):
@@ -640,7 +640,7 @@ def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
         odd.encoding = "32FC1"
         bridge.on_image(odd)
         bridge.on_image(an_image(maker, NOW_NS + 1))
-        node.wait_for("diagnostics", 2)  # the odd one's, and the fix's, which is told when it has been counted
+        node.wait_for("diagnostics", 2)  # the odd one's, and the fix's, which is reported when it has been counted
         bridge.on_image(an_image(maker, NOW_NS))  # older than the last
         status = bridge.status
     first = node.of("diagnostics")[0].status[0]
@@ -671,10 +671,10 @@ def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, s
             heard(wired(ros, message))
             bridge.on_image(an_image(maker, NOW_NS - 3 + k))
             node.wait_for("diagnostics", k + 1)
-    told = [{pair.key: pair.value for pair in message.status[0].values} for message in node.of("diagnostics")]
-    assert [each.get("odometry", "") != "" for each in told] == [True, True, False]
-    assert "along base_link (forward-left-up), got one along 'odom'" in told[0]["odometry"]
-    assert [each["velocity"] for each in told] == ["unknown", "unknown", "known"]
+    stated = [{pair.key: pair.value for pair in message.status[0].values} for message in node.of("diagnostics")]
+    assert [each.get("odometry", "") != "" for each in stated] == [True, True, False]
+    assert "along base_link (forward-left-up), got one along 'odom'" in stated[0]["odometry"]
+    assert [each["velocity"] for each in stated] == ["unknown", "unknown", "known"]
     assert caplog.text.count("an odometry cannot be used: frame_id: expected") == 1
     assert seen.frames[2].north_velocity_mps == pytest.approx(2.0)
 
@@ -848,8 +848,8 @@ def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
         "1",
         "LOCALHOST",
     )
-    told = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
-    assert np.array_equal(camera_from_message(told).matrix, camera.matrix)
+    stated = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
+    assert np.array_equal(camera_from_message(stated).matrix, camera.matrix)
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
     with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, None)
@@ -968,10 +968,10 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setenv("ROS_IP", "127.0.0.1")
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    for version, code, told in (("1", 1, "rospy"), ("2", 1, "rclpy"), ("3", 2, "--ros: expected 1 or 2")):
+    for version, code, stated in (("1", 1, "rospy"), ("2", 1, "rclpy"), ("3", 2, "--ros: expected 1 or 2")):
         capsys.readouterr()
         assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "map.tif")]) == code
-        assert told in capsys.readouterr().err
+        assert stated in capsys.readouterr().err
     assert main(["bridge", "ros", "--map", str(tmp_path / "map.tif"), "--firmware", "x"]) == 2
 
 
@@ -991,20 +991,22 @@ def test_arguments_of_ros_are_told_apart(typed, moved):
 
 
 def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
-    for version, given, told in (
+    for version, given, stated in (
         ("1", ["--ros-args", "-r", "a:=b"], "expected NAME:=VALUE for ROS 1, got --ros-args -r"),
         ("2", ["a:=b"], "expected --ros-args -r NAME:=VALUE, got a:=b"),
         ("1", ["nonsense"], "expected NAME:=VALUE for ROS 1, got nonsense"),
     ):
         assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "m.tif"), *given]) == 2
-        assert told in capsys.readouterr().err
+        assert stated in capsys.readouterr().err
 
 
 def test_an_odometry_of_another_message_is_refused(capsys, tmp_path):
     given = ["--odometry-topic", "/vio", "--odometry-type", "PoseStamped"]
     assert main(["bridge", "ros", "--map", str(tmp_path / "m.tif"), *given]) == 2
-    told = "--odometry-type: expected one of Odometry, TwistWithCovarianceStamped, TwistStamped, got 'PoseStamped'"
-    assert told in capsys.readouterr().err
+    stated = (
+        "--odometry-type: expected one of Odometry, TwistWithCovarianceStamped, TwistStamped, got 'PoseStamped'"
+    )
+    assert stated in capsys.readouterr().err
 
 
 def test_the_command_line_names_the_topics_of_the_code(capsys):

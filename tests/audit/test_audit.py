@@ -336,10 +336,10 @@ def test_people_get_a_table_and_a_pipe_no_escapes(map_file, route_file, tmp_path
     printed = capsys.readouterr()
     assert re.search(r"^good +\d+\.\d%$", printed.out, re.MULTILINE)
     assert "poor: flat" in printed.out
-    told = printed.err.splitlines()
-    assert told[0] == f"written to {tmp_path / 'out'}"
-    assert len(told) == 2
-    assert told[1].startswith("next: scenematch track --map ")
+    stated = printed.err.splitlines()
+    assert stated[0] == f"written to {tmp_path / 'out'}"
+    assert len(stated) == 2
+    assert stated[1].startswith("next: scenematch track --map ")
     assert "\x1b" not in printed.out
 
 

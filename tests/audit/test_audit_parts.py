@@ -95,10 +95,10 @@ def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(site):
     whole = audit_site(site, CAMERA, HEIGHT_M)
     part = audit_site(site, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
     assert len(part.plan) < 0.5 * len(whole.plan)
-    told, expected = (predict_route(one, *route.T) for one in (part, whole))
-    assert told.length_m == expected.length_m
-    assert told.availability == pytest.approx(expected.availability, abs=0.05)
-    assert Flag.OUTSIDE not in part.flag_at(told.xy_px)
+    stated, expected = (predict_route(one, *route.T) for one in (part, whole))
+    assert stated.length_m == expected.length_m
+    assert stated.availability == pytest.approx(expected.availability, abs=0.05)
+    assert Flag.OUTSIDE not in part.flag_at(stated.xy_px)
     assert (part.flags == Flag.OUTSIDE).any()
     np.testing.assert_array_equal(part.flags == Flag.OUTSIDE, ~part.plan.audited)
     assert np.isnan(part.availability[~part.plan.audited]).all()

@@ -62,14 +62,14 @@ def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
         ["map", "info", flight / "map.tif"],
         ["bridge", "mavlink", "--connect=udpout:127.0.0.1:9", *files, "--seconds=0.1"],
     ]
-    codes, told = run_without(lines)
+    codes, stated = run_without(lines)
     assert dict(zip([" ".join(map(str, line[:2])) for line in lines], codes, strict=True)) == {
         " ".join(map(str, line[:2])): 0 for line in lines
-    }, told
-    assert "Traceback" not in told
+    }, stated
+    assert "Traceback" not in stated
     assert (out / "report.html").is_file()
     assert not list(out.glob("*.png"))
-    assert told.count("no plots are drawn: expected matplotlib to be installed, got none: pip install") == 2
+    assert stated.count("no plots are drawn: expected matplotlib to be installed, got none: pip install") == 2
 
 
 @pytest.mark.parametrize(

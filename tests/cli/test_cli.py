@@ -185,8 +185,8 @@ def test_evaluate_takes_another_truth_and_drops_figures_that_no_longer_hold(done
 
 def test_start_comes_before_the_telemetry(copy, tmp_path):
     truth = cells(copy / "truth.csv")[0]
-    told = (copy / "telemetry.csv").read_text(encoding="utf-8").splitlines(keepends=True)
-    (copy / "telemetry.csv").write_text("".join(told[:2]), encoding="utf-8")  # of the first frame alone
+    lines = (copy / "telemetry.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    (copy / "telemetry.csv").write_text("".join(lines[:2]), encoding="utf-8")  # of the first frame alone
     # So far from the truth, and so sure of it, that nothing but the start itself can lead astray.
     lat = float(truth["lat_deg"]) + 0.002
     out = tmp_path / "out"
@@ -319,8 +319,8 @@ def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
     assert run(["doctor", "--json"]) == 1
     facts = json.loads(capsys.readouterr().out)
     assert facts["missing"] == ["no-such-package"]
-    told = f"pillow {metadata.version('pillow')}, no-such-tool is not installed"
-    assert [(name, value) for name, value in facts.items() if "extra" in name] == [("extra [pictures]", told)]
+    expected = f"pillow {metadata.version('pillow')}, no-such-tool is not installed"
+    assert [(name, value) for name, value in facts.items() if "extra" in name] == [("extra [pictures]", expected)]
 
 
 @pytest.mark.parametrize(

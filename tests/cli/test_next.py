@@ -121,3 +121,34 @@ def test_names_with_spaces_stay_one_word(capsys):
     console.next_step(f"track {console.options(map='a map.tif', truth=None, log_offset_s=2)}")
     said = capsys.readouterr().err
     assert shlex.split(said)[2:] == ["track", "--map", "a map.tif", "--log-offset-s", "2"]
+
+
+@pytest.mark.usefixtures("bare_runs")
+def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_path, capsys):
+    """An export would refuse it. By ncc every frame is refused under a heading that is 90 degrees off."""
+    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
+    files = [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
+    wrong = ["--height-offset-m", "900.0", "--every", "2", "--column", "heading_deg=heading_deg+90"]
+    out = tmp_path / "out"
+    words = next_of(capsys, ["track", *files, *wrong, "--out", str(out), "--method", "ncc", "--profile", "paper"])
+    assert json.loads((out / "summary.json").read_text())["fixes"] == 0
+    assert parsed(words) == "check"
+    assert set(files) | set(wrong) <= set(words)
+    words = next_of(capsys, ["evaluate", str(out), "--truth", str(flight / "truth.csv")])
+    assert parsed(words) == "check"
+    assert set(files) | set(wrong) <= set(words)
+    assert parsed(next_of(capsys, ["report", str(out)])) == "check"
+    words = next_of(capsys, words)
+    assert parsed(words) == "track"
+    assert set(files) | set(wrong) <= set(words)
+
+
+@pytest.mark.usefixtures("bare_runs")
+def test_compare_uses_the_settings_file_that_is_there(flight, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenematch.toml").touch()
+    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
+    files = [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
+    words = next_of(capsys, ["compare", *files, "--out=compared", "--run=ncc"])
+    assert parsed(words) == "track"
+    assert set(files) | {"--settings", "scenematch.toml"} <= set(words)

@@ -96,9 +96,9 @@ def test_a_flight_comes_back(tmp_path, kind):
     prior = next(iter(flight)).prior
     assert (prior.lat_deg, prior.lon_deg) == pytest.approx((48.2001, 15.1001), abs=1e-12)
     assert prior.sigma_m == pytest.approx(12.0)
-    for row, told in zip(open_truth(path, frames[0].timestamp_ns), truth, strict=True):
+    for row, true in zip(open_truth(path, frames[0].timestamp_ns), truth, strict=True):
         for name in Truth.__slots__:
-            assert getattr(row, name) == pytest.approx(getattr(told, name), abs=1e-9)
+            assert getattr(row, name) == pytest.approx(getattr(true, name), abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", BAG_KINDS)
@@ -236,8 +236,8 @@ def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ma
         assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
     flight = open_flight(path, odometry_topic="/vio/odometry")
     for k, item in zip((1, 6, 11), flight, strict=True):
-        told = item.frame.east_velocity_mps, item.frame.north_velocity_mps
-        assert told == pytest.approx((0.5 * k, -3.0), abs=1e-9)
+        velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
+        assert velocity == pytest.approx((0.5 * k, -3.0), abs=1e-9)
         speed_mps = np.linalg.norm((0.5 * k, -3.0, 0.25))
         assert item.frame.velocity_sigma_mps == pytest.approx(np.hypot(0.4, np.radians(1.0) * speed_mps))
     unstated = a_bag_with_odometry(tmp_path / "zeros.bag", maker)
@@ -253,8 +253,8 @@ def test_a_twist_by_itself_is_an_odometry_too(tmp_path, ros1, variances):
     path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker, variances=variances, by=twist_message)
     flight = open_flight(path, odometry_topic="/vio/odometry")
     for k, item in zip((1, 6, 11), flight, strict=True):
-        told = item.frame.east_velocity_mps, item.frame.north_velocity_mps
-        assert told == pytest.approx((0.5 * k, -3.0), abs=1e-9)
+        velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
+        assert velocity == pytest.approx((0.5 * k, -3.0), abs=1e-9)
         turned_mps = np.radians(1.0) * np.linalg.norm((0.5 * k, -3.0, 0.25))
         stated = None if variances is None else pytest.approx(np.hypot(0.4, turned_mps))
         assert item.frame.velocity_sigma_mps == stated
@@ -262,8 +262,8 @@ def test_a_twist_by_itself_is_an_odometry_too(tmp_path, ros1, variances):
 
 def test_a_twist_along_other_axes_is_refused(tmp_path, maker):
     path = a_bag_with_odometry(tmp_path / "x.bag", maker, by=partial(twist_message, frame="odom"))
-    told = r"x\.bag: /vio/odometry: frame_id: expected a velocity along base_link .*, got one along 'odom'"
-    with pytest.raises(TelemetryError, match=told):
+    message = r"x\.bag: /vio/odometry: frame_id: expected a velocity along base_link .*, got one along 'odom'"
+    with pytest.raises(TelemetryError, match=message):
         read_bag(path, odometry_topic="/vio/odometry")
     with pytest.raises(TelemetryError, match=r"/uav/velocity_local: .*, got one along 'map'"):
         read_bag(path, odometry_topic="/uav/velocity_local")
@@ -272,8 +272,8 @@ def test_a_twist_along_other_axes_is_refused(tmp_path, maker):
 def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
     path = a_bag_with_odometry(tmp_path / "x.bag", maker)
     for other in ("/odom", "/imu/data"):
-        told = f"nav_msgs/msg/Odometry or .* on {other}, got /uav/velocity_local, /vio/odometry"
-        with pytest.raises(TelemetryError, match=told):
+        message = f"nav_msgs/msg/Odometry or .* on {other}, got /uav/velocity_local, /vio/odometry"
+        with pytest.raises(TelemetryError, match=message):
             read_bag(path, odometry_topic=other)
     path = a_bag_with_odometry(tmp_path / "blind.bag", maker, without=("/imu/data",))
     with pytest.raises(TelemetryError, match="expected a heading at the times of /vio/odometry, got none"):

@@ -95,10 +95,10 @@ def followed(flight, tmp_path, frames, truth, *, method="ncc"):
     summary = track(files, tmp_path / "out", TrackSettings(method=method), report=False)
     assert summary["fixes"] == summary["scored_fixes"] == len(frames)
     assert summary["max_m"] < 3.0  # without a surface model roofs lean
-    told = read_truth(flight / "truth.csv")
-    frame = LocalFrame(told[0].lat_deg, told[0].lon_deg)
-    assert len(told) == len(truth)
-    return frame, told
+    stated = read_truth(flight / "truth.csv")
+    frame = LocalFrame(stated[0].lat_deg, stated[0].lon_deg)
+    assert len(stated) == len(truth)
+    return frame, stated
 
 
 def sequence(root, in_degrees, frames, truth, *, pieces=None, columns=10):
@@ -134,8 +134,8 @@ def test_uav_visloc_is_followed_where_it_says_that_it_was(in_degrees, frames, tr
     facts = json.loads(said.out)
     assert (facts["dataset"], facts["part"], facts["frames"], facts["findings"]) == ("UAV-VisLoc", "03", 4, [])
     assert "24 to 48 m" in said.err
-    _, told = followed(flight, tmp_path, frames, truth)
-    for row, true in zip(told, truth, strict=True):
+    _, stated = followed(flight, tmp_path, frames, truth)
+    for row, true in zip(stated, truth, strict=True):
         assert (row.lat_deg, row.lon_deg) == pytest.approx((true.lat_deg, true.lon_deg), abs=1e-8)
     rows = read_telemetry(flight / "telemetry.csv")
     assert rows[0].timestamp_ns == 1532142245_500000000  # taken as UTC
@@ -165,9 +165,9 @@ def test_uav_visloc_in_pieces_is_the_same_map_and_a_sequence_may_lack_its_attitu
     assert maps["whole"][1] == pytest.approx(maps["cut"][1], abs=1e-9)
     assert np.array_equal(maps["whole"][0], np.moveaxis(in_degrees[0], 2, 0))
     assert (maps["cut"][2] == 255).all()
-    told = capsys.readouterr().err
-    assert "this sequence has no attitude" in told
-    assert "4 of 4 rows have no heading" in told
+    stated = capsys.readouterr().err
+    assert "this sequence has no attitude" in stated
+    assert "4 of 4 rows have no heading" in stated
     row = read_telemetry(tmp_path / "flights" / "cut" / "telemetry.csv")[0]
     assert row.alt_amsl_m - row.height_agl_m == pytest.approx(20.0)
 
@@ -231,9 +231,9 @@ def test_wildnav_is_followed_on_its_map_of_pictures(in_degrees, frames, truth, t
     assert "--interval-s: expected seconds between pictures" in capsys.readouterr().err
     assert not flight.exists()
     assert run([*command, "--interval-s=0.893"]) == 0
-    told = capsys.readouterr().err
-    assert "1 of 5 pictures are missing" in told
-    assert "1 of 3 pictures of the map are missing" in told
+    stated = capsys.readouterr().err
+    assert "1 of 5 pictures are missing" in stated
+    assert "1 of 3 pictures of the map are missing" in stated
     followed(flight, tmp_path, frames, truth)
 
 
@@ -281,8 +281,8 @@ def test_vpair_is_followed_on_the_users_map(plan, frames, truth, tmp_path, capsy
     assert run(command) == 2
     assert "--map: expected a map, since the data set has none" in capsys.readouterr().err
     assert run([*command, f"--map={tmp_path / 'town.tif'}", f"--ground-m={GROUND_M}"]) == 0
-    _, told = followed(flight, tmp_path, frames, truth)
-    for row, frame in zip(told, frames, strict=True):
+    _, stated = followed(flight, tmp_path, frames, truth)
+    for row, frame in zip(stated, frames, strict=True):
         assert row.alt_amsl_m == pytest.approx(frame.height_agl_m + GROUND_M, abs=1e-3)
         assert row.height_agl_m == pytest.approx(frame.height_agl_m, abs=1e-3)
 
@@ -324,8 +324,8 @@ def test_alto_is_followed_on_the_map_of_its_aerial_pictures(plan, frames, truth,
     assert "the picture's right points to the nose" in capsys.readouterr().err
     followed(flight, tmp_path, frames, truth)
     for row, frame in zip(read_telemetry(flight / "telemetry.csv"), frames, strict=True):
-        told = (row.roll_deg, row.pitch_deg, row.heading_deg, row.height_agl_m)
-        assert told == pytest.approx(
+        stated = (row.roll_deg, row.pitch_deg, row.heading_deg, row.height_agl_m)
+        assert stated == pytest.approx(
             (frame.roll_deg, frame.pitch_deg, frame.heading_deg % 360, frame.height_agl_m), abs=2e-3
         )
 
@@ -676,8 +676,8 @@ def test_ortholoc_becomes_flights_of_one_frame_that_are_followed(plan, frames, t
     assert [job.name for job in plans.runs] == [f"L01_R000{k}/{run}" for k in (0, 1) for run in ("ncc", "sift")]
     assert set(plans.groups.values()) == {"OrthoLoC"}
     row = read_telemetry(out / "L01_R0000" / "telemetry.csv")[0]
-    told = (row.roll_deg, row.pitch_deg, row.height_agl_m)
-    assert told == pytest.approx((truth[0].roll_deg, truth[0].pitch_deg, truth[0].height_agl_m), abs=20.0)
+    stated = (row.roll_deg, row.pitch_deg, row.height_agl_m)
+    assert stated == pytest.approx((truth[0].roll_deg, truth[0].pitch_deg, truth[0].height_agl_m), abs=20.0)
 
 
 @pytest.mark.slow

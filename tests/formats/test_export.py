@@ -205,8 +205,8 @@ def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_pa
     write_track(tmp_path / "track.csv", ROWS)
     arguments = ["export", str(tmp_path), "--format", kind, "--json"]
     assert run(arguments) == 0
-    told = json.loads(capfd.readouterr().out)
-    assert (told["fixes"], told["segments"]) == (6, 3)
+    stated = json.loads(capfd.readouterr().out)
+    assert (stated["fixes"], stated["segments"]) == (6, 3)
     written = tmp_path / f"track.{kind}"
     assert written.stat().st_size > 100
     written.write_text("mine")

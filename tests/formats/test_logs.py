@@ -460,7 +460,7 @@ def test_mutated_files_are_read_or_refused():
 
     done = fuzz(count=150, seed=3)
     assert len(done.outcomes) == 8
-    assert all(told.total() == 150 for told in done.outcomes.values())
+    assert all(stated.total() == 150 for stated in done.outcomes.values())
 
 
 @pytest.mark.parametrize("piece", [" ", "\n", "a.", "<", "GPS(1,2,", "a  ", "1", "a:"])
@@ -493,8 +493,8 @@ def test_dataflash_is_read_as_pymavlink_reads_it(tmp_path):
         (row,), _ = at(log, message.TimeUS / 1e6)
         count += 1
         if message.get_type() == "ATT":
-            told = (message.Roll, message.Pitch, message.Yaw % 360.0)
-            assert (row.roll_deg, row.pitch_deg, row.heading_deg) == pytest.approx(told)
+            stated = (message.Roll, message.Pitch, message.Yaw % 360.0)
+            assert (row.roll_deg, row.pitch_deg, row.heading_deg) == pytest.approx(stated)
         else:
             assert (row.lat_deg, row.lon_deg, row.alt_amsl_m) == pytest.approx(
                 (message.Lat, message.Lng, message.Alt)
@@ -537,9 +537,9 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
 
     log, table = str(flown / "flight.BIN"), str(flown / "telemetry.csv")
     assert follow("log", "--telemetry", log, "--truth", log) == 0
-    told = capfd.readouterr()
-    assert "height above ground, by source, of 3 frames: take-off 3" in told.err
-    summary = json.loads(told.out)
+    stated = capfd.readouterr()
+    assert "height above ground, by source, of 3 frames: take-off 3" in stated.err
+    summary = json.loads(stated.out)
     assert summary["fixes"] == summary["scored_fixes"] == 3
     assert summary["settings"]["heights"] == {"take-off": 3}
     assert follow("csv", "--telemetry", table) == 0
@@ -554,13 +554,13 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
     rows = read_telemetry(table)
     lines = [f"{row.timestamp_ns - 500_000_000},{row.frame}" for row in rows]
     stamps.write_text("\n".join(["timestamp_ns,frame", *lines]) + "\n", encoding="utf-8")
-    told = ["--frame-stamps", str(stamps), "--log-offset-s", "0.5", "--map-sigma-m", "2"]
-    assert follow("told", "--telemetry", log, "--truth", log, *told) == 0
-    page, summary = (tmp_path / "told" / name for name in ("report.html", "summary.json"))
+    stated = ["--frame-stamps", str(stamps), "--log-offset-s", "0.5", "--map-sigma-m", "2"]
+    assert follow("stated", "--telemetry", log, "--truth", log, *stated) == 0
+    page, summary = (tmp_path / "stated" / name for name in ("report.html", "summary.json"))
     before = page.read_bytes(), summary.read_bytes()
     assert b"No frames are shown" not in before[0]
     assert all(word in before[0] for word in (str(stamps).encode(), b"<td>log offset (s)</td>", b"map sigma (m)"))
-    assert run(["evaluate", str(tmp_path / "told")]) == 0
+    assert run(["evaluate", str(tmp_path / "stated")]) == 0
     assert (page.read_bytes(), summary.read_bytes()) == before
     capfd.readouterr()
     assert follow("no", "--telemetry", table, "--log-offset-s", "1") == 2

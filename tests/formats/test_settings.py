@@ -86,7 +86,7 @@ def test_what_is_wrong_is_named(tmp_path, text, message):
 
 
 def test_a_file_cannot_hold_what_is_no_value():
-    """A matcher of the user's own is code; a file that names one is told so."""
+    """A matcher of the user's own is code; a file that names one is refused with that reason."""
     with pytest.raises(OptionError, match=r"^matcher: not a setting"):
         options_from_mapping(SiftOptions, {"matcher": "mine"})
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ def make_map(height_px, width_px):
     """Samples of a rough map whose levels all count as large, and the map."""
     gray = np.random.default_rng(1).integers(0, 256, (height_px, width_px), dtype=np.uint8)
     site = OrthoMap.from_arrays(gray, AFFINE, "EPSG:32633", surface_m=np.zeros(gray.shape, np.float32))
-    return SampleMap(site, PreparedMap(site, torch.device("cpu"), 8)), site
+    return SampleMap(site, PreparedMap(site, torch.device("cpu"), 8).enhanced), site
 
 
 @pytest.fixture
@@ -66,3 +68,13 @@ def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
         sys.setswitchinterval(before)
     assert len(found) == len(windows)
     assert len(sampled._cells) == 1
+
+
+def test_samples_are_the_same_with_and_without_a_prepared_map(by_cells):
+    """A method that does not correlate enhances the map for its samples alone."""
+    sampled, site = make_map(2 * CELL_PX, 2 * CELL_PX)
+    alone = SampleMap(site, partial(prepared.enhanced_part, site, 8, "local"))
+    for window, level in ((Window(100, 90, 300, 280), 0), (Window(20, 30, 120, 100), 1)):
+        for field in fields(Samples):
+            expected, actual = (getattr(one.find(window, level), field.name) for one in (sampled, alone))
+            np.testing.assert_array_equal(actual, expected)

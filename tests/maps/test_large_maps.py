@@ -213,7 +213,7 @@ def tiny_limits(monkeypatch):
 
 @pytest.fixture
 def picture(request, tmp_path):
-    """A smooth map without overviews, in metres unless told otherwise; a corner and a tile inside are nodata."""
+    """A smooth map without overviews, in metres unless asked otherwise; a corner and a tile inside are nodata."""
     noise = np.random.default_rng(1).uniform(0.0, 255.0, (400, 500))
     data = np.clip(128.0 + 8.0 * (cv2.GaussianBlur(noise, (0, 0), 4.0) - 127.5), 1, 254).astype(np.uint8)
     data[:128, :128] = data[128:256, 256:384] = 0
@@ -295,34 +295,34 @@ def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limit
 def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(picture, tmp_path, request, size):
     if size == "large":
         request.getfixturevalue("tiny_limits")
-    told = []
+    stated = []
 
     def opened():
-        return OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: told.append(pixels))
+        return OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: stated.append(pixels))
 
     site = opened()
     if size == "small" and not site.info()["resampled"]:
-        assert told == []  # nothing to copy
+        assert stated == []  # nothing to copy
         return
-    area_px, done = site.width_px * site.height_px, [pixels for pixels, _ in told]
-    assert told[-1] == (area_px, area_px)
+    area_px, done = site.width_px * site.height_px, [pixels for pixels, _ in stated]
+    assert stated[-1] == (area_px, area_px)
     assert done == sorted(done)
-    assert {total for _, total in told} == {area_px}
+    assert {total for _, total in stated} == {area_px}
     if size == "large":
         assert done[0] == 0  # before anything is read
-        assert len(told) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
-    count = len(told)
+        assert len(stated) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
+    count = len(stated)
     opened()
-    assert len(told) == count
+    assert len(stated) == count
 
 
 def test_a_copy_that_is_carried_on_begins_where_it_was(picture, tmp_path, tiny_limits):
     OrthoMap.open(picture, cache_dir=tmp_path / "cache")
     (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.name != "hashes")
     (folder / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
-    told = []
-    OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: told.append(pixels))
-    assert told == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
+    stated = []
+    OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: stated.append(pixels))
+    assert stated == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -345,8 +345,8 @@ def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, t
     site = OrthoMap.open(picture, cache_dir=cache)
     pixels, valid = site.gray(whole(site)), site.valid(whole(site))
     (folder,) = (path for path in cache.iterdir() if path.name != "hashes")
-    tile, told = folder / "0002-0001.tif", folder / "tiles.txt"
-    content, lines = tile.read_bytes(), told.read_text()
+    tile, stated = folder / "0002-0001.tif", folder / "tiles.txt"
+    content, lines = tile.read_bytes(), stated.read_text()
     if damage == "bytes":
         tile.write_bytes(content[:-40] + bytes(40))
     elif damage == "cut":
@@ -354,7 +354,7 @@ def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, t
     elif damage == "gone":
         tile.unlink()
     else:
-        told.write_text("" if damage == "no list" else lines[: len(lines) - 20])
+        stated.write_text("" if damage == "no list" else lines[: len(lines) - 20])
     made = []
     write = metric_copy._write
     monkeypatch.setattr(metric_copy, "_write", lambda t, *a, **o: made.append(t.name) or write(t, *a, **o))

@@ -239,23 +239,23 @@ def test_a_coarser_level_with_gaps_of_its_own_is_none(own, picture, tmp_path, ti
 def test_a_large_cache_without_coarser_levels_is_copied_once_and_again_when_a_tile_changes(
     own, plain, tmp_path, tiny_limits
 ):
-    told = []
+    stated = []
 
     def opened():
-        told.clear()
-        site = OrthoMap.open(own, cache_dir=tmp_path / "copies", on_copy=lambda *pixels: told.append(pixels))
+        stated.clear()
+        site = OrthoMap.open(own, cache_dir=tmp_path / "copies", on_copy=lambda *pixels: stated.append(pixels))
         return site.gray(WHOLE), site.valid(WHOLE)
 
     gray, valid = opened()
-    assert told
-    assert told[-1] == (WHOLE.area_px, WHOLE.area_px)
+    assert stated
+    assert stated[-1] == (WHOLE.area_px, WHOLE.area_px)
     np.testing.assert_array_equal(valid, there())
     np.testing.assert_array_equal(gray[valid], OrthoMap.open(plain).gray(WHOLE)[valid])
     opened()
-    assert told == []
+    assert stated == []
     Image.new("RGB", (TILE, TILE), (77, 77, 77)).save(tile_path(own))
     assert (opened()[0][:TILE, :TILE] == 77).all()
-    assert told
+    assert stated
 
 
 # ------------------------------------------------------------------------------------------------- refusals

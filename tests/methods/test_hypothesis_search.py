@@ -52,7 +52,7 @@ def near(truth, sigma_m=8.0):
     return Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=sigma_m)
 
 
-def told(frame, turn_deg=0.0, share=0.0):
+def stated(frame, turn_deg=0.0, share=0.0):
     heading = (frame.heading_deg + turn_deg) % 360.0
     return replace(frame, heading_deg=heading, height_agl_m=frame.height_agl_m * (1.0 + share))
 
@@ -83,7 +83,7 @@ def test_a_wrong_heading_and_height_are_put_right(
     bank = matcher(heading_search_deg=5.0, height_search_share=0.05)
     for k in PLACES:
         frame, truth = flight.frames[k], flight.truth[k]
-        fix = bank.locate(told(frame, turn_deg, share), near(truth) if known else None)
+        fix = bank.locate(stated(frame, turn_deg, share), near(truth) if known else None)
         assert error_m(site, fix, truth) < 2.0
         assert turn_between(fix.attitude.heading_deg, truth.heading_deg) < 0.3
         assert aligned_heights[-1] == pytest.approx(truth.height_agl_m, rel=0.005)
@@ -106,7 +106,7 @@ def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site,
 
 @KNOWN
 def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matcher, flight, known):
-    """Where the heading was told and is trusted, a search of the whole map measures no attitude either."""
+    """Where the heading is given and trusted, a search of the whole map measures no attitude either."""
     frame, truth = flight.frames[PLACES[0]], flight.truth[PLACES[0]]
     fix = matcher().locate(frame, near(truth) if known else None)
     assert isinstance(fix, Fix)

@@ -99,8 +99,8 @@ def test_a_compass_that_is_a_few_degrees_off_is_found_out(ground, camera, turn_d
     frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
     rng = np.random.default_rng(3)  # dim and noisy, so that the turned patch does not do by itself
     image = np.clip(0.25 * frame.image + 90 + rng.normal(0, 14, frame.image.shape), 0, 255).astype(np.uint8)
-    told = replace(frame, image=image, heading_deg=40.0 + turn_deg)
-    result = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR))
+    stated = replace(frame, image=image, heading_deg=40.0 + turn_deg)
+    result = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR))
     assert isinstance(result, Fix)
     assert np.hypot(*(np.array(result.map_xy_px) - NADIR)) < 3.0
     assert result.attitude is not None
@@ -111,8 +111,10 @@ def test_no_heading_makes_another_place_look_right(ground, camera):
     frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
     mirrored = replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]))
     for heading_deg in (36.0, 40.0, 44.0):
-        told = replace(mirrored, heading_deg=heading_deg)
-        assert isinstance(SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR)), NoFix)
+        stated = replace(mirrored, heading_deg=heading_deg)
+        assert isinstance(
+            SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR)), NoFix
+        )
 
 
 @pytest.mark.parametrize("turn_deg", [-4.0, 0.0, 4.5])
@@ -124,11 +126,11 @@ def test_a_heading_that_is_improbable_without_the_null_hypothesis_need_not_beat_
     frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
     noise = np.random.default_rng(5).normal(0, 14, frame.image.shape)
     image = np.clip(contrast * frame.image + 90 + noise, 0, 255).astype(np.uint8)
-    told = replace(frame, image=image, heading_deg=40.0 + turn_deg)
-    quick = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR))
+    stated = replace(frame, image=image, heading_deg=40.0 + turn_deg)
+    quick = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR))
     find = ncc.Ncc.find
     monkeypatch.setattr(ncc.Ncc, "find", lambda self, query, *, coarser=0, **_: find(self, query, coarser=coarser))
-    thorough = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(told, ground.prior(NADIR))
+    thorough = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR))
     assert type(quick) is type(thorough)
     if isinstance(quick, Fix):
         assert (quick.east_m, quick.north_m, quick.confidence) == (

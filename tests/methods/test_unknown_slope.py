@@ -86,8 +86,8 @@ def level_fixes(ground, site, camera):
         matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=refine)))
         rows = []
         for roll_deg, pitch_deg in OFF_DEG:
-            told = {"roll_deg": TRUE["roll_deg"] + roll_deg, "pitch_deg": TRUE["pitch_deg"] + pitch_deg}
-            fix = matcher.locate(replace(frame, **told), ground.prior(NADIR))
+            tilt = {"roll_deg": TRUE["roll_deg"] + roll_deg, "pitch_deg": TRUE["pitch_deg"] + pitch_deg}
+            fix = matcher.locate(replace(frame, **tilt), ground.prior(NADIR))
             assert isinstance(fix, Fix)
             rows.append((fix, np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)))
         out.append(rows)

@@ -21,7 +21,7 @@ def site(ground):
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
 @pytest.mark.parametrize(
-    "told",
+    "stated",
     [
         {"roll_deg": 6.0, "pitch_deg": -1.0},  # a mount that is off
         {"roll_deg": -3.0, "pitch_deg": 4.0},  # swapped
@@ -29,8 +29,8 @@ def site(ground):
         {"roll_deg": 0.07, "pitch_deg": -0.05},  # radians
     ],
 )
-def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, method, told):
-    frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), **told)
+def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, method, stated):
+    frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), **stated)
     fix = SceneMatcher(site, camera, method, "cpu").locate(frame, ground.prior(NADIR))
     assert isinstance(fix, Fix)
     off_m = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)

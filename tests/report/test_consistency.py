@@ -61,8 +61,8 @@ def test_steps_without_a_velocity_or_too_long_do_not_count():
     refused = [TrackRow(timestamp_ns=row.timestamp_ns, frame=row.frame, status="no_fix") for row in rows[4:15]]
     assert motion_consistency([*rows[:4], *refused, *rows[15:]], telemetry, FRAME)["steps"] == 2 + 3
     bare = [TelemetryRow(timestamp_ns=row.timestamp_ns, frame=row.frame) for row in telemetry]
-    for told in (None, [], bare, telemetry[:-1]):
-        assert motion_consistency(rows, told, FRAME) is None
+    for stated in (None, [], bare, telemetry[:-1]):
+        assert motion_consistency(rows, stated, FRAME) is None
     assert motion_consistency([*refused, *refused][:1], telemetry[4:5], FRAME) is None
 
 

@@ -227,7 +227,7 @@ def wait_for(happened):
 
 @pytest.mark.parametrize("bridge", ["mavlink", "ros"])
 def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
-    told = []
+    stated = []
     answer = Answer(Frame(np.zeros((3, 3), np.uint8), 1), NoFix(reason=Reason.NO_TEXTURE), 1.0)
     quiet = lambda prior: None  # noqa: E731
     if bridge == "mavlink":
@@ -236,13 +236,13 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
         from engine.adapters.mavlink_out import MavlinkOptions
 
         made = mavlink.MavlinkBridge(
-            Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=told.append
+            Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append
         )
     else:
-        made = RosBridge(SilentNode(), sim_site, quiet, RosOptions(), watch=told.append)
+        made = RosBridge(SilentNode(), sim_site, quiet, RosOptions(), watch=stated.append)
     made.deliver(answer)
     made.close()
-    assert told == [answer]
+    assert stated == [answer]
 
 
 class SilentNode:

@@ -158,9 +158,9 @@ def test_a_run_that_failed_is_tried_again_and_no_flight_is_drawn_for_nothing(
     shutil.rmtree(out / "flights")
     monkeypatch.setattr("engine.runs.campaign._executor", in_this_process)
     assert run(["campaign", str(place / "campaign.toml"), f"--out={out}", "--workers=1"]) == 1
-    told = capsys.readouterr().err
-    assert "3 runs, 2 of them finished before" in told
-    assert "bad/ncc: " in told
+    stated = capsys.readouterr().err
+    assert "3 runs, 2 of them finished before" in stated
+    assert "bad/ncc: " in stated
     assert not (out / "flights").exists()
     same(out, whole)
 
@@ -190,9 +190,9 @@ def test_runs_of_other_inputs_are_named_and_kept_unless_forced(place, whole, cap
     (place / "longer.toml").write_text(text.replace("frames = 2", "frames = 3"), encoding="utf-8")
     before = results(whole)
     assert run(["campaign", str(place / "longer.toml"), f"--out={whole}"]) == 2
-    told = capsys.readouterr().err
-    assert "town-1-noon (simulation), town-1-noon/ncc (simulation);" in told
-    assert "--force" in told
+    stated = capsys.readouterr().err
+    assert "town-1-noon (simulation), town-1-noon/ncc (simulation);" in stated
+    assert "--force" in stated
     assert results(whole) == before
 
 

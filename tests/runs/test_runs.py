@@ -11,6 +11,8 @@ import torch
 import engine.runs
 from engine import OptionError, TelemetryError
 from engine.cli.tables import print_summary
+from engine.diagnosis import Diagnosis, Finding
+from engine.diagnosis.findings import Contradiction
 from engine.errors import BackendError, MissingExtraError, require
 from engine.features import sift
 from engine.formats.ros.bags import import_rosbags
@@ -256,3 +258,25 @@ def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, m
 
 def test_what_is_installed_is_imported():
     assert require("json", "none").loads("1") == 1
+
+
+@pytest.mark.parametrize("is_wrong", [True, False])
+def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, tmp_path, monkeypatch, is_wrong):
+    """One frame of three is refused, for want of a heading; where all inputs fit, nothing is said of them."""
+    lines = (flight / "telemetry.csv").read_text(encoding="utf-8").splitlines()
+    names, last = lines[0].split(","), lines[-1].split(",")
+    last[names.index("heading_deg")] = ""
+    telemetry = tmp_path / "telemetry.csv"
+    telemetry.write_text("\n".join([*lines[:-1], ",".join(last)]), encoding="utf-8")
+    findings = [Finding("radians", "the heading is in radians", "--angles radians")] if is_wrong else []
+    found = Diagnosis(findings, 16, 16, ("attitude",), (Contradiction("heading", 6 * is_wrong, 16),))
+    monkeypatch.setattr("engine.runs.tracking.diagnose_flight", lambda *_, **__: found)
+    given = {name: flight / file for name, file in FOLDER_LAYOUT.items() if name != "telemetry"}
+    files = FlightFiles(**given, telemetry=telemetry)
+    summary = track(files, tmp_path / "out", TrackSettings(method="ncc"), report=False)
+    assert summary["fixes"] == FRAMES - 1
+    said = summary["settings"]["diagnosis"]
+    assert (said is not None) == is_wrong
+    if said:
+        assert said["radians"] == "the heading is in radians; try --angles radians"
+        assert said["pictures"].endswith("; 6 of 16 (38%) contradict the heading")

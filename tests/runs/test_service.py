@@ -153,12 +153,12 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
         run_mavlink_bridge(files, link, replace(settings, start="0,0"))
     assert heard(manager) == []  # one that cannot begin is never ready
     run_mavlink_bridge(files, link, settings)
-    told = heard(manager)
-    assert (told[0], told[-1]) == ("READY=1", "STOPPING=1")
-    beats = [line for line in told[1:-1] if not line.startswith("STATUS=")]
+    stated = heard(manager)
+    assert (stated[0], stated[-1]) == ("READY=1", "STOPPING=1")
+    beats = [line for line in stated[1:-1] if not line.startswith("STATUS=")]
     assert beats == ["WATCHDOG=1"] * len(beats)
     assert len(beats) >= 2  # while it waits for the autopilot, too
-    assert "STATUS=no autopilot; sent 0" in "".join(told)
+    assert "STATUS=no autopilot; sent 0" in "".join(stated)
 
 
 class Shown(Progress):
@@ -201,8 +201,8 @@ def test_a_ros_bridge_reports_as_the_other_does(manager, tmp_path, monkeypatch):
 def test_the_line_of_a_ros_bridge_names_what_was_not_published():
     counts = Counts(submitted=9, dropped=1, answered=8)
     status = RosStatus(counts, fixes=5, refused={"late": 2, "low_score": 1}, unusable=4, restarts=1)
-    told = "9 pictures; published 5; not published: late 2, low_score 1, unusable 4, dropped 1; 1 restarts"
-    assert status.line() == told
+    stated = "9 pictures; published 5; not published: late 2, low_score 1, unusable 4, dropped 1; 1 restarts"
+    assert status.line() == stated
     assert RosStatus(Counts()).line() == "0 pictures; published 0; not published: nothing"
 
 

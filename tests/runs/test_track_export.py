@@ -86,8 +86,8 @@ def test_a_run_of_before_is_exported_without_what_it_did_not_note(finished, tmp_
     (tmp_path / "notes.csv").write_text("\n".join(",".join(line.split(",")[:7]) + "," for line in lines[1:]))
     head = "frame,state,window_x0_px,window_y0_px,heading_deg,stage,confidence,detail"
     (tmp_path / "notes.csv").write_text(f"{head}\n{(tmp_path / 'notes.csv').read_text()}\n")
-    told = export_track(tmp_path, "tum")
-    assert told["left_out"] == 0
+    stated = export_track(tmp_path, "tum")
+    assert stated["left_out"] == 0
     text = (tmp_path / "track.tum").read_text()
     assert "quaternion is unity" in text.splitlines()[0]
     measured = [row.up_m for row in read_track(tmp_path / "track.csv") if row.fixed]

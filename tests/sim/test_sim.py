@@ -273,14 +273,14 @@ def test_the_nose_dips_to_speed_up_and_points_along_the_leg():
 
 def test_telemetry_errs_as_documented(town):
     plan = plan_flight(1, town=town, rate_hz=8.0)
-    truth, told = plan.truth, plan.telemetry
-    heading = (told.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
+    truth, stated = plan.truth, plan.telemetry
+    heading = (stated.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
     assert heading.mean() == pytest.approx(0.4, abs=0.08)
     assert heading.std() == pytest.approx(0.7, rel=0.1)
-    assert (told.roll_deg - truth.roll_deg).std() == pytest.approx(0.35, rel=0.1)
-    assert (told.pitch_deg - truth.pitch_deg).std() == pytest.approx(0.35, rel=0.1)
-    assert (told.velocity_mps - truth.velocity_mps)[:, :2].std() == pytest.approx(0.2, rel=0.1)
-    height = told.position_m[:, 2] - truth.position_m[:, 2]
+    assert (stated.roll_deg - truth.roll_deg).std() == pytest.approx(0.35, rel=0.1)
+    assert (stated.pitch_deg - truth.pitch_deg).std() == pytest.approx(0.35, rel=0.1)
+    assert (stated.velocity_mps - truth.velocity_mps)[:, :2].std() == pytest.approx(0.2, rel=0.1)
+    height = stated.position_m[:, 2] - truth.position_m[:, 2]
     assert np.diff(height).std() == pytest.approx(0.7 * np.sqrt(2), rel=0.1)
     assert 0.6 < height.std() < 1.3
     perfect = dict.fromkeys(SensorNoise.__dataclass_fields__, 0.0)

@@ -138,6 +138,6 @@ def test_a_planned_flight_moves_while_its_shutter_is_open(town):
     turn = np.array([sway.turn_dps for sway in blurred.sways])
     assert 1.0 < np.abs(turn).max() < 90.0
     assert [row.lat_deg for row in still.truth_rows()] == [row.lat_deg for row in blurred.truth_rows()]
-    seen, told = next(blurred.iter_frames()), next(still.iter_frames())
-    assert seen.heading_deg == told.heading_deg
+    seen, stated = next(blurred.iter_frames()), next(still.iter_frames())
+    assert seen.heading_deg == stated.heading_deg
     assert still.telemetry.heading_deg.tobytes() == blurred.telemetry.heading_deg.tobytes()

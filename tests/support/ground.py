@@ -123,9 +123,9 @@ class Ground:
 
     def frame(self, camera, nadir_px, height_m=150.0, *, timestamp_ns=0, **attitude):
         """The picture with the telemetry that is true of it."""
-        told = {"roll_deg": 0.0, "pitch_deg": 0.0, "heading_deg": 0.0, **attitude}
+        stated = {"roll_deg": 0.0, "pitch_deg": 0.0, "heading_deg": 0.0, **attitude}
         image = self.picture(camera, nadir_px, height_m, **attitude)
-        return Frame(image, timestamp_ns=timestamp_ns, height_agl_m=height_m, **told)
+        return Frame(image, timestamp_ns=timestamp_ns, height_agl_m=height_m, **stated)
 
     def prior(self, nadir_px, sigma_m=8.0, off_m=(5.0, -4.0)):
         """A prior some metres off a map pixel."""

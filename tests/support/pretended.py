@@ -2,7 +2,7 @@
 
 On a machine without a GPU ``.cpu()`` does nothing that could be counted. Tensors of this device are wrappers about
 tensors of the CPU: every operation runs there, and answers are real, while code that asks where a tensor lives is
-told another device and takes its path for GPUs. What would copy to the host, or make the host wait because a shape
+sent elsewhere and takes its path for GPUs. What would copy to the host, or make the host wait because a shape
 depends on values, is recorded; what CUDA refuses (operands on two devices) is refused.
 
 The device is called "meta", since torch without CUDA makes no tensor that says "cuda".

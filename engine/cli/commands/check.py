@@ -36,6 +36,7 @@ from engine.cli.options import (
     TelemetryOffsetOption,
     ThreadsOption,
     corrections,
+    flight_options,
     use_threads,
 )
 
@@ -95,9 +96,5 @@ def check(
         console.print_json(asdict(found))
     else:
         console.print_pairs(f"check of {frames}", as_rows(found, corrected=not files.corrections.changes_nothing))
-    given = console.options(
-        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, mount=mount, map_bounds=map_bounds,
-        map_crs=map_crs, frames=frames, every=None if every == 1 else every, telemetry=telemetry,
-        settings=settings_path, start=start,
-    )  # fmt: skip
+    given = flight_options(files, settings=settings_path, start=start)
     console.next_step(f"track {given} --out out", as_json=as_json)

@@ -33,6 +33,7 @@ from engine.cli.options import (
     SurfaceOption,
     ThreadsOption,
     WeightsOption,
+    flight_options,
     use_threads,
 )
 
@@ -100,4 +101,8 @@ def compare(
         console.say(f"written to {out}")
     # There is a page on as many runs as it has colours for, and always a chart.
     drawn = next((out / name for name in (COMPARISON, CHART) if (out / name).is_file()), out)
-    console.next_step("init --out scenematch.toml", as_json=as_json, hint=f"open {console.quoted(drawn)}")
+    settings_file = Path("scenematch.toml")
+    following = f"init --out {settings_file}"
+    if settings_file.exists():
+        following = f"track {flight_options(files, settings=settings_file, start=start)} --out out"
+    console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")

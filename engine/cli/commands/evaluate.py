@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from engine.cli import console, tables
-from engine.cli.options import JsonOption
+from engine.cli.options import JsonOption, flight_options
 
 
 def evaluate(
@@ -24,8 +24,15 @@ def evaluate(
     Prints the errors and rewrites the folder's summary.json and figures.
     """
     from engine.runs.evaluation import evaluate as evaluate_track
+    from engine.runs.evaluation import recorded_files
+    from engine.runs.record import read_record
+    from engine.runs.results import SUMMARY
 
     summary = evaluate_track(directory, truth, progress=console.PROGRESS)
     tables.print_summary(summary, as_json, title=f"track in {directory}", out=directory)
     page = f"open {directory / 'report.html'}"
-    console.next_step(f"export {console.quoted(directory)} --format tum", as_json=as_json, hint=page)
+    following = f"export {console.quoted(directory)} --format tum"
+    if not summary["fixes"]:
+        record = read_record(directory / SUMMARY)
+        following = f"check {flight_options(recorded_files(record), start=record.start)}"
+    console.next_step(following, as_json=as_json, hint=page)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from engine.cli import console
-from engine.cli.options import ForceOption, JsonOption
+from engine.cli.options import ForceOption, JsonOption, after_track
 
 
 def report(
@@ -24,11 +24,16 @@ def report(
 
     Of one run its own report.html; of several one page: all tracks on one map and one time axis, and a table.
     """
+    from engine.formats.track import read_track
+    from engine.runs.evaluation import recorded_files
+    from engine.runs.record import read_record
     from engine.runs.reporting import report as draw_report
+    from engine.runs.results import SUMMARY, TRACK
 
     page = draw_report(runs, out, force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]})
     else:
         console.say(f"written to {page}")
-    console.next_step(f"export {console.quoted(runs[0])} --format geojson", as_json=as_json)
+    record, fixes = read_record(runs[0] / SUMMARY), sum(row.fixed for row in read_track(runs[0] / TRACK))
+    console.next_step(after_track(recorded_files(record), runs[0], fixes, start=record.start), as_json=as_json)

@@ -42,6 +42,7 @@ from engine.cli.options import (
     TelemetryOffsetOption,
     ThreadsOption,
     WeightsOption,
+    after_track,
     corrections,
     use_threads,
 )
@@ -134,4 +135,5 @@ def track(
     title = f"{settings.method} ({settings.profile} profile) on {frames}"
     tables.print_summary(summary, as_json, title=title, out=out)
     page = f"open {out / 'report.html'}"
-    console.next_step(f"export {console.quoted(out)} --format geojson", as_json=as_json, hint=page)
+    following = after_track(files, out, summary["fixes"], settings=settings_path, start=start)
+    console.next_step(following, as_json=as_json, hint=page)
