@@ -88,7 +88,15 @@ class PreparedMap:
         return Region(aligned, search, region.valid[part], region.mask[part])
 
     def enhanced(self, window: Window, level: int) -> tuple[FloatImage, NDArray[np.bool_] | None]:
-        """The same as :func:`enhanced_part`, of what is prepared."""
+        """The enhanced picture of a window, of what is prepared; the same as by :func:`enhanced_part`.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: of the map's pyramid.
+
+        Returns:
+            (H, W) float32, and (H, W) bool, False on nodata; None where all pixels are valid.
+        """
         region = self.cut(window, level)
         inner = np.s_[window.y0 - region.window.y0 :, window.x0 - region.window.x0 :]
         return on_host(region.search.image)[inner], None if region.mask is None else region.mask[inner]

@@ -17,7 +17,7 @@ from engine.formats.flight import camera_info
 from engine.formats.geotiff import write_geotiff
 from engine.runs import BridgeFiles, FlightFiles
 from engine.runs.checks import check_pictures
-from engine.runs.evaluation import _recorded_files
+from engine.runs.evaluation import recorded_files
 from engine.runs.inputs import open_map
 from engine.runs.record import RunRecord
 from tests.support.photos import gimbal, photograph
@@ -271,12 +271,12 @@ def test_a_record_gives_the_same_files(photos):
         camera_pitch_deg=-80.0, method="ncc", profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0},
         ground_m=0.0, ground_amsl_m=None,
     )  # fmt: skip
-    assert _recorded_files(record) == files
+    assert recorded_files(record) == files
     some = replace(record, frames="/f.bag", camera="/f.bag", hfov_deg=None, odometry_topic="/vio", every=3)
     files = FlightFiles(
         map="/m.tif", frames="/f.bag", odometry_topic="/vio", every=3, mount="nadir-left", camera_pitch_deg=-80.0
     )
-    assert _recorded_files(some) == files
+    assert recorded_files(some) == files
 
 
 @pytest.fixture
@@ -343,4 +343,4 @@ def test_a_record_gives_the_scaled_calibration_too(photos, calibration):
         scale_calibration=True, profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0}, ground_m=0.0,
         ground_amsl_m=None,
     )  # fmt: skip
-    assert _recorded_files(record) == files
+    assert recorded_files(record) == files
