@@ -41,6 +41,11 @@ class Scheduler:
         self._step: tuple[str, float] | None = None  # that is being done, and its work
         self._has_fix = self._is_under_way = False
 
+    @property
+    def has_fix(self) -> bool:
+        """Whether there is a fix already, which a step that comes too late would lose."""
+        return self._has_fix
+
     def can_afford(self, step: str, work: float) -> bool:
         """Whether the time that is left suffices for a step of this much work; True for one that never ran."""
         return self.can_afford_all({step: work})

@@ -133,10 +133,16 @@ class Sift(Method):
         return coarser_scale(query, height_m, self.options.scale)
 
     def _has_time_for_few(self, query: Query) -> bool:
-        """Whether there is time for few features first and then for all of them, or only for few."""
+        """Whether there is time for few features first and then for all of them, or only for few.
+
+        Beside a fix that is there already they must leave time to spare: preempted once they would lose it.
+        """
         scheduler, works = query.scheduler, self._work_px(query)
-        if scheduler.can_afford_all({_FEW: works[1.0], "sift": min(works.values())}):
+        following = max(works.values()) if scheduler.has_fix else min(works.values())
+        if scheduler.can_afford_all({_FEW: works[1.0], "sift": following}):
             return True
+        if scheduler.has_fix:
+            return False
         if scheduler.first_affordable("sift", works) is None and scheduler.can_afford(_FEW, works[1.0]):
             return True
         scheduler.note_refusal(_FEW)
