@@ -83,8 +83,8 @@ class Auto(Method):
             return replace(first if second.reason is Reason.LATE else second, candidates=both)
         if isinstance(second, NoFix):
             return refined
-        apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
-        if not are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2):
+        apart_m = _apart_m(first, second)
+        if not _is_one_place(first, second):
             if float(np.hypot(*apart_m)) < self.ncc.options.rule.exclusion_m:
                 return _vaguer(second, apart_m)
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
@@ -111,11 +111,18 @@ class Auto(Method):
         return self.ncc.explain(query, window)
 
 
+def _apart_m(first: Fix, second: Fix) -> NDArray[np.float64]:
+    """(2,) from the second fix to the first."""
+    return np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+
+
+def _is_one_place(first: Fix, second: Fix) -> bool:
+    """Whether two fixes are consistent by their covariances; the map's error is that of both."""
+    return are_consistent(_apart_m(first, second), first.relative_covariance_m2 + second.relative_covariance_m2)
+
+
 def _agree(first: Fix, second: Fix) -> bool:
-    """Whether two fixes are of one place and height, by their covariances."""
-    apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
-    covariance_m2 = first.relative_covariance_m2 + second.relative_covariance_m2
-    return are_consistent(apart_m, covariance_m2) and agree_in_height(first, second)
+    return _is_one_place(first, second) and agree_in_height(first, second)
 
 
 def _vaguer(second: Fix, apart_m: NDArray[np.float64]) -> Fix:

@@ -38,12 +38,10 @@ MIN_CORRELATION_AT_ONCE = 0.45
 By day the frames of three simulated flights reached 0.8 and more, in the evening on a map of noon half of them
 0.6, and a wrong pose under a wrong tilt 0.34.
 """
-UNCONFIRMED_TILT_DEG = 1.5
-"""Tilt that may be wrong where the picture does not confirm the pose.
-
-Under angles that are off by 1.5 degrees half of the frames of a simulated flight were not confirmed, and their
-peaks were up to 7.6 m off at 150 m; under right ones each was confirmed.
-"""
+# Tilt that may be wrong where the picture does not confirm the pose: under angles that are off by 1.5 degrees half
+# of the frames of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; under
+# right ones each was confirmed.
+_UNCONFIRMED_TILT_DEG = 1.5
 # Standard deviations of an attitude that the picture does not confirm.
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
@@ -83,9 +81,7 @@ class Refinement:
         if not query.site.has_surface:
             return fix
         if has_tilt:
-            assert query.telemetry.height_agl_m is not None
-            doubt_m = query.telemetry.height_agl_m * math.radians(UNCONFIRMED_TILT_DEG)
-            return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
+            return with_unconfirmed_tilt(query, fix)
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
@@ -244,6 +240,14 @@ class Refinement:
             map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
+
+
+def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
+    """The fix of a frame whose picture does not confirm its attitude: its covariance allows for a wrong tilt."""
+    height_m = query.telemetry.height_agl_m
+    assert height_m is not None  # or there were no attitude to confirm
+    doubt_m = height_m * math.radians(_UNCONFIRMED_TILT_DEG)
+    return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 
 def _tilted(pose: Pose, height_m: float) -> list[Pose]:

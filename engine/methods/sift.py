@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-
-import numpy as np
 
 from engine.align import SIDE_STEP_PX
 from engine.device import Device
@@ -20,7 +17,7 @@ from engine.methods.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseC
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
-from engine.methods.refinement import MIN_CORRELATION_AT_ONCE, UNCONFIRMED_TILT_DEG, Refinement
+from engine.methods.refinement import MIN_CORRELATION_AT_ONCE, Refinement, with_unconfirmed_tilt
 from engine.methods.scheduler import OutOfTime
 from engine.methods.views import coarser_scale
 from engine.orthomap import OrthoMap
@@ -165,10 +162,7 @@ class Sift(Method):
             result = query.refuse_late(METHOD, "sift")
         if isinstance(result, Fix) or result.reason is not Reason.LATE:
             return result
-        assert query.telemetry.height_agl_m is not None  # or few features had not been sought
-        doubt_m = query.telemetry.height_agl_m * math.radians(UNCONFIRMED_TILT_DEG)
-        covariance_m2 = few.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0])
-        return replace(few, covariance_m2=covariance_m2, stage="coarse")
+        return replace(with_unconfirmed_tilt(query, few), stage="coarse")
 
     def _by_all_features(self, query: Query) -> Result:
         """A fix by all keypoints, not refined, at the highest resolution of the frame that there is time for."""
