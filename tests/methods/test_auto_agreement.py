@@ -5,19 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, NoFix, OrthoMap, SceneMatcher
+from engine import Fix, NoFix, SceneMatcher
 from engine.methods.ncc import Ncc
 from engine.methods.sift import Sift
 from engine.values import Reason
 
 NADIR = np.array([310.0, 305.0])
-
-
-@pytest.fixture(scope="module")
-def site(ground):
-    """The ground with a surface model, which says how flat it is."""
-    flat = np.zeros(ground.gray.shape, np.float32)
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
 
 
 @pytest.mark.parametrize(("off_m", "same_place"), [(4.0, True), (25.0, False)])

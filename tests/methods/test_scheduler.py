@@ -15,7 +15,6 @@ from engine import (
     Navigator,
     NccOptions,
     NoFix,
-    OrthoMap,
     Prior,
     Reason,
     SceneMatcher,
@@ -54,13 +53,6 @@ class FixedCosts:
 
     def note_abandoned(self, step, work, ms, waited_ms=0.0):
         pass
-
-
-@pytest.fixture(scope="module")
-def site(ground):
-    """The ground with a surface model that says how flat it is: only then is a pose refined."""
-    flat = np.zeros(ground.gray.shape, np.float32)
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
 
 
 @pytest.fixture

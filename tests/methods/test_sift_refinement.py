@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, OrthoMap, SceneMatcher
+from engine import Budget, Fix, SceneMatcher
 from engine.errors import OptionError
 from engine.methods.feature_pose import FeatureMatcher
 from engine.methods.options import MatcherOptions, SiftOptions
@@ -20,13 +20,6 @@ PLACES = [np.array([x, y]) for x in (270.0, 330.5, 371.25) for y in (262.5, 301.
 
 
 @pytest.fixture(scope="module")
-def site(ground):
-    """The ground with a surface model that says how flat it is: only then is a pose refined."""
-    flat = np.zeros(ground.gray.shape, np.float32)
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
-
-
-@pytest.fixture(scope="module")
 def matcher(site, camera):
     return SceneMatcher(site, camera, "sift", "cpu")
 
@@ -34,6 +27,18 @@ def matcher(site, camera):
 @pytest.fixture(scope="module")
 def plain(site, camera):
     return SceneMatcher(site, camera, "sift", "cpu", MatcherOptions(sift=SiftOptions(refine=False)))
+
+
+def costs_of(others_ms=0.0, **ms):
+    """Costs by step, whatever the work."""
+    costs = FixedCosts()
+    costs.upper_bound_ms = lambda step, work: ms.get(step.replace(" ", "_"), others_ms)
+    return costs
+
+
+def refuse_to_refine(monkeypatch):
+    for name in ("refine_at_once", "refine_from_coarser"):
+        monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
 
 
 def shot(ground, camera, nadir_px=NADIR, heading_deg=25.0):
@@ -87,8 +92,7 @@ def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypa
 def test_where_refinement_fails_all_features_give_the_pose(ground, camera, matcher, plain, monkeypatch):
     frame, prior = shot(ground, camera), ground.prior(NADIR)
     expected = plain.locate(frame, prior)
-    for name in ("refine_at_once", "refine_from_coarser"):
-        monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
+    refuse_to_refine(monkeypatch)
     fix = matcher.locate(frame, prior)
     assert fix.stage == "fine"
     assert (fix.east_m, fix.north_m, fix.up_m) == (expected.east_m, expected.north_m, expected.up_m)
@@ -108,8 +112,7 @@ def test_a_refinement_that_is_abandoned_leaves_the_fix(ground, camera, matcher, 
 def test_few_features_are_better_than_none_where_time_is_short(ground, site, camera):
     """With no time for all features nor for refinement."""
     matcher = SceneMatcher(site, camera, "sift", "cpu")
-    matcher._costs = FixedCosts()
-    matcher._costs.upper_bound_ms = lambda step, work: 0.0 if step == "sift by few features" else 1e9
+    matcher._costs = costs_of(1e9, sift_by_few_features=0.0)
     fix = matcher.locate(shot(ground, camera), ground.prior(NADIR), Budget(total_ms=1000.0))
     assert isinstance(fix, Fix)
     assert fix.stage == "coarse"
@@ -160,11 +163,10 @@ def test_after_the_warm_up_nothing_is_prepared_in_flight(ground, site, camera, h
 
 
 @pytest.mark.parametrize("wrong", [{"roll_deg": 5.0}, {"pitch_deg": 0.0}], ids=str)
-def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site, camera, wrong, monkeypatch):
+def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site, camera, wrong):
     """There is time for nothing else; a tilt that is off by 2 degrees displaces them by metres."""
     matcher = SceneMatcher(site, camera, "sift", "cpu")
-    matcher._costs = FixedCosts()
-    matcher._costs.upper_bound_ms = lambda step, work: 0.0 if step == "sift by few features" else 1e9
+    matcher._costs = costs_of(1e9, sift_by_few_features=0.0)
     chi_squares = []
     for place in PLACES:
         frame = replace(shot(ground, camera, place), **wrong)
@@ -174,13 +176,6 @@ def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site,
         off_m = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(place)
         chi_squares.append(off_m @ np.linalg.solve(fix.covariance_m2[:2, :2], off_m))
     assert np.mean(chi_squares) / 2.0 < 2.0
-
-
-def costs_of(**ms):
-    """Costs by step, whatever the work."""
-    costs = FixedCosts()
-    costs.upper_bound_ms = lambda step, work: ms.get(step.replace(" ", "_"), 0.0)
-    return costs
 
 
 def test_few_features_leave_the_time_for_all(ground, camera, site, monkeypatch):
@@ -201,8 +196,7 @@ def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, m
     def out_of_time(_self, _query):
         raise OutOfTime
 
-    for name in ("refine_at_once", "refine_from_coarser"):
-        monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
+    refuse_to_refine(monkeypatch)
     monkeypatch.setattr(Sift, "_by_all_features", out_of_time)
     fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
     assert isinstance(fix, Fix)
