@@ -175,6 +175,12 @@ def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
     return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
 
 
+def agree_in_place(first: Fix, second: Fix) -> bool:
+    """Whether two fixes by one map are of one place (:func:`are_consistent`); the map's error is that of both."""
+    apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+    return are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2)
+
+
 def agree_in_height(first: Fix, second: Fix) -> bool:
     """Whether two poses are equally high; refinement may stay at a wrong height that the telemetry holds it to.
 

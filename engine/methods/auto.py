@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.acceptance import agree_in_height, are_consistent
+from engine.acceptance import agree_in_height, agree_in_place
 from engine.device import Device
 from engine.methods.explanation import Explanation
 from engine.methods.method import Method
@@ -69,10 +69,9 @@ class Auto(Method):
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        at_once = self.ncc.by_coarse_peak(query)
-        first = at_once or self.ncc.correlate(query, try_turns=False)  # SIFT finds the heading by itself
+        first = self.ncc.begin(query, try_turns=False)  # SIFT finds the heading by itself
         # A wrong attitude displaces the peak; refinement, which measures it, leads back.
-        refined = at_once or self.ncc.refine(query, first)
+        refined = self.ncc.refine(query, first)
         if isinstance(refined, Fix) and refined.stage == "refined":
             first = refined
         second = self._second(query, first if isinstance(refined, Fix) else refined)
@@ -84,7 +83,7 @@ class Auto(Method):
         if isinstance(second, NoFix):
             return refined
         apart_m = _apart_m(first, second)
-        if not _is_one_place(first, second):
+        if not agree_in_place(first, second):
             if float(np.hypot(*apart_m)) < self.ncc.options.rule.exclusion_m:
                 return _vaguer(second, apart_m)
             detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
@@ -116,13 +115,8 @@ def _apart_m(first: Fix, second: Fix) -> NDArray[np.float64]:
     return np.array([first.east_m - second.east_m, first.north_m - second.north_m])
 
 
-def _is_one_place(first: Fix, second: Fix) -> bool:
-    """Whether two fixes are consistent by their covariances; the map's error is that of both."""
-    return are_consistent(_apart_m(first, second), first.relative_covariance_m2 + second.relative_covariance_m2)
-
-
 def _agree(first: Fix, second: Fix) -> bool:
-    return _is_one_place(first, second) and agree_in_height(first, second)
+    return agree_in_place(first, second) and agree_in_height(first, second)
 
 
 def _vaguer(second: Fix, apart_m: NDArray[np.float64]) -> Fix:

@@ -16,6 +16,8 @@ _SIGMAS = 3.0
 _MIN_MS = 0.05
 _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for its cost
 _COST_DECAY = 0.99  # of the cost itself, until the step is tried
+_DEVIATION_DECAY_BESIDE_FIX = 0.995  # a try that comes too late loses a fix
+_PREEMPTION_DECAY = 0.99  # of the longest wait, each time that a stage or step ran: some five frames
 _ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
 
 
@@ -67,6 +69,7 @@ class Costs:
     def __init__(self) -> None:
         self._models: dict[str, _CostModel] = {}
         self._ran_ms = self._waited_ms = 0.0  # running sums over all steps
+        self._preemption_ms = 0.0
         self._lock = threading.Lock()  # a model's sums belong together
 
     def learn(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
@@ -84,22 +87,26 @@ class Costs:
             known.learn(work, max(_ABANDONED * ran_ms, expected_ms))
             self._note_wait(ran_ms, waited_ms)
 
-    def note_refusal(self, step: str, *, keeps_cost: bool = False, has_fix: bool = False) -> None:
+    def note_refusal(self, step: str, *, has_fix: bool = False) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
 
         Args:
             step: its name.
-            keeps_cost: only the deviation of its cost decays, since to try it may lose a fix that is there. Else
-                the cost decays as well until it is tried once; if it was not cheaper, that is undone.
-            has_fix: other steps ran, and have shown how long they waited; else the waiting decays too.
+            has_fix: there is a fix, which a try may lose: only the deviation of the cost decays, and slowly. Else
+                the cost decays as well until it is tried once; if it was not cheaper, that is undone. So does the
+                waiting, which no other step has shown.
         """
         with self._lock:
             known = self._models.get(step)
             if known is None:
                 return
-            self._waited_ms *= 1.0 if has_fix else _DEVIATION_DECAY
+            if has_fix:
+                known.square *= _DEVIATION_DECAY_BESIDE_FIX**2
+                return
             known.square *= _DEVIATION_DECAY**2
-            known.trust *= 1.0 if keeps_cost else _COST_DECAY
+            known.trust *= _COST_DECAY
+            self._waited_ms *= _DEVIATION_DECAY
+            self._preemption_ms *= _DEVIATION_DECAY
 
     def upper_bound_ms(self, step: str, work: float) -> float:
         """Expected time and three deviations of a step, with the waiting that goes with it; 0 if it never ran."""
@@ -110,7 +117,14 @@ class Costs:
             ran_ms = model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
             return ran_ms * (1.0 + self._waited_ms / self._ran_ms) if self._ran_ms > 0.0 else ran_ms
 
+    @property
+    def preemption_ms(self) -> float:
+        """The longest that a stage waited for a processor of late."""
+        with self._lock:
+            return self._preemption_ms
+
     def _note_wait(self, ran_ms: float, waited_ms: float) -> None:
-        """Learn the share of waiting."""
+        """Learn the share of waiting, and the longest wait."""
+        self._preemption_ms = max(_PREEMPTION_DECAY * self._preemption_ms, waited_ms)
         self._ran_ms = _MEMORY * self._ran_ms + ran_ms
         self._waited_ms = _MEMORY * self._waited_ms + waited_ms

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from engine.acceptance import judge_peak, judge_second_look
-from engine.confidence import SECOND_LOOK_MODEL, peak_features, probability
+from engine.acceptance import agree_in_place, judge_peak, judge_second_look
+from engine.confidence import probability
 from engine.device import Device
 from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
@@ -21,7 +21,6 @@ from engine.methods.oblique import is_ground_below, is_oblique
 from engine.methods.options import MatcherOptions
 from engine.methods.peak_evidence import (
     PeakCandidate,
-    agreement_of,
     features_of,
     fix_of,
     is_hopeless,
@@ -31,7 +30,7 @@ from engine.methods.peak_evidence import (
 from engine.methods.query import Query
 from engine.methods.refinement import Refinement
 from engine.methods.scheduler import OutOfTime
-from engine.methods.second_look import SecondLook, can_look_coarsely, hopeful_look, second_look
+from engine.methods.second_look import can_look_coarsely, candidate_of, hopeful_look, second_look
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
 
@@ -88,37 +87,51 @@ class Ncc(Method):
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that there is time for, refined where there is time for that."""
-        return self.by_coarse_peak(query) or self.refine(query, self.correlate(query))
+        return self.refine(query, self.begin(query))
 
-    def by_coarse_peak(self, query: Query) -> Fix | None:
-        """A refined fix that begins at the peak of the coarsest level, where that is beyond doubt.
+    def begin(self, query: Query, *, try_turns: bool = True) -> Result:
+        """A refined fix that begins at the coarsest level, else one by correlation alone, see :meth:`correlate`.
+
+        The peak of the coarsest level is the fix where it was accepted and there is no time for a finer one, or
+        where it is beyond doubt and the finer one is at the same place, but not accepted.
+        """
+        coarse = self._by_coarse_peak(query)
+        if coarse is None:
+            return self.correlate(query, try_turns=try_turns)
+        is_certain = coarse.confidence is not None and coarse.confidence >= _MIN_CONFIDENCE_COARSE
+        try:
+            with query.scheduler.with_fix():
+                refined = self._refine_at_once(query, coarse) if is_certain else None
+                fine = refined or self.correlate(query, try_turns=try_turns)
+        except OutOfTime:
+            return coarse
+        if isinstance(fine, Fix):
+            return fine
+        is_seconded = is_certain and any(agree_in_place(coarse, peak) for peak in fine.candidates[:1])
+        return coarse if is_seconded or fine.reason is Reason.LATE else fine
+
+    def _by_coarse_peak(self, query: Query) -> Fix | None:
+        """The peak of the coarsest level, where it is accepted and a pose may be refined from it.
 
         It costs a fraction of a fine one, and what is refined from it is the same pose. Where roll and pitch, or
-        the slope of the ground, are unknown, the pose rests on the peak as well, which then must be fine. An
-        accepted peak that is not refined is the fix where there is no time for another one.
+        the slope of the ground, are unknown, the pose rests on the peak as well, which then must be fine.
         """
         if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
             return None
         step, works = self._step(query)
-        coarser, work_px = max(works), float(query.gray.size)
+        coarser = max(works)
         is_wide = query.site.is_large and works[coarser] > MAX_WINDOW_PX
         if not (coarser and query.telemetry.has_tilt and query.site.has_surface) or is_wide:
             return None
-        if not query.scheduler.can_afford_all({step: works[coarser], _AT_ONCE: work_px}):
+        if not query.scheduler.can_afford_all({step: works[coarser], _AT_ONCE: float(query.gray.size)}):
             return None
         _, result = self._find_and_judge(query, step, works, coarser)
-        if isinstance(result, NoFix):
-            return None
-        refined = None
-        if (result.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE:
-            try:
-                with query.scheduler.with_fix(), query.scheduler.costed(_AT_ONCE, work_px):
-                    refined = Refinement(query, self.samples, self.options).refine_at_once(result)
-            except OutOfTime:
-                return replace(result, stage="coarse")
-        if refined is None and query.scheduler.first_affordable(step, works) is None:
-            return replace(result, stage="coarse")
-        return refined
+        return None if isinstance(result, NoFix) else replace(result, stage="coarse")
+
+    def _refine_at_once(self, query: Query, coarse: Fix) -> Fix | None:
+        """The pose refined from a coarse peak; None where it is not confirmed."""
+        with query.scheduler.costed(_AT_ONCE, float(query.gray.size)):
+            return Refinement(query, self.samples, self.options).refine_at_once(coarse)
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
@@ -340,25 +353,14 @@ class Ncc(Method):
                 return None
             with scheduler.costed(_HOPEFUL_LOOK, work_px), scheduler.stage("second look"):
                 hopeful = hopeful_look(correlator, found.aligned, window)
-            best = None if hopeful is None else self._candidate(correlator, found, hopeful)
+            best = None if hopeful is None else candidate_of(correlator, found, hopeful)
             if best is not None and is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
                 return best
         if not scheduler.can_afford(_SECOND_LOOK, work_px):
             return None
         with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
             looked = second_look(correlator, found.aligned, window)
-        return None if looked is None else self._candidate(correlator, found, looked)
-
-    def _candidate(self, correlator: Correlator, found: PeakCandidate, looked: SecondLook) -> PeakCandidate:
-        """What the peak of a second look means."""
-        peak = looked.peak
-        if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
-            elsewhere = found.peak.second_score / found.peak.score * peak.score
-            peak = replace(peak, second_score=max(peak.second_score, elsewhere))
-        fix = fix_of(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
-        features = peak_features(peak, looked.chance_sigma, agreement_of(correlator.query, fix))
-        fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
-        return PeakCandidate(peak, found.aligned, fix, features, found.searched)
+        return None if looked is None else candidate_of(correlator, found, looked)
 
     def judge_again(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where the peak of the second look is accepted, else a refusal."""

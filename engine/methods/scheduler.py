@@ -51,17 +51,21 @@ class Scheduler:
         return self.can_afford_all({step: work})
 
     def can_afford_all(self, works: Mapping[str, float]) -> bool:
-        """Whether the time that is left suffices for several steps, by their work, one after the other."""
+        """Whether the time that is left suffices for several steps, by their work, one after the other.
+
+        Beside a fix that would be lost it must suffice as well for one preemption as long as the longest of late.
+        """
         needed_ms = sum(self._costs.upper_bound_ms(step, work) for step, work in works.items())
-        return needed_ms <= self.deadline.remaining_ms
+        room_ms = self._costs.preemption_ms if self._has_fix else 0.0
+        return needed_ms + room_ms <= self.deadline.remaining_ms
 
     def first_affordable(self, step: str, works: Mapping[_T, float]) -> _T | None:
         """The first variant of a step, by its work, that there is time for; None where there is none."""
         return next((variant for variant, work in works.items() if self.can_afford(step, work)), None)
 
-    def note_refusal(self, step: str, *, keeps_cost: bool = False) -> None:
+    def note_refusal(self, step: str) -> None:
         """Note that a step could not be afforded, see :meth:`engine.methods.costs.Costs.note_refusal`."""
-        self._costs.note_refusal(step, keeps_cost=keeps_cost, has_fix=keeps_cost or self._has_fix)
+        self._costs.note_refusal(step, has_fix=self._has_fix)
 
     @contextmanager
     def costed(self, step: str, work: float) -> Iterator[None]:
@@ -80,22 +84,23 @@ class Scheduler:
     @contextmanager
     def with_fix(self) -> Iterator[None]:
         """Within it there is a fix already: what would make it late is abandoned before the deadline."""
-        self._has_fix = True
+        outer, self._has_fix = self._has_fix, True
         try:
             yield
         finally:
-            self._has_fix = False
+            self._has_fix = outer
 
     def improved(self, fix: Fix, step: str, work: float, improve: Callable[[Fix], _T]) -> Fix | _T:
         """What a step makes of a fix that is there already; the fix itself where there is no time for the step."""
-        if not self.can_afford(step, work):
-            self.note_refusal(step, keeps_cost=True)
-            return fix
-        try:
-            with self.with_fix(), self.costed(step, work):
-                return improve(fix)
-        except OutOfTime:
-            return fix
+        with self.with_fix():
+            if not self.can_afford(step, work):
+                self.note_refusal(step)
+                return fix
+            try:
+                with self.costed(step, work):
+                    return improve(fix)
+            except OutOfTime:
+                return fix
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

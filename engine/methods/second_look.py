@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.coarse_to_fine import WIDE_PX
+from engine.confidence import SECOND_LOOK_MODEL, peak_features, probability
 from engine.device import on_host, placed
 from engine.methods.correlation import Aligned, Correlator
+from engine.methods.peak_evidence import PeakCandidate, agreement_of, fix_of
 from engine.ncc_fft import ncc
 from engine.peaks import best_positions, find_peak
 from engine.scores import enhance, orientation
@@ -176,3 +178,21 @@ def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[
 def _channels(gray: NDArray[np.uint8], radius_px: int, valid: NDArray[np.bool_] | None) -> FloatImage:
     """Grey levels and both orientation channels, (3, H, W)."""
     return np.concatenate([enhance(gray, radius_px=radius_px, valid=valid)[None], orientation(gray, valid=valid)])
+
+
+def candidate_of(correlator: Correlator, found: PeakCandidate, looked: SecondLook) -> PeakCandidate:
+    """What the peak of a second look means.
+
+    Args:
+        correlator: of the frame.
+        found: at the first look.
+        looked: the second.
+    """
+    peak = looked.peak
+    if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
+        elsewhere = found.peak.second_score / found.peak.score * peak.score
+        peak = replace(peak, second_score=max(peak.second_score, elsewhere))
+    fix = fix_of(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
+    features = peak_features(peak, looked.chance_sigma, agreement_of(correlator.query, fix))
+    fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
+    return PeakCandidate(peak, found.aligned, fix, features, found.searched)

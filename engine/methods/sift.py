@@ -19,7 +19,7 @@ from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
 from engine.methods.refinement import MIN_CORRELATION_AT_ONCE, Refinement, with_unconfirmed_tilt
 from engine.methods.scheduler import OutOfTime
-from engine.methods.views import coarser_scale
+from engine.methods.views import coarser_scale, drawn_px
 from engine.orthomap import OrthoMap
 from engine.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
@@ -130,17 +130,12 @@ class Sift(Method):
         return coarser_scale(query, height_m, self.options.scale)
 
     def _has_time_for_few(self, query: Query) -> bool:
-        """Whether there is time for few features first and then for all of them, or only for few.
-
-        Beside a fix that is there already they must leave time to spare: preempted once they would lose it.
-        """
+        """Whether there is time for few features first and then for all of them, or only for few."""
         scheduler, works = query.scheduler, self._work_px(query)
-        following = max(works.values()) if scheduler.has_fix else min(works.values())
-        if scheduler.can_afford_all({_FEW: works[1.0], "sift": following}):
+        if scheduler.can_afford_all({_FEW: works[1.0], "sift": min(works.values())}):
             return True
-        if scheduler.has_fix:
-            return False
-        if scheduler.first_affordable("sift", works) is None and scheduler.can_afford(_FEW, works[1.0]):
+        is_only = scheduler.has_fix or scheduler.first_affordable("sift", works) is None
+        if is_only and scheduler.can_afford(_FEW, works[1.0]):
             return True
         scheduler.note_refusal(_FEW)
         return False
@@ -217,8 +212,11 @@ class Sift(Method):
         return result
 
     def _work_px(self, query: Query) -> dict[float, float]:
-        """Pixels of the reduced frame, to which the cost is proportional, by the share of the usual scale."""
-        return {share: query.gray.size * (self.options.scale * share) ** 2 for share in _REDUCED}
+        """Pixels of the picture that is matched, by which the cost goes, by share of the usual scale."""
+        known, scale = query.telemetry, self.options.scale
+        if not self.options.upright or known.height_agl_m is None or known.grid_heading_deg is None:
+            return {share: query.gray.size * (scale * share) ** 2 for share in _REDUCED}
+        return {share: drawn_px(query, known.height_agl_m, scale * share) for share in _REDUCED}
 
     def _at_scale(self, query: Query, share: float) -> Result:
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)

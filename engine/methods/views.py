@@ -108,6 +108,11 @@ def level_at(query: Query, height_m: float, scale: float) -> int:
     return level_for(1.0, map_px_per_pixel(query, height_m, scale) * _NO_LARGER, query.site.levels)
 
 
+def drawn_px(query: Query, height_m: float, scale: float) -> float:
+    """How many pixels a frame has that is drawn on the level of a scale."""
+    return query.gray.size * (map_px_per_pixel(query, height_m) / 2.0 ** level_at(query, height_m, scale)) ** 2
+
+
 def coarser_scale(query: Query, height_m: float, scale: float) -> float | None:
     """The scale to reduce a frame to for one level above that of another scale; None where the map has none."""
     level = level_at(query, height_m, scale) + 1

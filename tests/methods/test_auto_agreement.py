@@ -27,7 +27,7 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
         return replace(fix, east_m=fix.east_m + off_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
 
     monkeypatch.setattr(Ncc, "correlate", off)
-    monkeypatch.setattr(Ncc, "by_coarse_peak", lambda _self, _query: None)
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda _self, _query: None)
     monkeypatch.setattr(Ncc, "refine", lambda _self, _query, result: result)  # it would lead back
     result = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
     if same_place:

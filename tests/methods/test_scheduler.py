@@ -37,6 +37,8 @@ HURRY = Budget(total_ms=1e6)  # finite, so that costs count, and never over
 class FixedCosts:
     """Costs that a test sets, per step and unit of work; nothing is learned."""
 
+    preemption_ms = 0.0
+
     def __init__(self, **per_unit):
         self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
 
@@ -122,7 +124,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
     """Where there is no time for the finest level; and where there is, the coarse one is enough."""
     hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc", "ncc")).locate(frame, prior, HURRY)
     by_coarse = make("ncc").locate(frame, prior)
-    monkeypatch.setattr(Ncc, "by_coarse_peak", lambda self, query: None)
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda self, query: None)
     by_fine = make("ncc").locate(frame, prior)
     for fix in (hurried, by_coarse, by_fine):
         assert off_m(ground, fix) < 0.3
@@ -139,6 +141,44 @@ def test_a_refinement_that_is_abandoned_leaves_the_coarse_fix(ground, make, fram
     fix = make("ncc").locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
+
+
+@pytest.mark.parametrize(
+    ("reason", "off_m", "is_fixed"),
+    [
+        (Reason.LATE, None, True),
+        (Reason.AMBIGUOUS, 1.0, True),  # a finer peak at the same place does not contradict
+        (Reason.AMBIGUOUS, 60.0, False),
+        (Reason.LOW_SCORE, None, False),
+    ],
+)
+def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
+    make, frame, prior, monkeypatch, reason, off_m, is_fixed
+):
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    coarse = make("ncc")._method._by_coarse_peak
+
+    def refused(self, query, **_):
+        fix = coarse(query)
+        candidates = () if off_m is None else (replace(fix, east_m=fix.east_m + off_m),)
+        return replace(query.refuse(reason, "of the finer peak", "ncc"), candidates=candidates)
+
+    monkeypatch.setattr(Ncc, "correlate", refused)
+    result = make("ncc").locate(frame, prior, HURRY)
+    assert isinstance(result, Fix) == is_fixed
+    assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
+
+
+def test_beside_a_fix_a_step_leaves_room_for_a_preemption(ground, make, frame, prior):
+    """Which would lose the fix; without one the step is tried all the same."""
+    matcher = make("auto")
+    assert matcher.locate(frame, prior, HURRY).stage == "verified"
+    matcher._costs.preemption_ms = 0.9 * HURRY.total_ms
+    assert matcher.locate(frame, prior, HURRY).stage == "verified"
+    matcher._costs.preemption_ms = HURRY.total_ms
+    fix = matcher.locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert (fix.method, fix.stage) == ("ncc", "refined")
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
