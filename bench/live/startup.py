@@ -1,6 +1,7 @@
 """What a start takes: help and imports alone, and from the start of the process to the first fix, part by part.
 
 ``python -m bench.live.startup FOLDER METHOD STARTED_S`` is the measured process; it prints one JSON object.
+``python -m bench.live.startup --entry ARGUMENTS`` measures a start of Python with these arguments.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -16,6 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+from bench.resident import peak_mb
 
 Row = dict[str, Any]
 PARTS = ("Python", "import engine", "open map and flight", "warm-up", "first frame")
@@ -37,22 +39,32 @@ def entries(rounds: int = 5) -> list[Row]:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     rows = []
     for what, arguments in ENTRIES.items():
-        starts = [_entry([sys.executable, *arguments], environment) for _ in range(rounds + 1)][1:]
+        starts = [_entry(arguments, environment) for _ in range(rounds + 1)][1:]
         seconds, core_s, resident_mb = (statistics.median(values) for values in zip(*starts, strict=True))
         rows.append({"what": what, "seconds": seconds, "core_s": core_s, "resident_mb": resident_mb})
     return rows
 
 
-def _entry(command: list[str], environment: dict[str, str]) -> tuple[float, float, float]:
-    """Seconds, seconds on a core and megabytes of one process."""
+def _entry(arguments: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float, float]:
+    """Seconds, seconds on a core and megabytes of one start of Python.
+
+    A small process starts it: the peak that the system counts for a child begins with that of its parent.
+    """
+    command = [sys.executable, "-m", "bench.live.startup", "--entry", *arguments]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
+    seconds, core_s, resident_mb = json.loads(done.stdout)
+    return seconds, core_s, resident_mb
+
+
+def _measured_entry(arguments: list[str]) -> list[float]:
     begin = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
+    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - begin
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, command)
-    return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0
+        raise subprocess.CalledProcessError(process.returncode, arguments)
+    return [seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * 1.024e-3]
 
 
 def startup(methods: tuple[str, ...] = ("ncc", "sift", "auto"), rounds: int = 1) -> list[Row]:
@@ -115,14 +127,14 @@ def measured() -> Row:
     result = matcher.locate(first.frame, first.prior)
     marks.append(time.time())
     spent = [end - begin for begin, end in itertools.pairwise(marks)]
-    used = resource.getrusage(resource.RUSAGE_SELF)
+    used = os.times()
     return {
         **dict(zip(PARTS, spent, strict=True)),
         "fixed": isinstance(result, Fix),
-        "core_s": used.ru_utime + used.ru_stime,  # which other work on the machine hardly changes
-        "resident_mb": used.ru_maxrss / 1024.0,
+        "core_s": used.user + used.system,  # which other work on the machine hardly changes
+        "resident_mb": peak_mb(),
     }
 
 
 if __name__ == "__main__":
-    print(json.dumps(measured()))
+    print(json.dumps(_measured_entry(sys.argv[2:]) if sys.argv[1] == "--entry" else measured()))

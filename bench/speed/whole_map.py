@@ -6,7 +6,6 @@ Run alone, so that its peak memory is its own: ``python -m bench.speed.whole_map
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import tempfile
 import time
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 
 from bench.inputs.scenes import flight, mosaic, town_gray
+from bench.resident import peak_mb
 from engine import Fix, MatcherOptions, OrthoMap, SceneMatcher, set_threads
 from engine.formats.geotiff import write_geotiff
 from engine.methods.options import NccOptions
@@ -69,7 +69,7 @@ def ours(path: Path, count: int) -> dict[str, Any]:
         "median_s": float(np.median(times)),
         "max_s": float(np.max(times)),
         "prepared_s": prepared_s,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+        "peak_memory_mb": peak_mb(),
     }
 
 
@@ -87,7 +87,7 @@ def opencv(path: Path) -> dict[str, Any]:
     return {
         "peer": "OpenCV, one hypothesis",
         "median_s": time.perf_counter() - start,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+        "peak_memory_mb": peak_mb(),
     }
 
 
