@@ -110,7 +110,8 @@ class SceneMatcher:
                 for _ in range(rounds):
                     self.locate(frame, prior)
                     self._method.warmup(self._query(frame, prior, Deadline(Budget())))
-                self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
+                if rounds > 1 or share == _WARMUP_SHARES[-1]:  # one search compiles what all need
+                    self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
             if self.site.is_searchable:
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
         _give_back_memory()
