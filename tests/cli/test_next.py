@@ -102,6 +102,14 @@ def test_campaign_names_runs_that_it_finished(tmp_path, capsys, monkeypatch):
     assert next_of(capsys, ["campaign", "c.toml", "--out=o"], code=1) == ["report", "RUN"]
 
 
+@pytest.mark.parametrize(("availability", "command"), [(0.9, "export"), (0.0, "check")])
+def test_a_closed_loop_without_a_fix_is_not_exported(tmp_path, capsys, monkeypatch, availability, command):
+    monkeypatch.setattr("engine.runs.closed_loop.fly_closed_loop", lambda *_, **__: {"availability": availability})
+    words = next_of(capsys, ["simulate", f"--out={tmp_path / 'o'}", "--closed-loop"])
+    assert parsed(words) == command
+    assert (str(tmp_path / "o" / "telemetry.csv") in words) == (command == "check")
+
+
 def test_a_path_with_two_spaces_stays_as_it_is(capsys):
     console.next_step(f"track {console.options(map='two  spaces/a map.tif')}")
     said = capsys.readouterr().err

@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from engine.runs.live_viewing import LiveViewTarget
     from engine.runs.simulation import WorldSettings
 
+_FLIGHT = {
+    "map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
+    "telemetry": "telemetry.csv",
+}  # fmt: skip
+
 
 def simulate(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Flight folder, created by this run.")],
@@ -102,15 +107,13 @@ def simulate(
     else:
         facts = _fly_closed_loop(out, world, loop, LiveViewTarget(recording, viewer), force)
     console.facts(facts, as_json, title=f"simulated flight {seed}")
-    if closed_loop:
-        page = f"open {out / 'report.html'}"
-        console.next_step(f"export {console.quoted(out)} --format geojson", as_json=as_json, hint=page)
+    flight = {name: out / file for name, file in _FLIGHT.items()}
+    if not closed_loop:
+        console.next_step(f"track {console.options(**flight, out=f'{out}-track')}", as_json=as_json)
         return
-    flight = console.options(
-        map=out / "map.tif", surface=out / "dsm.tif", camera=out / "camera.yaml", frames=out / "frames",
-        telemetry=out / "telemetry.csv", out=f"{out}-track",
-    )  # fmt: skip
-    console.next_step(f"track {flight}", as_json=as_json)
+    shown = f"export {console.quoted(out)} --format geojson"
+    following = shown if facts["availability"] else f"check {console.options(**flight)}"
+    console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
 
 
 def _fly_closed_loop(
