@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from engine import Budget, Fix, SceneMatcher
+from engine.budget import Deadline
 from engine.errors import OptionError
+from engine.methods import feature_matching
 from engine.methods.feature_pose import FeatureMatcher
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.refinement import Refinement
 from engine.methods.scheduler import OutOfTime
 from engine.methods.sift import Sift
+from engine.methods.views import drawn_px
 from engine.values import NoFix, Reason
 from tests.methods.test_scheduler import FixedCosts
 
@@ -209,10 +212,11 @@ def test_few_features_that_were_too_dear_once_are_tried_again(ground, camera, si
     dear_ms = 40.0 * matcher._costs.upper_bound_ms("sift", ground.gray.size)
     matcher._costs._models["sift by few features"].ms *= 1e3
     frame, prior = shot(ground, camera), ground.prior(NADIR)
-    before_ms = matcher._costs.upper_bound_ms("sift by few features", frame.image[..., 0].size)
+    work_px = drawn_px(matcher._query(frame, prior, Deadline(Budget())), frame.height_agl_m, 0.5)
+    before_ms = matcher._costs.upper_bound_ms("sift by few features", work_px)
     for _ in range(10):
         matcher.locate(frame, prior, Budget(total_ms=min(dear_ms, before_ms / 2.0)))
-    after_ms = matcher._costs.upper_bound_ms("sift by few features", frame.image[..., 0].size)
+    after_ms = matcher._costs.upper_bound_ms("sift by few features", work_px)
     assert after_ms < before_ms
 
 
@@ -235,3 +239,22 @@ def test_samples_of_another_method_are_shared(site, camera):
     parts = both._method.parts
     assert isinstance(parts["sift"], Sift)
     assert parts["sift"].samples is parts["ncc"].samples
+
+
+@pytest.mark.parametrize("scale", [0.35, 0.5, 1.0])
+def test_the_cost_of_features_goes_by_the_pixels_that_are_drawn(ground, camera, matcher, monkeypatch, scale):
+    """Not by the frame's: at one height they are up to four times as many as at another. Borders are not shown."""
+    shown = []
+    drawn = feature_matching.orthorectify
+
+    def noting(*args):
+        photo = drawn(*args)
+        shown.append(np.count_nonzero(photo.valid))
+        return photo
+
+    monkeypatch.setattr(feature_matching, "orthorectify", noting)
+    for height_m in (90.0, 110.0, 130.0, 150.0):
+        frame = ground.frame(camera, NADIR, height_m, heading_deg=25.0)
+        query = matcher._query(frame, ground.prior(NADIR), Deadline(Budget()))
+        FeatureMatcher(query, matcher._method.landmarks, SiftOptions(scale=scale)).find_at_once()
+        assert 1.0 < drawn_px(query, height_m, scale) / shown[-1] < 1.35
