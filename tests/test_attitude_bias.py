@@ -78,8 +78,8 @@ def test_what_is_assumed_of_any_telemetry_is_not_corrected():
     bias, frames = flown((0.5, -0.5, 1.5))
     assert bias.bias.roll_deg == pytest.approx(-0.5, abs=0.1)
     for k, frame in enumerate(frames):
-        told = frame_at(k * INTERVAL_S, (0.5, -0.5, 1.5))
-        assert fields_of(replace(frame, tilt_lag_deg=None, heading_lag_deg=None)) == fields_of(told)
+        stated = frame_at(k * INTERVAL_S, (0.5, -0.5, 1.5))
+        assert fields_of(replace(frame, tilt_lag_deg=None, heading_lag_deg=None)) == fields_of(stated)
 
 
 def test_a_bias_that_changes_is_followed():
