@@ -131,8 +131,8 @@ def _rows(names: list[str]) -> list[list[str]]:
     return rows
 
 
-def _width(name: str) -> float:
-    return round(LETTER_PX * len(name) + 18, 1)
+def _width(name: str) -> int:
+    return round(LETTER_PX * len(name) + 18)  # whole: sums of floats differ between Python 3.11 and 3.12
 
 
 def _line(boxes: dict[str, tuple[float, float]], name: str, other: str) -> str:

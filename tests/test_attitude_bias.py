@@ -17,6 +17,7 @@ from engine.attitude_lag import AttitudeLag
 from engine.navigator import Navigator
 from engine.navigator_options import ACCEPT_ALL
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
+from tests.support.fields import fields_of
 
 IMAGE = np.zeros((8, 8), np.uint8)
 _NUMBERS = itertools.count()
@@ -77,9 +78,8 @@ def test_what_is_assumed_of_any_telemetry_is_not_corrected():
     bias, frames = flown((0.5, -0.5, 1.5))
     assert bias.bias.roll_deg == pytest.approx(-0.5, abs=0.1)
     for k, frame in enumerate(frames):
-        assert replace(frame, tilt_lag_deg=None, heading_lag_deg=None) == frame_at(
-            k * INTERVAL_S, (0.5, -0.5, 1.5)
-        )
+        stated = frame_at(k * INTERVAL_S, (0.5, -0.5, 1.5))
+        assert fields_of(replace(frame, tilt_lag_deg=None, heading_lag_deg=None)) == fields_of(stated)
 
 
 def test_a_bias_that_changes_is_followed():
@@ -135,7 +135,7 @@ def test_one_fix_alone_takes_nothing_off():
     bias = AttitudeBias(1.0, 5.0)
     bias.follow(frame_at(0.0), 0.0)
     bias.note(fix_of((6.0, -6.0, 20.0)))
-    assert bias.corrected(frame_at(0.1)) == frame_at(0.1)
+    assert fields_of(bias.corrected(frame_at(0.1))) == fields_of(frame_at(0.1))
 
 
 def test_a_bias_within_what_the_frame_states_of_itself_is_left():

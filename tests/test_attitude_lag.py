@@ -13,6 +13,7 @@ from engine.covariance import AssumedErrors, with_frame_accuracy
 from engine.errors import OptionError, TelemetryError
 from engine.navigator_options import ACCEPT_ALL, NavigatorOptions
 from engine.values import Attitude, Fix, Frame, Timings, Window
+from tests.support.fields import fields_of
 
 IMAGE = np.zeros((8, 8), np.uint8)
 INTERVAL_S = 0.1
@@ -80,7 +81,8 @@ def test_a_calm_flight_is_as_it_was():
 @pytest.mark.parametrize("changes", [{"timestamp_ns": None}, {"roll_deg": None}, {"heading_deg": None}])
 def test_without_stamp_or_attitude_there_is_no_rate(changes):
     _, frames = flown(0.1, frames=4, **changes)
-    assert frames == [frame_at(k * INTERVAL_S, 0.1, **changes) for k in range(4)]
+    given = [frame_at(k * INTERVAL_S, 0.1, **changes) for k in range(4)]
+    assert list(map(fields_of, frames)) == list(map(fields_of, given))
 
 
 def test_frames_far_apart_say_nothing():

@@ -45,7 +45,8 @@ def _block_peaks(
     product = tl.load(products + template * template_stride + y * row_stride + x, mask=inside, other=0.0)
     norm = tl.load(inverse_norms + template * norm_template_stride + y * norm_stride + x, mask=inside, other=0.0)
     score = product * norm
-    score = tl.minimum(tl.maximum(score, -1.0), 1.0)  # NaN becomes -1
+    score = tl.where(score > -1.0, score, -1.0)  # NaN becomes -1; tl.maximum keeps it in Triton 3.7's interpreter
+    score = tl.minimum(score, 1.0)
     if winner is not None:
         middle = tl.load(winner + template)
         dy, dx = y - middle // width, x - middle % width

@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def test_settings_that_name_nothing_are_refused(tmp_path, line, words):
 
 def database_export(path):
     """A table as a database's shell exports it: semicolons, and its own dates and names."""
-    with sqlite3.connect(":memory:") as database:
+    with closing(sqlite3.connect(":memory:")) as database:
         rows = database.execute(
             "SELECT strftime('%Y-%m-%d %H:%M:%f', 1777636800 + k / 2.0, 'unixepoch'), k || '.png', 120.5 + k "
             "FROM (SELECT 0 AS k UNION SELECT 1)"

@@ -1,6 +1,7 @@
 """Exported tracks opened by the libraries that people open them with: gpxpy, pynmea2, and GDAL by pyogrio."""
 
 import datetime
+import warnings
 
 import numpy as np
 import pytest
@@ -68,7 +69,9 @@ def points_of(geometries):
 def gdal_layer(path, layer=None):
     """Geometries and fields of a vector file, by GDAL."""
     pyogrio = pytest.importorskip("pyogrio", reason="pyogrio is not installed")
-    facts, _, geometries, values = pyogrio.raw.read(path, layer=layer)
+    with warnings.catch_warnings():  # pyogrio's own, of NumPy 2.5
+        warnings.filterwarnings("ignore", "The 'generic' unit for NumPy timedelta", DeprecationWarning)
+        facts, _, geometries, values = pyogrio.raw.read(path, layer=layer)
     return facts, geometries, dict(zip(facts["fields"], values, strict=True))
 
 

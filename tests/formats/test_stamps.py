@@ -4,6 +4,7 @@ import csv
 import datetime
 import json
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def test_dates_as_python_writes_them(tmp_path):
 
 
 def test_dates_without_a_zone_are_utc_and_said(tmp_path):
-    with sqlite3.connect(":memory:") as database:  # another program's way to write a date
+    with closing(sqlite3.connect(":memory:")) as database:  # another program's way to write a date
         query = "SELECT strftime('%Y-%m-%d %H:%M:%f', ?, 'unixepoch')"
         given = [database.execute(query, (ns / 1e9,)).fetchone()[0] for ns in UTC_NS]
     found = open_telemetry(table(tmp_path / "t.csv", given))

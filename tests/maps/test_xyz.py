@@ -3,6 +3,7 @@
 import math
 import shutil
 import sqlite3
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -132,12 +133,11 @@ def test_it_lies_where_the_slippy_map_has_it(cache):
 def test_the_tiles_of_mbtiles_in_a_folder_are_the_map_that_mbtiles_are(tmp_path, plain, south_up):
     """Whose tiles GDAL cut and reads."""
     copy(plain, tmp_path / "map.mbtiles", driver="MBTiles", tile_format="PNG")
-    with sqlite3.connect(tmp_path / "map.mbtiles") as base:
+    with closing(sqlite3.connect(tmp_path / "map.mbtiles")) as base:
         for zoom, column, row, data in base.execute("SELECT * FROM tiles"):  # MBTiles count rows from the south
             path = tmp_path / f"tiles/{zoom}/{column}/{row if south_up else 2**zoom - 1 - row}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-    base.close()
     if south_up:
         (tmp_path / "tiles/tilemapresource.xml").write_text(TMS.format(srs="EPSG:3857", profile="mercator"))
     packed, cached = OrthoMap.open(tmp_path / "map.mbtiles"), OrthoMap.open(tmp_path / "tiles")
