@@ -28,7 +28,7 @@ from engine.methods.peak_evidence import (
     with_confidence,
 )
 from engine.methods.query import Query
-from engine.methods.refinement import Refinement
+from engine.methods.refinement import Refinement, with_unconfirmed_tilt
 from engine.methods.scheduler import OutOfTime
 from engine.methods.second_look import can_look_coarsely, candidate_of, hopeful_look, second_look
 from engine.orthomap import OrthoMap
@@ -98,40 +98,41 @@ class Ncc(Method):
         coarse = self._by_coarse_peak(query)
         if coarse is None:
             return self.correlate(query, try_turns=try_turns)
-        is_certain = coarse.confidence is not None and coarse.confidence >= _MIN_CONFIDENCE_COARSE
+        kept, is_certain = coarse, (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
         try:
             with query.scheduler.with_fix():
-                refined = self._refine_at_once(query, coarse) if is_certain else None
-                fine = refined or self.correlate(query, try_turns=try_turns)
+                if is_certain:
+                    with query.scheduler.costed(_AT_ONCE, float(query.gray.size)):
+                        refined = Refinement(query, self.samples, self.options).refine_at_once(coarse)
+                    if refined is not None:
+                        return refined
+                    kept = with_unconfirmed_tilt(query, coarse)
+                fine = self.correlate(query, try_turns=try_turns)
         except OutOfTime:
-            return coarse
+            return kept
         if isinstance(fine, Fix):
             return fine
         is_seconded = is_certain and any(agree_in_place(coarse, peak) for peak in fine.candidates[:1])
-        return coarse if is_seconded or fine.reason is Reason.LATE else fine
+        return kept if is_seconded or fine.reason is Reason.LATE else fine
 
     def _by_coarse_peak(self, query: Query) -> Fix | None:
-        """The peak of the coarsest level, where it is accepted and a pose may be refined from it.
+        """The peak of the coarsest level, where it is accepted and a pose may be refined from it as from any.
 
-        It costs a fraction of a fine one, and what is refined from it is the same pose. Where roll and pitch, or
-        the slope of the ground, are unknown, the pose rests on the peak as well, which then must be fine.
+        Where roll, pitch or the slope of the ground is unknown, the pose rests on the peak, which must be fine.
         """
         if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
             return None
         step, works = self._step(query)
-        coarser = max(works)
+        coarser, scheduler = max(works), query.scheduler
         is_wide = query.site.is_large and works[coarser] > MAX_WINDOW_PX
         if not (coarser and query.telemetry.has_tilt and query.site.has_surface) or is_wide:
             return None
-        if not query.scheduler.can_afford_all({step: works[coarser], _AT_ONCE: float(query.gray.size)}):
+        if not scheduler.can_afford_all({step: works[coarser], _AT_ONCE: float(query.gray.size)}):
+            if scheduler.can_afford(step, works[coarser]):
+                scheduler.note_refusal(_AT_ONCE)
             return None
         _, result = self._find_and_judge(query, step, works, coarser)
         return None if isinstance(result, NoFix) else replace(result, stage="coarse")
-
-    def _refine_at_once(self, query: Query, coarse: Fix) -> Fix | None:
-        """The pose refined from a coarse peak; None where it is not confirmed."""
-        with query.scheduler.costed(_AT_ONCE, float(query.gray.size)):
-            return Refinement(query, self.samples, self.options).refine_at_once(coarse)
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.

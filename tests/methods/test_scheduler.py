@@ -166,7 +166,19 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
     monkeypatch.setattr(Ncc, "correlate", refused)
     result = make("ncc").locate(frame, prior, HURRY)
     assert isinstance(result, Fix) == is_fixed
+    if is_fixed:  # refinement did not confirm the tilt
+        assert result.sigma_m > 1.5 * coarse(make("ncc")._query(frame, prior, Deadline(HURRY))).sigma_m
     assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
+
+
+def test_a_refinement_at_once_that_was_too_dear_once_is_tried_again(site, camera, frame, prior):
+    """Without it every frame takes the long way, which is dearer yet."""
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    matcher._costs.learn("refinement at once", 9e4, 1e9)
+    before_ms = matcher._costs.upper_bound_ms("refinement at once", 9e4)
+    for _ in range(40):
+        matcher.locate(frame, prior, Budget(total_ms=0.9 * before_ms))
+    assert matcher._costs.upper_bound_ms("refinement at once", 9e4) < 0.5 * before_ms
 
 
 def test_beside_a_fix_a_step_leaves_room_for_a_preemption(ground, make, frame, prior):
