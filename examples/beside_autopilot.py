@@ -27,4 +27,4 @@ with bridge:
         for picture in pictures:
             if picture is not None:  # a camera had none for a while
                 bridge.submit(*picture)
-    print(bridge.status)
+print(bridge.status)  # closed, the frame in progress has been answered

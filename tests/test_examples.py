@@ -65,7 +65,6 @@ def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
         finally:
             bridge.kill()
     assert bridge.returncode == 0
-    assert "connected=True" in said
     # A busy machine hears of height and receiver after its first fix, and is late with some.
     unheard = {"no height", "receiver not heard yet"}
     assert set(re.findall(r"'([\w ]+)': \d+", said)) <= {"late", "unconfirmed"} | unheard
