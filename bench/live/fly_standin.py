@@ -31,6 +31,7 @@ from engine.geo import LocalFrame
 
 FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 _REPORT_S = 5.0
+_LAST_ANSWER_S = 1.0  # the answer to the last picture comes after the flight
 
 
 def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]:
@@ -120,7 +121,7 @@ def fly(flight: Path, port: int, firmware: str, seconds: float | None = None) ->
     agenda.every(2 * MS, pilot.poll, clock())
     agenda.every(round(_REPORT_S * S), lambda: print(summary(errors), flush=True), clock() + round(_REPORT_S * S))
     try:
-        agenda.run(begin_ns + round(min(duration_s, math.inf if seconds is None else seconds) * S))
+        agenda.run(begin_ns + round(min(duration_s + _LAST_ANSWER_S, math.inf if seconds is None else seconds) * S))
     finally:
         pilot.close()
     return {"fixes": len(errors), "median_m": float(np.median(errors)) if errors else None}
