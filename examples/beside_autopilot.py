@@ -22,9 +22,8 @@ bridge = MavlinkBridge(
 )
 # A camera, or without one the flight folder's pictures at their own pace.
 pictures = capture(cameras[0]) if cameras else replay(Path("frames"), Path("telemetry.csv"), rate_hz=5.0)
-with bridge:
-    with suppress(KeyboardInterrupt):  # the usual end beside a camera
-        for picture in pictures:
-            if picture is not None:  # a camera had none for a while
-                bridge.submit(*picture)
+with bridge, suppress(KeyboardInterrupt):  # the usual end beside a camera
+    for picture in pictures:
+        if picture is not None:  # a camera had none for a while
+            bridge.submit(*picture)
 print(bridge.status)  # closed, the frame in progress has been answered
