@@ -27,6 +27,10 @@ def site(ground):
         {"roll_deg": -3.0, "pitch_deg": 4.0},  # swapped
         {"roll_deg": -4.0, "pitch_deg": 3.0},  # of the other sign
         {"roll_deg": 0.07, "pitch_deg": -0.05},  # radians
+        {"roll_deg": 14.0, "pitch_deg": -3.0},
+        {"roll_deg": 4.0, "pitch_deg": 7.0},
+        {"roll_deg": 4.0, "pitch_deg": -13.0},
+        {"roll_deg": -6.0, "pitch_deg": -3.0},
     ],
 )
 def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, method, stated):
