@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 import threading
 from functools import cache, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from engine.errors import OptionError
 from engine.kernels import surface_loops
@@ -101,10 +101,9 @@ def prepared_surface(image: FloatImage, inverse_norms: FloatImage, templates: Fl
 
 
 class _Block(NamedTuple):
-    """Part of a window and where its scores lie on the surface."""
+    """The transform of part of a window, and where its scores lie on the surface."""
 
-    values: FloatImage
-    is_spectrum: bool
+    spectrum: NDArray[np.floating]  # float64 where some patch is too weak for float32
     rows: slice
     columns: slice
 
@@ -142,11 +141,11 @@ def correlate(
     blocks = in_parallel(prepared, range(ny * nx))
 
     def one_template(t: int) -> None:
-        spectrum = _spectrum(models[t], size) if any(block.is_spectrum for block in blocks) else None
+        spectra = {kind: _spectrum(models[t], size, kind) for kind in {block.spectrum.dtype for block in blocks}}
 
         def one_block(block: _Block) -> None:
-            part = block.rows, block.columns
-            _write_scores(out[t][part], block, models[t], spectrum, inverse_norms[part])
+            part, spectrum = (block.rows, block.columns), block.spectrum
+            _write_scores(out[t][part], spectrum, spectra[spectrum.dtype], inverse_norms[part])
 
         in_parallel(one_block, blocks)
 
@@ -177,10 +176,13 @@ def _finish_pair(
 ) -> None:
     """The scores of what :func:`surface_loops.pack` wrote: both pictures in one transform, of equal norm."""
     mean, energy = moments
+    size = packed.shape[:2]
     if _is_weak(energy, largest):
-        _write_exactly(out, window - np.float32(mean), model, inverse_norms)
+        whole = slice(0, out.shape[0]), slice(0, out.shape[1])
+        spectrum = _block(window, mean, size, inverse_norms, whole).spectrum
+        _write_scores(out, spectrum, _spectrum(model, size, spectrum.dtype), inverse_norms)
         return
-    products = _scratch("products", packed.shape[:2])
+    products = _scratch("products", size)
     cv2.dft(packed, packed)
     surface_loops.packed_product(products, packed)
     transform(products, cv2.DFT_INVERSE, out.shape[0])
@@ -190,20 +192,6 @@ def _finish_pair(
 def _is_weak(energy: float, largest: float) -> bool:
     """Whether some patch, by the largest of the inverse norms, is too weak in this window for float32."""
     return energy * largest**2 > FLOAT32_NORM_RATIO**2
-
-
-def _write_exactly(out: FloatImage, window: FloatImage, model: FloatImage, inverse_norms: FloatImage) -> None:
-    """By transforms in float64; OpenCV's ``matchTemplate`` is no more exact than float32 on small templates."""
-    size = fast_side(window.shape[0]), fast_side(window.shape[1])
-    values, spectrum = np.zeros(size), np.zeros(size)
-    values[: window.shape[0], : window.shape[1]] = window
-    spectrum[: model.shape[0], : model.shape[1]] = model
-    transform(values, 0, window.shape[0])
-    transform(spectrum, 0, model.shape[0])
-    cv2.mulSpectrums(values, spectrum, 0, values, True)
-    transform(values, cv2.DFT_INVERSE, out.shape[0])
-    products = (values[: out.shape[0], : out.shape[1]] / values.size).astype(np.float32)
-    surface_loops.normalise(out, products, inverse_norms, np.float32(1.0))
 
 
 @lru_cache(maxsize=1024)
@@ -224,43 +212,42 @@ def fast_side(n: int) -> int:
 def _block(
     window: FloatImage, mean: float, size: tuple[int, int], inverse_norms: FloatImage, part: tuple[slice, slice]
 ) -> _Block:
-    """The transform of part of a window; the part itself where some patch is too weak for float32."""
-    values = np.empty(size, np.float32)
+    """The transform of part of a window."""
+    values: NDArray[np.floating] = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
     if _is_weak(energy, float(inverse_norms.max())):
-        return _Block(values[: window.shape[0], : window.shape[1]], False, *part)
+        values = values.astype(np.float64)
     transform(values, 0, window.shape[0])
-    return _Block(values, True, *part)
+    return _Block(values, *part)
 
 
-def _spectrum(model: FloatImage, size: tuple[int, int]) -> FloatImage:
-    values = np.zeros(size, np.float32)
+def _spectrum(model: FloatImage, size: tuple[int, int], kind: np.dtype[np.floating]) -> NDArray[np.floating]:
+    values = np.zeros(size, kind)
     values[: model.shape[0], : model.shape[1]] = model
     transform(values, 0, model.shape[0])
     return values
 
 
 def _write_scores(
-    out: FloatImage, block: _Block, model: FloatImage, spectrum: FloatImage | None, inverse_norms: FloatImage
+    out: FloatImage, block: NDArray[np.floating], model: NDArray[np.floating], inverse_norms: FloatImage
 ) -> None:
-    if block.is_spectrum:
-        products = _scratch("products", block.values.shape)
-        cv2.mulSpectrums(block.values, spectrum, 0, products, True)
-        transform(products, cv2.DFT_INVERSE, out.shape[0])
-        surface_loops.normalise(out, products, inverse_norms, np.float32(1.0 / products.size))
-    else:
-        _write_exactly(out, block.values, model, inverse_norms)
+    """Write the scores by the transforms of part of a window and of a template, both of one type."""
+    products = _scratch("products", block.shape, block.dtype)
+    cv2.mulSpectrums(block, model, 0, products, True)
+    transform(products, cv2.DFT_INVERSE, out.shape[0])
+    numerators = products[: out.shape[0], : out.shape[1]].astype(np.float32, copy=False)
+    surface_loops.normalise(out, numerators, inverse_norms, np.float32(1.0 / block.size))
 
 
 _kept = threading.local()
 
 
-def _scratch(name: str, shape: tuple[int, ...]) -> FloatImage:
+def _scratch(name: str, shape: tuple[int, ...], kind: DTypeLike = np.float32) -> NDArray[Any]:
     """An array that the thread keeps between calls: fresh pages of memory cost as much as a transform."""
-    count = math.prod(shape)
-    memory: FloatImage | None = getattr(_kept, name, None)
+    count, name = math.prod(shape), f"{name} {np.dtype(kind).char}"
+    memory: NDArray[Any] | None = getattr(_kept, name, None)
     if memory is None or memory.size < count:
-        memory = np.empty(count, np.float32)
+        memory = np.empty(count, kind)
         if count <= _MAX_KEPT:
             setattr(_kept, name, memory)
     return memory[:count].reshape(shape)
