@@ -84,7 +84,7 @@ def write(docs: Path, results: dict[str, Any]) -> None:
     }
     for name, figure in pictures.items():
         figure.savefig(docs / "img" / f"latency-{name}.png", dpi=130, facecolor="white")
-    lines = ["# The latency budget", "", *_wrapped(INTRO.format(machine=machine()))]
+    lines = ["# Latency, measured", "", *_wrapped(INTRO.format(machine=machine()))]
     lines += [
         "## On time, alone on the machine",
         "",

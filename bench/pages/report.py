@@ -30,9 +30,9 @@ INTRO = (
     "calls, and a ratio above 1 means faster than the peer it is counted from. Times are compared only where the "
     "results were shown to be the same, or where the quality of the results stands beside them: the peers' peaks "
     "lie on the same pixel, the score's error against the float64 reference stands beside its time, and so do the "
-    "figures of the features. No GPU was measured. NCC is its peak alone here, without the dense refinement. "
-    "Table I with its tails and the trade-off of accuracy against budget are in [latency](latency.md), whole "
-    "flights by SIFT in [flights](flights.md)."
+    "figures of the features. No GPU was measured. In all sections but the first, NCC is its peak alone, without "
+    "the dense refinement. Table I with its tails and the trade-off of accuracy against budget are in "
+    "[latency](latency.md), whole flights by SIFT in [flights](flights.md)."
 )
 
 
@@ -107,7 +107,8 @@ def _stages_section(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> 
         "`SceneMatcher.locate` of a tracked flight, one thread: a refined and verified pose with its covariance. "
         "OpenCV's step (grey, enhance, warp, match; no check and no refinement, 1.1 to 1.3 m off) has the same "
         "frames in turns of twenty. *Before* is the engine before poses were refined from the coarsest level, "
-        "measured likewise on another machine: compare the ratios."
+        "measured likewise on another machine: compare the ratios. NEES is per axis: 1 where errors match the "
+        "covariance, less where it is cautious."
     )
     return [
         "## A frame of a tracked flight",

@@ -40,10 +40,11 @@ CONDITIONS = (
 )
 STEP = (
     "The paper's case on the built-in flight: half scale, the window of equations 4 and 5, a prior a few metres "
-    "off. `paper's` is its recipe taken literally with OpenCV (features of frame and window in every frame, "
-    "brute force, `solvePnPRansac` on flat ground); it refuses nothing. `scenematch` finds the map's features "
-    "once, before the flight; what that saves stands apart, for it and for OpenCV. It also judges the pose and "
-    "states a covariance. NCC stands here because the paper compares the two: how many times as long SIFT takes is"
+    "off. Rows that begin with `paper's` are its recipe taken literally with OpenCV (features of frame and "
+    "window in every frame, brute force, `solvePnPRansac` on flat ground); it refuses nothing. `scenematch` "
+    "finds the map's features once, before the flight; what that saves stands apart, for it and for OpenCV. It "
+    "also judges the pose and states a covariance. NCC stands here because the paper compares the two. The "
+    "first table states how many times as long SIFT takes."
 )
 PAPER_RATIO = 121 / 40  # Table I of the paper: SIFT's time over NCC's
 PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.4}
