@@ -235,8 +235,9 @@ def _write_scores(
     products = _scratch("products", block.shape, block.dtype)
     cv2.mulSpectrums(block, model, 0, products, True)
     transform(products, cv2.DFT_INVERSE, out.shape[0])
-    numerators = products[: out.shape[0], : out.shape[1]].astype(np.float32, copy=False)
-    surface_loops.normalise(out, numerators, inverse_norms, np.float32(1.0 / block.size))
+    if products.dtype != np.float32:
+        products = products[: out.shape[0], : out.shape[1]].astype(np.float32)
+    surface_loops.normalise(out, products, inverse_norms, np.float32(1.0 / block.size))
 
 
 _kept = threading.local()
