@@ -101,6 +101,8 @@ class Auto(Method):
             if not isinstance(first, Fix):
                 return self.sift.locate(query)
             with query.scheduler.with_fix():
+                if first.stage == "coarse":  # no pose that is refined yet: SIFT's will be
+                    return self.sift.locate(query)
                 return self.sift.confirm(query, partial(_agree, first))
         except OutOfTime:
             return query.refuse(Reason.LATE, "the budget was spent before there was a second fix", "sift")

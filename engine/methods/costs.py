@@ -16,8 +16,10 @@ _SIGMAS = 3.0
 _MIN_MS = 0.05
 _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for its cost
 _COST_DECAY = 0.99  # of the cost itself, until the step is tried
-_DEVIATION_DECAY_BESIDE_FIX = 0.995  # a try that comes too late loses a fix
-_PREEMPTION_DECAY = 0.99  # of the longest wait, each time that a stage or step ran: some five frames
+# The same beside a fix, which a try that comes too late may lose: of a step a third too dear one frame in 400.
+_DEVIATION_DECAY_BESIDE_FIX, _COST_DECAY_BESIDE_FIX = 0.995, 0.999
+_IDLE_DECAY = 0.8  # of the waiting, from frame to frame in which no step runs
+_PREEMPTION_DECAY = 0.9  # of the longest preemption, from frame to frame
 _ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
 
 
@@ -90,23 +92,32 @@ class Costs:
     def note_refusal(self, step: str, *, has_fix: bool = False) -> None:
         """Note that a step was refused for its cost: one that never runs is never seen to have become cheap.
 
+        Its cost decays until it is tried once; if it was not cheaper, that is undone.
+
         Args:
             step: its name.
-            has_fix: there is a fix, which a try may lose: only the deviation of the cost decays, and slowly. Else
-                the cost decays as well until it is tried once; if it was not cheaper, that is undone. So does the
-                waiting, which no other step has shown.
+            has_fix: there is a fix, which a try may lose: the cost decays slowly.
         """
         with self._lock:
             known = self._models.get(step)
-            if known is None:
-                return
-            if has_fix:
-                known.square *= _DEVIATION_DECAY_BESIDE_FIX**2
-                return
-            known.square *= _DEVIATION_DECAY**2
-            known.trust *= _COST_DECAY
-            self._waited_ms *= _DEVIATION_DECAY
-            self._preemption_ms *= _DEVIATION_DECAY
+            if known is not None:
+                known.square *= (_DEVIATION_DECAY_BESIDE_FIX if has_fix else _DEVIATION_DECAY) ** 2
+                known.trust *= _COST_DECAY_BESIDE_FIX if has_fix else _COST_DECAY
+
+    def note_idle(self) -> None:
+        """Note that no step ran: none has shown whether it would still have waited."""
+        with self._lock:
+            self._waited_ms *= _IDLE_DECAY
+
+    def begin_frame(self) -> None:
+        """Note that a frame begins."""
+        with self._lock:
+            self._preemption_ms *= _PREEMPTION_DECAY
+
+    def note_preemption(self, ms: float) -> None:
+        """Note that a processor was taken away for so long."""
+        with self._lock:
+            self._preemption_ms = max(self._preemption_ms, ms)
 
     def upper_bound_ms(self, step: str, work: float) -> float:
         """Expected time and three deviations of a step, with the waiting that goes with it; 0 if it never ran."""
@@ -119,12 +130,11 @@ class Costs:
 
     @property
     def preemption_ms(self) -> float:
-        """The longest that a stage waited for a processor of late."""
+        """The longest preemption of late."""
         with self._lock:
             return self._preemption_ms
 
     def _note_wait(self, ran_ms: float, waited_ms: float) -> None:
-        """Learn the share of waiting, and the longest wait."""
-        self._preemption_ms = max(_PREEMPTION_DECAY * self._preemption_ms, waited_ms)
+        """Learn the share of waiting."""
         self._ran_ms = _MEMORY * self._ran_ms + ran_ms
         self._waited_ms = _MEMORY * self._waited_ms + waited_ms

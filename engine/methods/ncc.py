@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from engine.acceptance import agree_in_place, judge_peak, judge_second_look
-from engine.confidence import probability
 from engine.device import Device
 from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
@@ -21,7 +20,7 @@ from engine.methods.oblique import is_ground_below, is_oblique
 from engine.methods.options import MatcherOptions
 from engine.methods.peak_evidence import (
     PeakCandidate,
-    features_of,
+    candidates_of,
     fix_of,
     is_hopeless,
     quick_look,
@@ -36,7 +35,6 @@ from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Win
 
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
-_MAX_CANDIDATES = 4  # of a refused frame
 _SECOND_LOOK, _AT_ONCE = "ncc second look", "refinement at once"  # steps
 _HOPEFUL_LOOK = "ncc second look by a coarser level"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
@@ -76,7 +74,7 @@ class Ncc(Method):
         self.refine(untilted, self.correlate(untilted))
         found = self.find(query)
         if isinstance(found, PeakCandidate):
-            self._candidates(query, found)  # as of a refused frame
+            candidates_of(self._correlator(query), found)  # as of a refused frame
         if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
             self.find_again(query, found)
 
@@ -98,22 +96,29 @@ class Ncc(Method):
         coarse = self._by_coarse_peak(query)
         if coarse is None:
             return self.correlate(query, try_turns=try_turns)
-        kept, is_certain = coarse, (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
+        scheduler, work_px, is_refuted = query.scheduler, float(query.gray.size), False
+        step, works = self._step(query)
+        is_certain = (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
         try:
-            with query.scheduler.with_fix():
-                if is_certain:
-                    with query.scheduler.costed(_AT_ONCE, float(query.gray.size)):
+            with scheduler.with_fix():
+                if is_certain and scheduler.can_afford(_AT_ONCE, work_px):
+                    with scheduler.costed(_AT_ONCE, work_px):
                         refined = Refinement(query, self.samples, self.options).refine_at_once(coarse)
                     if refined is not None:
                         return refined
-                    kept = with_unconfirmed_tilt(query, coarse)
-                fine = self.correlate(query, try_turns=try_turns)
+                    coarse, is_refuted = with_unconfirmed_tilt(query, coarse), True
+                finer = {level: work for level, work in works.items() if level < max(works)}
+                level = scheduler.first_affordable(step, finer)
+                if level is None:
+                    return coarse
+                fine = self.correlate(query, level, try_turns=try_turns)
         except OutOfTime:
-            return kept
+            return coarse
         if isinstance(fine, Fix):
-            return fine
-        is_seconded = is_certain and any(agree_in_place(coarse, peak) for peak in fine.candidates[:1])
-        return kept if is_seconded or fine.reason is Reason.LATE else fine
+            return with_unconfirmed_tilt(query, fine) if is_refuted and fine.stage == "coarse" else fine
+        if is_certain and any(self._is_same(coarse, peak) for peak in fine.candidates[:1]):
+            return replace(coarse, confidence=self.options.rule.min_confidence)
+        return coarse if fine.reason is Reason.LATE else fine
 
     def _by_coarse_peak(self, query: Query) -> Fix | None:
         """The peak of the coarsest level, where it is accepted and a pose may be refined from it as from any.
@@ -133,6 +138,11 @@ class Ncc(Method):
             return None
         _, result = self._find_and_judge(query, step, works, coarser)
         return None if isinstance(result, NoFix) else replace(result, stage="coarse")
+
+    def _is_same(self, coarse: Fix, fine: Fix) -> bool:
+        """Whether two peaks are of one place: where one would not be the other's rival."""
+        apart_m = np.hypot(coarse.east_m - fine.east_m, coarse.north_m - fine.north_m)
+        return bool(apart_m < self.options.rule.exclusion_m) and agree_in_place(coarse, fine)
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
@@ -160,7 +170,7 @@ class Ncc(Method):
                 if isinstance(result, NoFix) and try_turns and found.features is not None:
                     result = self._look_turned(query, coarser, works[coarser], result)
             if isinstance(result, NoFix):
-                result = replace(result, candidates=self._candidates(query, found))
+                result = replace(result, candidates=candidates_of(self._correlator(query), found))
         if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
             return self.refine(query.with_height(found.aligned.pose), result)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
@@ -269,30 +279,6 @@ class Ncc(Method):
         if refusal is not None:
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
         return fix
-
-    def _candidates(self, query: Query, found: PeakCandidate) -> tuple[Fix, ...]:
-        """The peaks of a refused frame, each with its probability beside the others; none where no model holds.
-
-        Rivals belong to it: over repeated structure they follow the vehicle as faithfully as the right place does.
-        """
-        if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
-            return ()
-        correlator, aligned = self._correlator(query), found.aligned
-        exclusion_px = self.options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
-        apart_px = max(2, round(exclusion_px))
-        with query.scheduler.stage("candidates"):
-            best = correlator.best_places(aligned, found.fix.window, apart_px, _MAX_CANDIDATES)
-        if best is None:
-            return (found.fix,)
-        (places, corner_px), fixes = best, [found.fix]
-        for x, y, score in places:
-            place = corner_px + np.array([x, y])
-            if max(abs(place - [found.peak.x, found.peak.y])) <= apart_px:
-                continue
-            peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
-            fix = fix_of(correlator, aligned, peak, found.fix.window, searched=False)
-            fixes.append(replace(fix, confidence=probability(features_of(query, aligned, peak, fix))))
-        return tuple(fixes[:_MAX_CANDIDATES])
 
     def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
         """The fix by a heading that is a few degrees off, where one is much more probable, else the refusal.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from engine.acceptance import judge_peak
 from engine.coarse_to_fine import QuickLook
 from engine.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
@@ -16,6 +18,7 @@ from engine.values import Fix, Peak, Window
 
 HOPELESS_ODDS = 0.01
 """Odds as a share of those that are asked for, below which what a quick look found is not looked at closely."""
+_MAX_CANDIDATES = 4  # of a refused frame
 _EXPECTED_CHI_SQUARE = 2.0  # of two degrees of freedom
 
 
@@ -149,3 +152,28 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
         grid_attitude=pose.grid_attitude if searched else None,
         map_sigma_m=errors.map_m,
     )
+
+
+def candidates_of(correlator: Correlator, found: PeakCandidate) -> tuple[Fix, ...]:
+    """The peaks of a refused frame, each with its probability beside the others; none where no model holds.
+
+    Rivals belong to it: over repeated structure they follow the vehicle as faithfully as the right place does.
+    """
+    query, aligned, window = correlator.query, found.aligned, found.fix.window
+    if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
+        return ()
+    exclusion_px = correlator.options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+    apart_px = max(2, round(exclusion_px))
+    with query.scheduler.stage("candidates"):
+        best = correlator.best_places(aligned, window, apart_px, _MAX_CANDIDATES)
+    if best is None:
+        return (found.fix,)
+    (places, corner_px), fixes = best, [found.fix]
+    for x, y, score in places:
+        place = corner_px + np.array([x, y])
+        if max(abs(place - [found.peak.x, found.peak.y])) <= apart_px:
+            continue
+        peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
+        fix = fix_of(correlator, aligned, peak, window, searched=False)
+        fixes.append(replace(fix, confidence=probability(features_of(query, aligned, peak, fix))))
+    return tuple(fixes[:_MAX_CANDIDATES])

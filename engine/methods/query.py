@@ -283,7 +283,7 @@ class Query:
 
     def refuse_late(self, method: str, step: str) -> NoFix:
         """The refusal of a frame for whose quickest variant of a step there is no time, see :class:`Scheduler`."""
-        self.scheduler.note_refusal(step)
+        self.scheduler.note_late(step)
         left_ms = self.scheduler.deadline.remaining_ms
         detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
         return self.refuse(Reason.LATE, detail, method)

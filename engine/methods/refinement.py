@@ -18,6 +18,7 @@ from engine.geo import attitude_from_rotation
 from engine.indexes.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.methods.options import NccOptions
 from engine.methods.query import Query
+from engine.methods.scheduler import OutOfTime
 from engine.methods.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.scores import enhance
 from engine.values import Attitude, Fix, NoFix, Reason, Window
@@ -68,16 +69,19 @@ class Refinement:
         """The fix with all of its pose refined, or a less certain one where refinement does not confirm it.
 
         Where the picture does not or hardly confirm the telemetry's attitude, that is doubted: the pose is refined
-        once more as if roll and pitch were hardly known, and the better of both counts. Without a known roll and
-        pitch the picture must determine them over a surface model, or the fix is refused: its error is unknown
-        then. Over ground that is taken for flat a fix that is not confirmed stays as it was.
+        once more as if roll and pitch were hardly known, which counts where the picture confirms that. Without a
+        known roll and pitch the picture must determine them over a surface model, or the fix is refused: its error
+        is unknown then. Over ground that is taken for flat a fix that is not confirmed stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
         is_doubtful = refined is None or refined.score < MIN_CORRELATION_AT_ONCE
         if is_doubtful and has_tilt and query.site.has_surface:
-            doubted = self._doubting()._through_all(fix)
-            refined = max(filter(None, (refined, doubted)), key=lambda each: each.score, default=None)
+            try:
+                refined = self._doubting()._through_all(fix) or refined
+            except OutOfTime:
+                if refined is None:
+                    raise
         if refined is not None:
             return refined
         if not query.site.has_surface:

@@ -37,6 +37,7 @@ class Scheduler:
         self.deadline = deadline
         self._device = device
         self._costs = costs or Costs()
+        self._costs.begin_frame()
         self._stages_ms: dict[str, float] = {}
         self._step: tuple[str, float] | None = None  # that is being done, and its work
         self._has_fix = self._is_under_way = False
@@ -67,6 +68,12 @@ class Scheduler:
         """Note that a step could not be afforded, see :meth:`engine.methods.costs.Costs.note_refusal`."""
         self._costs.note_refusal(step, has_fix=self._has_fix)
 
+    def note_late(self, step: str) -> None:
+        """Note that a frame has no answer because a step could not be afforded."""
+        self.note_refusal(step)
+        if not self._has_fix:
+            self._costs.note_idle()
+
     @contextmanager
     def costed(self, step: str, work: float) -> Iterator[None]:
         """Learn what a step of this much work costs."""
@@ -75,11 +82,11 @@ class Scheduler:
         try:
             yield
         except OutOfTime:
-            self._costs.note_abandoned(step, work, *taken())
+            self._costs.note_abandoned(step, work, *taken()[:2])
             raise
         finally:
             self._step = outer
-        self._costs.learn(step, work, *taken())
+        self._costs.learn(step, work, *taken()[:2])
 
     @contextmanager
     def with_fix(self) -> Iterator[None]:
@@ -125,22 +132,27 @@ class Scheduler:
             yield
         finally:
             synchronise(self._device)
-            took_ms, waiting_ms = taken()
+            took_ms, waiting_ms, preemptions = taken()
             self._stages_ms[name] = self._stages_ms.get(name, 0.0) + took_ms
         if self._step is not None:
             self._costs.learn(stage, work, took_ms, waiting_ms)
+            if preemptions:
+                self._costs.note_preemption(waiting_ms / preemptions)
 
-    def _stopwatch(self) -> Callable[[], tuple[float, float]]:
-        """Says how many milliseconds have passed since it was made, and how many of them this thread waited.
+    def _stopwatch(self) -> Callable[[], tuple[float, float, int]]:
+        """Says how many milliseconds have passed since it was made, and how many of them, how often, it waited.
 
         Where other threads or a device do the work, its own time tells nothing of it, and all counts as work.
         """
         start_ms, works_alone = self.deadline.elapsed_ms, self._device.type == "cpu" and threads.count() == 1
         before = thread_usage() if works_alone else None
 
-        def taken() -> tuple[float, float]:
+        def taken() -> tuple[float, float, int]:
             took_ms = self.deadline.elapsed_ms - start_ms
-            return took_ms, 0.0 if before is None else waited_ms(before, thread_usage(), took_ms)
+            if before is None:
+                return took_ms, 0.0, 0
+            after = thread_usage()
+            return took_ms, waited_ms(before, after, took_ms), after.preemptions - before.preemptions
 
         return taken
 

@@ -109,10 +109,8 @@ def level_at(query: Query, height_m: float, scale: float) -> int:
 
 
 def drawn_px(query: Query, height_m: float, scale: float) -> float:
-    """How many pixels a frame has that is drawn on the level of a scale."""
-    per_px = map_px_per_pixel(query, height_m)
-    level = level_for(1.0, per_px / scale * _NO_LARGER, query.site.levels)
-    return query.gray.size * (per_px / 2.0**level) ** 2
+    """How many pixels a frame has that is drawn on the level of a scale; :func:`_view` may draw it coarser."""
+    return query.gray.size * (map_px_per_pixel(query, height_m) / 2.0 ** level_at(query, height_m, scale)) ** 2
 
 
 def coarser_scale(query: Query, height_m: float, scale: float) -> float | None:

@@ -47,14 +47,10 @@ class FixedCosts:
             step = step.removesuffix(suffix)
         return self.per_unit.get(step, 0.0) * work
 
-    def learn(self, step, work, ms, waited_ms=0.0):
+    def learn(self, *_, **__):
         pass
 
-    def note_refusal(self, step, *, keeps_cost=False, has_fix=False):
-        pass
-
-    def note_abandoned(self, step, work, ms, waited_ms=0.0):
-        pass
+    note_refusal = note_abandoned = note_idle = note_preemption = begin_frame = learn
 
 
 @pytest.fixture
@@ -148,6 +144,7 @@ def test_a_refinement_that_is_abandoned_leaves_the_coarse_fix(ground, make, fram
     [
         (Reason.LATE, None, True),
         (Reason.AMBIGUOUS, 1.0, True),  # a finer peak at the same place does not contradict
+        (Reason.AMBIGUOUS, 8.0, False),  # a rival is farther off than 6 m
         (Reason.AMBIGUOUS, 60.0, False),
         (Reason.LOW_SCORE, None, False),
     ],
@@ -158,7 +155,7 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
     coarse = make("ncc")._method._by_coarse_peak
 
-    def refused(self, query, **_):
+    def refused(self, query, level, **_):
         fix = coarse(query)
         candidates = () if off_m is None else (replace(fix, east_m=fix.east_m + off_m),)
         return replace(query.refuse(reason, "of the finer peak", "ncc"), candidates=candidates)
@@ -166,9 +163,52 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
     monkeypatch.setattr(Ncc, "correlate", refused)
     result = make("ncc").locate(frame, prior, HURRY)
     assert isinstance(result, Fix) == is_fixed
-    if is_fixed:  # refinement did not confirm the tilt
+    if is_fixed:  # refinement did not confirm the tilt, and a refused peak makes nothing more certain
+        assert result.confidence == (0.99 if off_m else pytest.approx(1.0, abs=1e-3))
         assert result.sigma_m > 1.5 * coarse(make("ncc")._query(frame, prior, Deadline(HURRY))).sigma_m
     assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
+
+
+@pytest.mark.parametrize("finer", [(), (1,), (1, 0)])
+def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
+    make, frame, prior, monkeypatch, finer
+):
+    """And no level is correlated twice."""
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    monkeypatch.setattr(Refinement, "refine", lambda _self, fix: fix)
+    correlated, find = [], Ncc.find
+
+    def noted(self, query, *, coarser=0, **options):
+        correlated.append(coarser)
+        return find(self, query, coarser=coarser, **options)
+
+    monkeypatch.setattr(Ncc, "find", noted)
+    matcher = make("ncc")
+    affordable = {2: 0, **dict.fromkeys(finer, 0)}
+    monkeypatch.setattr(
+        Scheduler,
+        "first_affordable",
+        lambda _self, _step, works: next((w for w in works if w in affordable), None),
+    )
+    fix = matcher.locate(frame, prior, HURRY)
+    assert correlated == [2, *finer[-1:]]
+    assert (fix.relative_sigma_m > 3.5) == (fix.stage == "coarse")
+
+
+def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, make, frame, prior, monkeypatch):
+    """What comes before it may have taken longer than thought."""
+    matcher = make("ncc")
+    by_coarse_peak = Ncc._by_coarse_peak
+
+    def slow(self, query):
+        found = by_coarse_peak(self, query)
+        matcher._costs.per_unit = {"refinement": 1e9, "ncc": 1e9}
+        return found
+
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", slow)
+    fix = matcher.locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert fix.stage == "coarse"
 
 
 def test_a_refinement_at_once_that_was_too_dear_once_is_tried_again(site, camera, frame, prior):
@@ -190,7 +230,7 @@ def test_beside_a_fix_a_step_leaves_room_for_a_preemption(ground, make, frame, p
     matcher._costs.preemption_ms = HURRY.total_ms
     fix = matcher.locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
-    assert (fix.method, fix.stage) == ("ncc", "refined")
+    assert (fix.method, fix.stage) == ("ncc", "coarse")
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])

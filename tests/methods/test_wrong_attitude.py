@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from engine import Fix, OrthoMap, SceneMatcher
+from engine.methods.refinement import Refinement
+from engine.methods.scheduler import OutOfTime
 
 NADIR = np.array([310.0, 305.0])
 TRUE = {"roll_deg": 4.0, "pitch_deg": -3.0, "heading_deg": 20.0}
@@ -43,3 +45,21 @@ def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, meth
     assert fix.attitude is not None
     assert abs(fix.attitude.roll_deg - TRUE["roll_deg"]) < 0.5
     assert abs(fix.attitude.pitch_deg - TRUE["pitch_deg"]) < 0.5
+
+
+@pytest.mark.parametrize("knows_better", [True, False, None])
+def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, camera, monkeypatch, knows_better):
+    """And stands where the doubt leads nowhere, or there is no time for it (None)."""
+
+    def through_all(self, fix):
+        if not self.knows_tilt and knows_better is None:
+            raise OutOfTime
+        better = replace(fix, stage="refined", score=0.9)
+        hardly = replace(fix, stage="refined", score=0.3)
+        return hardly if self.knows_tilt else better if knows_better else None
+
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    monkeypatch.setattr(Refinement, "_through_all", through_all)
+    frame = ground.frame(camera, NADIR, 150.0, **TRUE)
+    fix = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
+    assert (fix.stage, fix.score) == ("refined", 0.9 if knows_better else 0.3)
