@@ -175,10 +175,23 @@ def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
     return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
 
 
+def offset_between_m(first: Fix, second: Fix) -> Array:
+    """How far one fix lies from another.
+
+    Args:
+        first: The fix at which the offset ends.
+        second: The fix at which it begins.
+
+    Returns:
+        (2,) metres east and north from the second fix to the first.
+    """
+    return np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+
+
 def agree_in_place(first: Fix, second: Fix) -> bool:
     """Whether two fixes by one map are of one place (:func:`are_consistent`); the map's error is that of both."""
-    apart_m = np.array([first.east_m - second.east_m, first.north_m - second.north_m])
-    return are_consistent(apart_m, first.relative_covariance_m2 + second.relative_covariance_m2)
+    covariance_m2 = first.relative_covariance_m2 + second.relative_covariance_m2
+    return are_consistent(offset_between_m(first, second), covariance_m2)
 
 
 def agree_in_height(first: Fix, second: Fix) -> bool:

@@ -121,7 +121,8 @@ def fly(flight: Path, port: int, firmware: str, seconds: float | None = None) ->
     agenda.every(2 * MS, pilot.poll, clock())
     agenda.every(round(_REPORT_S * S), lambda: print(summary(errors), flush=True), clock() + round(_REPORT_S * S))
     try:
-        agenda.run(begin_ns + round(min(duration_s + _LAST_ANSWER_S, seconds or math.inf) * S))
+        end_s = duration_s + _LAST_ANSWER_S
+        agenda.run(begin_ns + round((end_s if seconds is None else min(end_s, seconds)) * S))
     finally:
         pilot.close()
     return {"fixes": len(errors), "median_m": float(np.median(errors)) if errors else None}

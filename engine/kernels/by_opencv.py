@@ -136,7 +136,8 @@ def correlate(
     def prepared(index: int) -> _Block:
         y, x = index // nx * (rows - h + 1), index % nx * (columns - w + 1)
         part = slice(y, min(y + rows - h + 1, height)), slice(x, min(x + columns - w + 1, width))
-        return _block(window[y : y + rows, x : x + columns], mean, size, inverse_norms[part], part)
+        spectrum = _window_spectrum(window[y : y + rows, x : x + columns], mean, size, inverse_norms[part])
+        return _Block(spectrum, *part)
 
     blocks = in_parallel(prepared, range(ny * nx))
 
@@ -178,8 +179,7 @@ def _finish_pair(
     mean, energy = moments
     size = packed.shape[:2]
     if _is_weak(energy, largest):
-        whole = slice(0, out.shape[0]), slice(0, out.shape[1])
-        spectrum = _block(window, mean, size, inverse_norms, whole).spectrum
+        spectrum = _window_spectrum(window, mean, size, inverse_norms)
         _write_scores(out, spectrum, _spectrum(model, size, spectrum.dtype), inverse_norms)
         return
     products = _scratch("products", size)
@@ -209,16 +209,16 @@ def fast_side(n: int) -> int:
     return step * fast_length(-(-n // step))
 
 
-def _block(
-    window: FloatImage, mean: float, size: tuple[int, int], inverse_norms: FloatImage, part: tuple[slice, slice]
-) -> _Block:
-    """The transform of part of a window."""
+def _window_spectrum(
+    window: FloatImage, mean: float, size: tuple[int, int], inverse_norms: FloatImage
+) -> NDArray[np.floating]:
+    """The transform of a window less a mean, in float64 where some patch is too weak for float32."""
     values: NDArray[np.floating] = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
     if _is_weak(energy, float(inverse_norms.max())):
         values = values.astype(np.float64)
     transform(values, 0, window.shape[0])
-    return _Block(values, *part)
+    return values
 
 
 def _spectrum(model: FloatImage, size: tuple[int, int], kind: np.dtype[np.floating]) -> NDArray[np.floating]:

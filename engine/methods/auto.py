@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.acceptance import agree_in_height, agree_in_place
+from engine.acceptance import agree_in_height, agree_in_place, offset_between_m
 from engine.device import Device
 from engine.methods.explanation import Explanation
 from engine.methods.method import Method
@@ -82,14 +82,14 @@ class Auto(Method):
             return replace(first if second.reason is Reason.LATE else second, candidates=both)
         if isinstance(second, NoFix):
             return refined
-        apart_m = _apart_m(first, second)
+        offset_m = offset_between_m(first, second)
         if not agree_in_place(first, second):
-            if float(np.hypot(*apart_m)) < self.ncc.options.rule.exclusion_m:
-                return _vaguer(second, apart_m)
-            detail = f"NCC and SIFT are {float(np.hypot(*apart_m)):.1f} m apart"
+            if float(np.hypot(*offset_m)) < self.ncc.options.rule.exclusion_m:
+                return _vaguer(second, offset_m)
+            detail = f"NCC and SIFT are {float(np.hypot(*offset_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
         if not agree_in_height(first, second):
-            return _vaguer(second, apart_m)
+            return _vaguer(second, offset_m)
         fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
         # Both compare one picture with one map under one prior, so their odds are not multiplied.
         stated = [fix.confidence for fix in fixes if fix.confidence is not None]
@@ -112,21 +112,16 @@ class Auto(Method):
         return self.ncc.explain(query, window)
 
 
-def _apart_m(first: Fix, second: Fix) -> NDArray[np.float64]:
-    """(2,) from the second fix to the first."""
-    return np.array([first.east_m - second.east_m, first.north_m - second.north_m])
-
-
 def _agree(first: Fix, second: Fix) -> bool:
     return agree_in_place(first, second) and agree_in_height(first, second)
 
 
-def _vaguer(second: Fix, apart_m: NDArray[np.float64]) -> Fix:
+def _vaguer(second: Fix, offset_m: NDArray[np.float64]) -> Fix:
     """The fix of SIFT where NCC found the same place, but not as nearly as both state.
 
     No other place lies so near. Telemetry in error moves the patch that NCC looks for; the pose rests less on it.
     Which one is off is unknown: the covariance covers both.
     """
     covariance_m2 = second.covariance_m2.copy()
-    covariance_m2[:2, :2] += apart_m[:, None] * apart_m
+    covariance_m2[:2, :2] += offset_m[:, None] * offset_m
     return replace(second, covariance_m2=covariance_m2)

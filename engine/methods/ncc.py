@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from engine.acceptance import agree_in_place, judge_peak, judge_second_look
+from engine.acceptance import agree_in_place, judge_peak, judge_second_look, offset_between_m
 from engine.device import Device
 from engine.geo import wrap_heading_deg
 from engine.indexes.prepared import PreparedMap
@@ -97,7 +97,6 @@ class Ncc(Method):
         if coarse is None:
             return self.correlate(query, try_turns=try_turns)
         scheduler, work_px, is_refuted = query.scheduler, float(query.gray.size), False
-        step, works = self._step(query)
         is_certain = (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
         try:
             with scheduler.with_fix():
@@ -107,6 +106,7 @@ class Ncc(Method):
                     if refined is not None:
                         return refined
                     coarse, is_refuted = with_unconfirmed_tilt(query, coarse), True
+                step, works = self._step(query)
                 finer = {level: work for level, work in works.items() if level < max(works)}
                 level = scheduler.first_affordable(step, finer)
                 if level is None:
@@ -141,8 +141,8 @@ class Ncc(Method):
 
     def _is_same(self, coarse: Fix, fine: Fix) -> bool:
         """Whether two peaks are of one place: where one would not be the other's rival."""
-        apart_m = np.hypot(coarse.east_m - fine.east_m, coarse.north_m - fine.north_m)
-        return bool(apart_m < self.options.rule.exclusion_m) and agree_in_place(coarse, fine)
+        distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
+        return distance_m < self.options.rule.exclusion_m and agree_in_place(coarse, fine)
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
