@@ -213,7 +213,7 @@ def surfaces_over_nodata(
     """
     assert search.counts is not None
     model = (templates.shape[1], templates.shape[2])
-    inverse_norms = kernels.inverse_norm(search.sums, *model)
+    inverse_norms = kernels.inverse_norm(search.image, search.sums, *model)
     share = _share_on_map(search.counts, model, 1, inverse_norms.shape)
     for first in range(0, len(templates), group):
         part = templates[first : first + group]
@@ -224,7 +224,7 @@ def surfaces_over_nodata(
 def _coarse_scores(levels: _Levels) -> FloatImage:
     """Scores on the coarsest level, of what lies partly on nodata about as at full resolution."""
     coarse, model = levels.parts[-1], levels.models[-1]
-    inverse_norms = kernels.inverse_norm(coarse.sums, *model.shape)
+    inverse_norms = kernels.inverse_norm(coarse.image, coarse.sums, *model.shape)
     counts, (h, w), step = levels.parts[0].counts, levels.models[0].shape, levels.scale
     if counts is None:
         return np.asarray(kernels.prepared_surface(coarse.image, inverse_norms, model[None])[0])
@@ -321,7 +321,7 @@ def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak 
     part, model, scale = levels.parts[0], levels.models[0], levels.scale
     dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
     y, x = round(scale * (y + dy)), round(scale * (x + dx))
-    scorer = kernels.LocalScores(part.image, part.sums, model, (y, x), part.counts, levels.min_overlap)
+    scorer = kernels.LocalScores(part.image, model, (y, x), part.counts, levels.min_overlap)
     for uphill in range(_UPHILL_STEPS + 1):
         if not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
             return None, False

@@ -165,7 +165,7 @@ def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]
     Returns:
         Yields (group, H-h+1, W-w+1) float32, the last one with the remainder of T.
     """
-    inverse_norms = kernels.inverse_norm(search.sums, *templates.shape[-2:])
+    inverse_norms = kernels.inverse_norm(search.image, search.sums, *templates.shape[-2:])
     for first in range(0, len(templates), group):
         part = _of_kind(search, templates[first : first + group])
         found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))

@@ -1,4 +1,4 @@
-"""Part of a map prepared for matching: with running sums, half-resolution levels, and its nodata counted."""
+"""Part of a map prepared for matching: with half-resolution levels, and its nodata counted."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ class Search:
 
     Attributes:
         image: (H, W) float32, its mean small against its standard deviation.
-        sums: (2, H+1, W+1) float64 running sums of the picture and of its square.
         half: the same part at half resolution, whose pixel (x, y) is the mean of 2 x 2 pixels from (2x, 2y);
             None on the coarsest level.
+        sums: (2, H+1, W+1) float64 running sums of the picture and of its square on a GPU; None on the CPU, where
+            the sums of a window take one pass.
         counts: (H+1, W+1) int32 running sums of its valid pixels, of which the others are 0 in the picture; None
             where all are valid, on a GPU, and at half resolution.
     """
 
     image: Picture
-    sums: Picture
     half: Search | None = None
+    sums: Picture = None
     counts: NDArray[np.int32] | None = None
 
     def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
@@ -44,12 +45,13 @@ class Search:
         if self.half is not None and not (x0 & 1 or y0 & 1):
             half = self.half.crop(x0 >> 1, y0 >> 1, width >> 1, height >> 1)
         inner = np.s_[..., y0 : y0 + height + 1, x0 : x0 + width + 1]
+        sums = None if self.sums is None else self.sums[inner]
         counts = None if self.counts is None else self.counts[inner]
-        return Search(self.image[rows, columns], self.sums[inner], half, counts)
+        return Search(self.image[rows, columns], half, sums, counts)
 
 
 def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.bool_] | None = None) -> Search:
-    """Compute running sums and half-resolution levels.
+    """Compute half-resolution levels, and on a GPU running sums.
 
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
@@ -57,7 +59,7 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
         valid: (H, W); None where all pixels are. The picture is 0 where they are not.
 
     Returns:
-        Search: with integral images (2, H+1, W+1) float64, and levels down to 48 x 48 pixels.
+        Search: with levels down to 48 x 48 pixels.
 
     Raises:
         ShapeError: the picture is not (H, W), or is empty.
@@ -72,5 +74,6 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
     half = None
     if halvings > 0 and min(image.shape) >= 2 * COARSE_TEMPLATE_PX:
         half = prepare(kernels.halved(image), halvings=halvings - 1)
-    counts = None if valid is None or not isinstance(image, np.ndarray) else kernels.counts(valid)
-    return Search(image, kernels.integrals(image), half, counts)
+    if not isinstance(image, np.ndarray):
+        return Search(image, half, sums=kernels.integrals(image))
+    return Search(image, half, counts=None if valid is None else kernels.counts(valid))

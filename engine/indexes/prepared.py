@@ -1,4 +1,4 @@
-"""The map as the NCC method searches it, prepared once: enhanced, with running sums and half-resolution levels.
+"""The map as the NCC method searches it, prepared once: enhanced, with half-resolution levels.
 
 A small level of the map is prepared as a whole; of a large one, regions on a fixed grid as the flight reaches
 them, of which the least recently used are evicted.
@@ -27,8 +27,8 @@ next windows of a flight fall in the same region."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
 MAX_REGION_PX = 6 << 20
-"""Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 27 bytes, 31 with
-nodata."""
+"""Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 6 bytes, 11 with nodata,
+and on a GPU 27."""
 _HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
 
 

@@ -21,7 +21,6 @@ from engine.kernels.transform_sizes import FLOAT32_NORM_RATIO, fast_length
 from engine.threads import in_parallel
 
 FloatImage = NDArray[np.float32]
-Sums = NDArray[np.float64]
 
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
@@ -69,18 +68,20 @@ def _check_finite(name: str, energy: float) -> None:
         raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 
 
-def inverse_norm(sums: Sums, h: int, w: int) -> FloatImage:
+def inverse_norm(image: FloatImage, h: int, w: int) -> FloatImage:
     """Reciprocal norm about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) float64 integrals.
+        image: (H, W) float32, its mean small against its standard deviation.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
         (H-h+1, W-w+1) float32, 0 where a patch is flat.
     """
-    return np.asarray(surface_loops.inverse_norms_of(sums, h, w))
+    image = np.ascontiguousarray(image)  # loops over a crop of a larger picture would not be vectorised
+    mean, energy = surface_loops.moments(image, False)
+    return np.asarray(surface_loops.inverse_norms(image, mean, energy, h, w, True))
 
 
 def prepared_surface(image: FloatImage, inverse_norms: FloatImage, templates: FloatImage) -> FloatImage:
@@ -94,6 +95,7 @@ def prepared_surface(image: FloatImage, inverse_norms: FloatImage, templates: Fl
     Returns:
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
+    image = np.ascontiguousarray(image)  # loops over a crop of a larger picture would not be vectorised
     out = np.empty((len(templates), *inverse_norms.shape), np.float32)
     models = [surface_loops.unit(picture, False)[0] for picture in np.ascontiguousarray(templates)]
     correlate(out, image, surface_loops.moments(image, False), inverse_norms, models)

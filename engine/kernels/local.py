@@ -24,7 +24,6 @@ class LocalScores:
 
     Args:
         image: (H, W) float32, its mean small against its standard deviation; 0 where not valid.
-        sums: (2, H+1, W+1) float64 running sums of it and of its square.
         template: (h, w) float32 of zero mean.
         middle: (y, x); scores can be computed within ``REACH`` of it.
         counts: (H+1, W+1) running sums of the valid pixels, of which alone all sums are; None where all are.
@@ -36,33 +35,35 @@ class LocalScores:
     def __init__(
         self,
         image: FloatImage,
-        sums: Sums,
         template: FloatImage,
         middle: tuple[int, int],
         counts: Counts | None = None,
         min_overlap: float = 0.0,
     ) -> None:
+        from engine.kernels import surface_loops
+
         h, w = template.shape
         self.limits = (image.shape[0] - h, image.shape[1] - w)
         """The last row and column at which the template fits."""
         y0, x0 = self._corner = (max(0, middle[0] - self.REACH), max(0, middle[1] - self.REACH))
         y1, x1 = min(self.limits[0], middle[0] + self.REACH), min(self.limits[1], middle[1] + self.REACH)
         self._row = w + x1 - x0
-        self._patch = np.ascontiguousarray(image[y0 : y1 + h, x0 : x1 + w]).ravel()
+        patch = np.ascontiguousarray(image[y0 : y1 + h, x0 : x1 + w])
+        self._patch = patch.ravel()
         padded = np.zeros((h, self._row), np.float32)
         padded[:, :w] = template
         self._template = padded.ravel()[: (h - 1) * self._row + w]
         # The patches' sums of squares about their means, at every position within reach.
-        inner = np.s_[..., y0 : y1 + h + 1, x0 : x1 + w + 1]
-        self._total, square = _boxes(sums[inner], h, w)
+        self._total, square = surface_loops.box_sums(patch, h, w)
         self._energy = float(np.dot(self._template, self._template))
         energy = np.maximum(square - self._total * self._total / (h * w), 0.0) * self._energy
         self._inverse_norm = np.divide(1.0, np.sqrt(energy), out=np.zeros_like(energy), where=energy > 0)
         self._count: NDArray[np.float64] | None = None
         if counts is not None:
-            count = _boxes(counts[inner], h, w)
+            counts = counts[y0 : y1 + h + 1, x0 : x1 + w + 1]
+            count = _boxes(counts, h, w)
             if (count < h * w).any():
-                self._mask(counts[inner], count.astype(np.float64), square, max(min_overlap * (h * w), 1.0))
+                self._mask(counts, count.astype(np.float64), square, max(min_overlap * (h * w), 1.0))
 
     def _mask(self, counts: Counts, count: Sums, square: Sums, least: float) -> None:
         """Prepare the sums of positions that reach over the mask's edge."""

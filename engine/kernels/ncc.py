@@ -111,30 +111,36 @@ def prepared_surface(image: Picture, inverse_norms: Picture, templates: Picture)
     return eager.prepared_surface(image, inverse_norms, templates)
 
 
-def inverse_norm(running: Picture, h: int, w: int) -> Picture:
+def inverse_norm(image: Picture, sums: Picture, h: int, w: int) -> Picture:
     """Reciprocal norm about the mean of every patch.
 
     Args:
-        running: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's; tensors also in batches.
+        image: (H, W) float32, its mean small against its standard deviation.
+        sums: of a tensor its :func:`integrals` (2, H+1, W+1), or a crop of a larger picture's; of an array None.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
         (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    if isinstance(running, np.ndarray):
+    if isinstance(image, np.ndarray):
         from engine.kernels import by_opencv
 
-        return by_opencv.inverse_norm(running, h, w)
+        return by_opencv.inverse_norm(image, h, w)
     from engine.kernels import eager
 
-    return eager.inverse_norm(running, h, w)
+    return eager.inverse_norm(sums, h, w)
 
 
-def integrals(image: Picture) -> Picture:
-    """Integral images of a picture (H, W) and of its square: (2, H+1, W+1) float64 running sums, from 0."""
-    if isinstance(image, np.ndarray):
-        return sums.integrals(image)
+def integrals(image: Tensor) -> Tensor:
+    """Integral images of a picture and of its square.
+
+    Args:
+        image: (H, W) floating point.
+
+    Returns:
+        (2, H+1, W+1) float64 running sums; the first row and column are 0.
+    """
     from engine.kernels import eager
 
     return eager.integrals(image)

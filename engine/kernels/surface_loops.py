@@ -72,19 +72,12 @@ def inverse_norms(window, mean, energy, h, w, zero_mean):
     columns, height, width = window.shape[1], window.shape[0] - h + 1, window.shape[1] - w + 1
     out = np.empty((height, width), np.float32)
     floor, share = _FLAT_SHARE * energy, 1.0 / (1.0 * h * w) if zero_mean else 0.0
-    down, down_squares = np.zeros(columns), np.zeros(columns)  # sums over h rows
-    along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)  # running sums of these
+    down, down_squares = np.zeros(columns), np.zeros(columns)
+    along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)
     spreads, (unit_energy, unit_norm) = np.empty(width, np.float32), _units(energy)
-    for y in range(h):
-        _add(down, down_squares, window[y], mean)
     for y in range(height):
-        if y > 0:
-            _slide(down, down_squares, window[y + h - 1], window[y - 1], mean)
-        total, square = 0.0, 0.0
-        for x in range(columns):
-            total += down[x]
-            square += down_squares[x]
-            along[x + 1], along_squares[x + 1] = total, square
+        _sum_rows(down, down_squares, window, y, h, mean)
+        _sum_along(along, along_squares, down, down_squares)
         row, ahead, ahead_squares = out[y], along[w:], along_squares[w:]  # an index x + w would not be vectorised
         for x in range(width):
             total = ahead[x] - along[x]
@@ -93,6 +86,51 @@ def inverse_norms(window, mean, energy, h, w, zero_mean):
         for x in range(width):
             row[x] = unit_norm / np.sqrt(spreads[x]) if spreads[x] > 0.0 else 0.0
     return out
+
+
+@compiled
+def box_sums(picture, h, w):
+    """Sums of the pixels of every patch, and of their squares.
+
+    Args:
+        picture: (H, W) float32.
+        h: rows of a patch.
+        w: columns of a patch.
+
+    Returns:
+        (2, H-h+1, W-w+1) float64.
+    """
+    columns, height, width = picture.shape[1], picture.shape[0] - h + 1, picture.shape[1] - w + 1
+    out = np.empty((2, height, width))
+    down, down_squares = np.zeros(columns), np.zeros(columns)
+    along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)
+    for y in range(height):
+        _sum_rows(down, down_squares, picture, y, h, 0.0)
+        _sum_along(along, along_squares, down, down_squares)
+        for x in range(width):
+            out[0, y, x] = along[x + w] - along[x]
+            out[1, y, x] = along_squares[x + w] - along_squares[x]
+    return out
+
+
+@compiled
+def _sum_rows(down, down_squares, picture, y, h, mean):
+    """Sums over rows y to y + h of every column, from those at y - 1, 0 before the first."""
+    if y > 0:
+        _slide(down, down_squares, picture[y + h - 1], picture[y - 1], mean)
+        return
+    for first in range(h):
+        _add(down, down_squares, picture[first], mean)
+
+
+@compiled
+def _sum_along(along, along_squares, down, down_squares):
+    """Running sums along a row, from 0."""
+    total, square = 0.0, 0.0
+    for x in range(len(down)):
+        total += down[x]
+        square += down_squares[x]
+        along[x + 1], along_squares[x + 1] = total, square
 
 
 @compiled
@@ -118,34 +156,6 @@ def _slide(down, down_squares, after, before, mean):
         new, old = after[x] - mean, before[x] - mean
         down[x] += new - old
         down_squares[x] += (new - old) * (new + old)
-
-
-@compiled
-def inverse_norms_of(sums, h, w):
-    """The same from integral images (2, H+1, W+1) float64, or a crop of a larger picture's."""
-    columns, height, width = sums.shape[2], sums.shape[1] - h, sums.shape[2] - w
-    down, down_squares = np.empty(columns), np.empty(columns)
-    ahead, ahead_squares = down[w:], down_squares[w:]  # an index x + w would not be vectorised
-    energy = sums[1, -1, -1] - sums[1, 0, 0]  # no less than the window's own
-    share, floor, (unit_energy, unit_norm) = 1.0 / (1.0 * h * w), _FLAT_SHARE * energy, _units(energy)
-    out, spreads = np.empty((height, width), np.float32), np.empty(width, np.float32)
-    for y in range(height):
-        row, above, below, above_squares, below_squares = (
-            out[y],
-            sums[0, y],
-            sums[0, y + h],
-            sums[1, y],
-            sums[1, y + h],
-        )
-        for x in range(columns):
-            down[x], down_squares[x] = below[x] - above[x], below_squares[x] - above_squares[x]
-        for x in range(width):
-            total = ahead[x] - down[x]
-            spread = ahead_squares[x] - down_squares[x] - total * total * share
-            spreads[x] = spread * unit_energy if spread > floor else 0.0
-        for x in range(width):
-            row[x] = unit_norm / np.sqrt(spreads[x]) if spreads[x] > 0.0 else 0.0
-    return out
 
 
 @compiled

@@ -69,9 +69,6 @@ def test_cells_join_without_a_seam(gray, holes, window, masked, monkeypatch, by_
     np.testing.assert_allclose(pieces.search.image, whole.search.image, rtol=0, atol=tolerance)
     for part, full in zip(levels_of(pieces.search), levels_of(whole.search), strict=False):
         np.testing.assert_allclose(part.image, full.image, rtol=0, atol=tolerance)
-        # Running sums begin elsewhere; what a box adds up to does not.
-        boxes = [s[:, -1, -1] - s[:, 0, -1] - s[:, -1, 0] + s[:, 0, 0] for s in (part.sums, full.sums)]
-        np.testing.assert_allclose(boxes[0], boxes[1], rtol=5e-3, atol=1.0)
     assert (pieces.valid is None) == (whole.valid is None)
     if whole.valid is not None:
         assert np.array_equal(pieces.valid, whole.valid)
@@ -98,7 +95,6 @@ def test_a_cut_is_the_enhanced_level_from_the_multiple_of_eight_before_it(gray, 
         assert y0 + cut.window.height_px == window.y0 + window.height_px
         expected = picture[y0 : y0 + cut.window.height_px, x0 : x0 + cut.window.width_px]
         np.testing.assert_array_equal(cut.search.image, expected)
-        assert cut.search.sums.shape == (2, expected.shape[0] + 1, expected.shape[1] + 1)
         assert cut.valid is None
 
 

@@ -114,7 +114,7 @@ def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
     part = prepare(torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))).crop(7, 3, 41, 37)
     templates = torch.from_numpy(rng.normal(0.0, 1.0, (2, *model)).astype(np.float32))
     centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    norms = eager.inverse_norm(torch.from_numpy(part.sums), *model)
+    norms = eager.inverse_norm(eager.integrals(torch.from_numpy(part.image)), *model)
     for count in (1, 2):
         expected = eager.prepared_surface(torch.from_numpy(part.image), norms, centred[:count])
         torch.testing.assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)

@@ -69,7 +69,8 @@ def whole_surface(search, template):
 
 def of_tensors(search):
     """A map that is prepared as arrays, as the tensors that a device has."""
-    return Search(torch.as_tensor(search.image), torch.as_tensor(search.sums))
+    image = torch.as_tensor(search.image)
+    return Search(image, sums=eager.integrals(image))
 
 
 def on_device(search, template, exclusion_px):

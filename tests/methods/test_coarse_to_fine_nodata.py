@@ -66,7 +66,7 @@ def test_scores_at_a_few_places_are_those_of_the_masked_surface(share):
     surface = every_place(image, valid, template)
     model = template - template.mean()
     for j, i in ((y, x), (6, 6), (100, 105), (surface.shape[0] - 7, 40)):
-        scorer = kernels.LocalScores(search.image, search.sums, model, (j, i), search.counts, MIN_OVERLAP)
+        scorer = kernels.LocalScores(search.image, model, (j, i), search.counts, MIN_OVERLAP)
         around = np.mgrid[j - 5 : j + 6, i - 5 : i + 6].reshape(2, -1)
         rows, columns = around[:, (around[0] < surface.shape[0]) & (around[1] < surface.shape[1])]
         np.testing.assert_allclose(scorer.at(rows, columns), surface[rows, columns], rtol=0, atol=2e-6)
