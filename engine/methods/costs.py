@@ -18,6 +18,7 @@ _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for
 _COST_DECAY = 0.99  # of the cost itself, until the step is tried
 # The same beside a fix, which a try that comes too late may lose: of a step a third too dear one frame in 400.
 _DEVIATION_DECAY_BESIDE_FIX, _COST_DECAY_BESIDE_FIX = 0.995, 0.999
+_MOST_WAITING = 10.0  # of a step, in what the steps of late waited together: of tiny ones the share says little
 _IDLE_DECAY = 0.8  # of the waiting, from frame to frame in which no step runs
 _PREEMPTION_DECAY = 0.9  # of the longest preemption, from frame to frame
 _ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
@@ -49,6 +50,9 @@ class _CostModel:
 
     def learn(self, work: float, ms: float) -> float:
         """Note a run, and return the milliseconds that count of it."""
+        # Much dearer than the second in proportion to its work, the first run compiled and planned besides.
+        if self.weight == 1.0 and _MAX_SURPRISE * ms * max(self.work, work) < self.ms * work:
+            self.weight = self.work = self.ms = self.work_work = self.work_ms = 0.0
         if self.weight > 0.0:
             if ms <= self.trust * self.expected_ms(work):  # it has become cheaper, as was tried
                 self.ms *= self.trust
@@ -126,7 +130,8 @@ class Costs:
             if model is None:
                 return 0.0
             ran_ms = model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
-            return ran_ms * (1.0 + self._waited_ms / self._ran_ms) if self._ran_ms > 0.0 else ran_ms
+            share = self._waited_ms / self._ran_ms if self._ran_ms > 0.0 else 0.0
+            return ran_ms + min(ran_ms * share, _MOST_WAITING * self._waited_ms)
 
     @property
     def preemption_ms(self) -> float:

@@ -136,6 +136,22 @@ def test_the_share_of_waiting_is_common_to_all_steps():
     assert costs.upper_bound_ms("long", 1.0) == pytest.approx(alone, rel=0.05)  # the other process has ended
 
 
+def test_a_first_run_that_compiled_is_forgotten_by_the_second():
+    costs = Costs()
+    costs.learn("step", 1.0, 20_000.0)
+    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(20_000.0)
+    costs.learn("step", 1.0, 50.0)
+    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(50.0)
+
+
+def test_one_preemption_among_tiny_steps_makes_a_long_one_little_dearer():
+    """A few microseconds of work say little of the share of waiting."""
+    costs = learned([1.0] * 50, lambda work: 1000.0, "long")
+    for n in range(200):
+        costs.learn("tiny", 1.0, *((30.0, 30.0) if n == 199 else (0.05, 0.0)))
+    assert costs.upper_bound_ms("long", 1.0) < 1500.0
+
+
 def test_a_long_step_beside_another_process_takes_what_it_took():
     costs = Costs()
     for _ in range(80):
