@@ -77,6 +77,21 @@ def test_an_optical_centre_that_is_off_is_named_with_its_pixels(forward_m, right
     assert row == pytest.approx(forward_m * 260.0 / 120.0, abs=4.0)
 
 
+def test_an_optical_centre_that_is_far_off_is_named_by_the_few_turns_of_straight_lines():
+    """At each turn places move by many sigmas, which alone would be an outlier."""
+    angles = np.zeros((N, 3))
+    angles[:, 2] = np.where(np.arange(N) // 30 % 2, 160.0, 20.0)
+    lines = []
+    for one in seen(outliers=0):
+        heading = np.radians(angles[one.index, 2])
+        aside_m = 25.0 * np.array([np.sin(heading), np.cos(heading)])
+        attitude = Attitude(0.0, 0.0, float(angles[one.index, 2]))
+        lines.append(replace(one, attitude=attitude, en_m=one.en_m + aside_m))
+    (found,) = findings(series(angles_deg=angles), lines, 1.0)
+    assert found.cause == "mount"
+    assert "+25" in found.text or "+24" in found.text
+
+
 @pytest.mark.parametrize(
     ("angles", "cause"),
     [

@@ -96,18 +96,12 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     if legs is None:
         return None
     moved, reckoned, sigma, turned = legs
-    rows = (turned / sigma[:, None, None]).reshape(-1, 2)
-    off = ((moved - reckoned) / sigma[:, None]).ravel()
-    near = np.abs(off) < 3.0 * _OUTLIER**0.5
-    information = rows[near].T @ rows[near]
-    if float(np.linalg.eigvalsh(information)[0]) <= 0.0:
+    rows, off = turned / sigma[:, None, None], (moved - reckoned) / sigma[:, None]
+    shared = _common_offset(rows, off)
+    if shared is None:
         return None
-    aside_m = np.linalg.solve(information, rows[near].T @ off[near])
-
-    def cost(left: Array) -> float:
-        return float(np.minimum(left**2, _OUTLIER).mean())
-
-    as_told, best = cost(off), cost(off - rows @ aside_m)
+    aside_m, information = shared
+    as_told, best = _limited(off), _limited(off - rows @ aside_m)
     height_m = float(np.median([one.height_agl_m for one in seen]))
     # Legs are mostly better known than is assumed of them.
     sigma_m = math.sqrt(max(best, _LEAST_COST) * float(np.trace(np.linalg.inv(information))))
@@ -118,6 +112,28 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
         return None
     return _named(aside_m, sigma_m, height_m, series)
+
+
+def _limited(left: Array) -> float:
+    """Mean chi-square of what is left, each limited."""
+    return float(np.minimum(left**2, _OUTLIER).mean())
+
+
+def _common_offset(rows: Array, off: Array) -> tuple[Array, Array] | None:
+    """The offset that most legs share, and its information (2, 2); None where no leg turns enough to show one.
+
+    One leg that turns shows it, and the best of these is averaged with all legs that agree: an offset of many
+    sigmas is an outlier of each leg before it is known.
+    """
+    turning = np.abs(np.linalg.det(rows)) > 1e-6
+    if not turning.any():
+        return None
+    shown = np.linalg.solve(rows[turning], off[turning][..., None])[..., 0]
+    offset_m = min(shown, key=lambda one: _limited(off - rows @ one))
+    agreeing = (np.abs(off - rows @ offset_m) < _OUTLIER**0.5).all(axis=1)
+    design = rows[agreeing].reshape(-1, 2)
+    information = design.T @ design
+    return np.linalg.solve(information, design.T @ off[agreeing].ravel()), information
 
 
 def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySeries) -> Finding:
