@@ -59,11 +59,14 @@ class Recorded:
     ground: Ground
 
 
-def recorded(name: str, step: int, **accuracy: float | None) -> Recorded:
+def recorded(
+    name: str, step: int, *, map_name: str = "map.tif", with_surface: bool = True, **accuracy: float | None
+) -> Recorded:
     """Every ``step``-th frame of a shared flight; the accuracy of its map as :meth:`OrthoMap.open` takes it."""
     folder = SHARED / name
     camera, surface = Camera.load(folder / "camera.yaml"), folder / "dsm.tif"
-    site = OrthoMap.open(folder / "map.tif", surface=surface if surface.exists() else None, **accuracy)
+    has_surface = with_surface and surface.exists()
+    site = OrthoMap.open(folder / map_name, surface=surface if has_surface else None, **accuracy)
     flown = open_flight(folder / FRAMES.get(name, "frames"), folder / "telemetry.csv", camera)
     frames = [(item.frame, item.prior) for index, item in enumerate(flown) if index % step == 0]
     ground = Ground(site.ground_m, ground_amsl_m(flown.rows))
