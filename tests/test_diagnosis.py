@@ -77,19 +77,34 @@ def test_an_optical_centre_that_is_off_is_named_with_its_pixels(forward_m, right
     assert row == pytest.approx(forward_m * 260.0 / 120.0, abs=4.0)
 
 
-def test_an_optical_centre_that_is_far_off_is_named_by_the_few_turns_of_straight_lines():
+def on_lines(headings_deg, outliers):
+    """Telemetry and sightings of a level flight with these headings; false sightings are turned and elsewhere."""
+    shown = [replace(one, attitude=Attitude(0.0, 0.0, float(headings_deg[one.index]))) for one in seen(outliers=0)]
+    for number in range(3, 3 + outliers):
+        turned = Attitude(0.0, 0.0, shown[number].attitude.heading_deg + 100.0)
+        shown[number] = replace(shown[number], attitude=turned, en_m=shown[number].en_m + 90.0)
+    return series(angles_deg=np.column_stack([np.zeros((N, 2)), headings_deg])), shown
+
+
+@pytest.mark.parametrize("outliers", [0, 1])
+def test_an_optical_centre_that_is_far_off_is_named_by_the_few_turns_of_straight_lines(outliers):
     """At each turn places move by many sigmas, which alone would be an outlier."""
-    angles = np.zeros((N, 3))
-    angles[:, 2] = np.where(np.arange(N) // 30 % 2, 160.0, 20.0)
-    lines = []
-    for one in seen(outliers=0):
-        heading = np.radians(angles[one.index, 2])
-        aside_m = 25.0 * np.array([np.sin(heading), np.cos(heading)])
-        attitude = Attitude(0.0, 0.0, float(angles[one.index, 2]))
-        lines.append(replace(one, attitude=attitude, en_m=one.en_m + aside_m))
-    (found,) = findings(series(angles_deg=angles), lines, 1.0)
-    assert found.cause == "mount"
-    assert "+25" in found.text or "+24" in found.text
+    telemetry, shown = on_lines(np.where(np.arange(N) // 30 % 2, 160.0, 20.0), outliers)
+    moved = []
+    for one in shown:
+        heading = np.radians(one.attitude.heading_deg)
+        moved.append(replace(one, en_m=one.en_m + 25.0 * np.array([np.sin(heading), np.cos(heading)])))
+    (found,) = (one for one in findings(telemetry, moved, 1.0) if one.cause == "mount")
+    assert found.value == pytest.approx(np.degrees(np.arctan2(25.0, 120.0)), abs=1.0)
+    column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
+    assert column == pytest.approx(0.0, abs=4.0)
+    assert row == pytest.approx(25.0 * 260.0 / 120.0, abs=4.0)
+
+
+@pytest.mark.parametrize("outliers", [1, 2])
+def test_false_sightings_over_a_straight_line_are_no_optical_centre(outliers):
+    telemetry, shown = on_lines(np.full(N, 20.0), outliers)
+    assert findings(telemetry, shown, 1.0) == []
 
 
 @pytest.mark.parametrize(

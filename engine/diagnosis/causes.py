@@ -46,9 +46,12 @@ def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: flo
     """
     if len(seen) < _LEAST:
         return []
-    turning = optical_centre(series, seen)
+    attitude = _attitude(series, seen)
+    # By a clock that is late places lie off forwards as well.
+    is_late = attitude is not None and attitude.cause == "clock"
+    turning = None if is_late else optical_centre(series, seen)
     tries = (
-        _attitude(series, seen), _height(series, seen), turning or velocity(series, seen),
+        attitude, _height(series, seen), turning or velocity(series, seen),
         _place(series, seen, map_sigma_m),
     )  # fmt: skip
     return [found for found in tries if found is not None]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engine.diagnosis.findings import Array, Finding, TelemetrySeries
 from engine.diagnosis.sightings import Sighting
@@ -19,20 +21,56 @@ _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048
 # Of places that move with the heading: by how much they lessen the cost, to which share, and what is named at all.
 _TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_LEAST_DEG = 0.35, 2.5, 4.0, 1.2
 _LEAST_COST = 0.1
+# Legs that show them: the vehicle turns at all, as the telemetry says, and tilts about as usual at both ends.
+_TURN_DEG, _TURN_OFF_DEG, _TILT_OFF_DEG = 15.0, 10.0, 8.0
 _MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
 _VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Leg:
+    """The way between two sightings.
+
+    Attributes:
+        first: where it begins.
+        last: where it ends.
+        moved_m: (2,) east and north by the sightings.
+        reckoned_m: (2,) the same by the velocity.
+        sigma_m: of their difference, per axis.
+    """
+
+    first: Sighting
+    last: Sighting
+    moved_m: Array
+    reckoned_m: Array
+    sigma_m: float
+
+    @property
+    def off(self) -> Array:
+        """(2,) the difference, in sigmas."""
+        return (self.moved_m - self.reckoned_m) / self.sigma_m
+
+    @property
+    def turn_deg(self) -> float:
+        """Of the heading, by the sightings; from -180 up to 180."""
+        return _wrapped_deg(self.last.attitude.heading_deg - self.first.attitude.heading_deg)
+
+    @property
+    def turned(self) -> Array:
+        """(2, 2) what an offset forward and to the right adds to the difference, in sigmas a metre."""
+        return (_heading_rotation(self.last) - _heading_rotation(self.first)) / self.sigma_m
 
 
 def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     """The unit, the axes and the sign of a velocity that does not fit the ways between sightings."""
     legs = _legs(series, seen)
-    if legs is None:
+    if len(legs) < _LEAST:
         return None
-    moved, reckoned, sigma, _ = legs
-    sigma = sigma[:, None]
+    moved, reckoned = np.array([leg.moved_m for leg in legs]), np.array([leg.reckoned_m for leg in legs])
+    sigma = np.array([[leg.sigma_m] for leg in legs])
 
     def cost(expected: Array) -> float:
-        return float(np.minimum(((moved - expected) / sigma) ** 2, _OUTLIER).mean())
+        return _limited((moved - expected) / sigma)
 
     tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
               "--column east_velocity_mps=north_velocity_mps --column north_velocity_mps=east_velocity_mps"),
@@ -67,20 +105,12 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
 def leg_differences(series: TelemetrySeries, seen: Sequence[Sighting]) -> Array:
     """(N,) by how many standard deviations each way between two pictures differs from that of the velocity."""
     legs = _legs(series, seen)
-    if legs is None:
-        return np.zeros(0)
-    moved, reckoned, sigma, _ = legs
-    return np.asarray(np.abs(moved - reckoned).max(axis=1) / sigma, np.float64)
+    return np.array([np.abs(leg.off).max() for leg in legs] if len(legs) >= _LEAST else [], np.float64)
 
 
-def _legs(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[Array, Array, Array, Array] | None:
-    """The legs between sightings: movements (N, 2), the velocity's, sigmas (N,), and what turned (N, 2, 2)."""
-    known = [(a, b, leg) for a, b in pairwise(seen) if (leg := _leg(series, a, b)) is not None]
-    if len(known) < _LEAST:
-        return None
-    moved, reckoned, sigma = (np.array(column) for column in zip(*(leg for _, _, leg in known), strict=True))
-    turned = np.array([_heading_rotation(b) - _heading_rotation(a) for a, b, _ in known])
-    return moved, reckoned, sigma, turned
+def _legs(series: TelemetrySeries, seen: Sequence[Sighting]) -> list[_Leg]:
+    """The legs between sightings whose velocity is known."""
+    return [leg for first, last in pairwise(seen) if (leg := _leg(series, first, last)) is not None]
 
 
 def _heading_rotation(seen: Sighting) -> Array:
@@ -92,15 +122,15 @@ def _heading_rotation(seen: Sighting) -> Array:
 
 def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     """Places that are off forwards or to the right: at every turn of the vehicle they move."""
-    legs = _legs(series, seen)
-    if legs is None:
+    tilts_deg = np.array([_tilt_deg(one) for one in seen])
+    usual_deg = np.median(tilts_deg, axis=0)
+    level = [one for one in seen if np.abs(_tilt_deg(one) - usual_deg).max() < _TILT_OFF_DEG]
+    legs = [leg for leg in _legs(series, level) if _turns_as_told(series, leg)]
+    turning = np.array([abs(leg.turn_deg) > _TURN_DEG for leg in legs], bool)
+    if len(legs) < _LEAST or not turning.any():
         return None
-    moved, reckoned, sigma, turned = legs
-    rows, off = turned / sigma[:, None, None], (moved - reckoned) / sigma[:, None]
-    shared = _common_offset(rows, off)
-    if shared is None:
-        return None
-    aside_m, information = shared
+    rows, off = np.array([leg.turned for leg in legs]), np.array([leg.off for leg in legs])
+    aside_m, information = _common_offset(rows, off, turning)
     as_told, best = _limited(off), _limited(off - rows @ aside_m)
     height_m = float(np.median([one.height_agl_m for one in seen]))
     # Legs are mostly better known than is assumed of them.
@@ -119,15 +149,26 @@ def _limited(left: Array) -> float:
     return float(np.minimum(left**2, _OUTLIER).mean())
 
 
-def _common_offset(rows: Array, off: Array) -> tuple[Array, Array] | None:
-    """The offset that most legs share, and its information (2, 2); None where no leg turns enough to show one.
+def _tilt_deg(seen: Sighting) -> Array:
+    return np.array([seen.attitude.roll_deg, seen.attitude.pitch_deg])
+
+
+def _wrapped_deg(angle_deg: float) -> float:
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
+    """Whether the telemetry confirms the turn: to a false sighting and back, both legs would show one offset."""
+    first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2]
+    return abs(_wrapped_deg(leg.turn_deg - (last_deg - first_deg))) < _TURN_OFF_DEG  # not where it is unknown
+
+
+def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The offset that most legs share, and its information (2, 2).
 
     One leg that turns shows it, and the best of these is averaged with all legs that agree: an offset of many
     sigmas is an outlier of each leg before it is known.
     """
-    turning = np.abs(np.linalg.det(rows)) > 1e-6
-    if not turning.any():
-        return None
     shown = np.linalg.solve(rows[turning], off[turning][..., None])[..., 0]
     offset_m = min(shown, key=lambda one: _limited(off - rows @ one))
     agreeing = (np.abs(off - rows @ offset_m) < _OUTLIER**0.5).all(axis=1)
@@ -149,8 +190,7 @@ def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySer
     )
 
 
-def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> tuple[Array, Array, float] | None:
-    """The movement between two sightings, the one that the velocity says, and the standard deviation of both."""
+def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> _Leg | None:
     between = slice(a.index, b.index + 1)
     time_s, velocity = series.time_s[between], series.velocity_mps[between]
     seconds = float(time_s[-1] - time_s[0])
@@ -161,4 +201,4 @@ def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> tuple[Array, Arra
     if seconds > _MAX_LEG_S or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
         return None
     coarse_m = _ACCELERATION_MPS2 / 12.0 * float((np.diff(time_s) ** 2).sum())  # of the trapezoids
-    return moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m)
+    return _Leg(a, b, moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m))
