@@ -18,7 +18,9 @@ _DEVIATION_DECAY = 0.9  # of the deviation, each time that a step is refused for
 _COST_DECAY = 0.99  # of the cost itself, until the step is tried
 # The same beside a fix, which a try that comes too late may lose: of a step a third too dear one frame in 400.
 _DEVIATION_DECAY_BESIDE_FIX, _COST_DECAY_BESIDE_FIX = 0.995, 0.999
-_MOST_WAITING = 10.0  # of a step, in what the steps of late waited together: of tiny ones the share says little
+_MOST_WAITING = 10.0  # a step waits at most this many times what all steps of late waited together
+# A first run that took longer, and so many times as long as the second, compiled.
+_LEAST_COMPILED_MS, _COMPILED = 200.0, 10.0
 _IDLE_DECAY = 0.8  # of the waiting, from frame to frame in which no step runs
 _PREEMPTION_DECAY = 0.9  # of the longest preemption, from frame to frame
 _ABANDONED = 1.25  # by what a step is thought to cost more than the time after which it was abandoned
@@ -48,11 +50,13 @@ class _CostModel:
         rate = min(max(rate, 0.0), mean_ms / mean_work if mean_work > 0.0 else math.inf)
         return mean_ms + rate * (work - mean_work)
 
+    def has_compiled(self, work: float, ms: float) -> bool:
+        """Whether the only run so far did far more than this next one, in proportion to its work."""
+        share = min(1.0, work / self.work) if self.work > 0.0 else 1.0
+        return self.weight == 1.0 and self.ms > _LEAST_COMPILED_MS and share * self.ms > _COMPILED * ms
+
     def learn(self, work: float, ms: float) -> float:
         """Note a run, and return the milliseconds that count of it."""
-        # Much dearer than the second in proportion to its work, the first run compiled and planned besides.
-        if self.weight == 1.0 and _MAX_SURPRISE * ms * max(self.work, work) < self.ms * work:
-            self.weight = self.work = self.ms = self.work_work = self.work_ms = 0.0
         if self.weight > 0.0:
             if ms <= self.trust * self.expected_ms(work):  # it has become cheaper, as was tried
                 self.ms *= self.trust
@@ -81,8 +85,11 @@ class Costs:
     def learn(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
         """Note that a step with this much work took so long, ``waited_ms`` of it waiting for a processor."""
         with self._lock:
-            ran_ms = self._models.setdefault(step, _CostModel()).learn(work, max(_MIN_MS, ms - waited_ms))
-            self._note_wait(ran_ms, waited_ms)
+            ran_ms, known = max(_MIN_MS, ms - waited_ms), self._models.setdefault(step, _CostModel())
+            if known.has_compiled(work, ran_ms):
+                known = self._models[step] = _CostModel()
+                self._ran_ms = self._waited_ms = 0.0  # nearly all of that run
+            self._note_wait(known.learn(work, ran_ms), waited_ms)
 
     def note_abandoned(self, step: str, work: float, ms: float, waited_ms: float = 0.0) -> None:
         """Note that a step was abandoned after so many milliseconds: it costs more than these."""
@@ -130,8 +137,7 @@ class Costs:
             if model is None:
                 return 0.0
             ran_ms = model.trust * model.expected_ms(work) + _SIGMAS * math.sqrt(model.square)
-            share = self._waited_ms / self._ran_ms if self._ran_ms > 0.0 else 0.0
-            return ran_ms + min(ran_ms * share, _MOST_WAITING * self._waited_ms)
+            return ran_ms + self._waited_ms * min(ran_ms / self._ran_ms, _MOST_WAITING)
 
     @property
     def preemption_ms(self) -> float:

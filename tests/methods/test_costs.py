@@ -140,8 +140,16 @@ def test_a_first_run_that_compiled_is_forgotten_by_the_second():
     costs = Costs()
     costs.learn("step", 1.0, 20_000.0)
     assert costs.upper_bound_ms("step", 1.0) == pytest.approx(20_000.0)
-    costs.learn("step", 1.0, 50.0)
-    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(50.0)
+    costs.learn("step", 1.0, 80.0, 30.0)
+    assert costs.upper_bound_ms("step", 1.0) == pytest.approx(80.0)  # with the share of waiting
+
+
+@pytest.mark.parametrize(("work", "ms"), [(0.1, 30.0), (1.0, 30.0), (1.0, 150.0)])
+def test_a_first_run_of_more_work_or_little_dearer_still_counts(work, ms):
+    costs = Costs()
+    costs.learn("step", 1.0, 180.0 if ms == 30.0 and work == 1.0 else 280.0)
+    costs.learn("step", work, ms)
+    assert costs.upper_bound_ms("step", 1.0) > 90.0
 
 
 def test_one_preemption_among_tiny_steps_makes_a_long_one_little_dearer():
