@@ -85,11 +85,13 @@ def matched(name: str, flight: Recorded, *, refine: bool) -> Row:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--flights", nargs="*", choices=STEPS, default=[n for n in STEPS if (SHARED / n).is_dir()])
+    parser.add_argument("--flights", nargs="*", choices=STEPS, default=STEPS)
     parser.add_argument("--map", default="map.tif")
     options, rows = parser.parse_args(), []
     set_threads(1)
     for name in options.flights:
+        if not (SHARED / name / options.map).exists():
+            continue
         flight = flown(name, options.map)
         peak, refined = (matched(name, flight, refine=refine) for refine in (False, True))
         both = [f"{old}, **{new}**" for old, new in zip(peak.cells, refined.cells, strict=True)]

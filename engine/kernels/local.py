@@ -6,11 +6,10 @@ of products is one dot product of contiguous memory, and the next position is th
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.kernels.sums import counts_inside
 from engine.kernels.transform_sizes import FLAT_SHARE
 
 FloatImage = NDArray[np.float32]
@@ -61,13 +60,13 @@ class LocalScores:
         self._count: NDArray[np.float64] | None = None
         if counts is not None:
             counts = counts[y0 : y1 + h + 1, x0 : x1 + w + 1]
-            count = _boxes(counts, h, w)
+            count = counts_inside(counts, h, w)
             if (count < h * w).any():
                 self._mask(counts, count.astype(np.float64), square, max(min_overlap * (h * w), 1.0))
 
     def _mask(self, counts: Counts, count: Sums, square: Sums, least: float) -> None:
         """Prepare the sums of positions that reach over the mask's edge."""
-        valid = _boxes(counts, 1, 1).astype(np.float32)
+        valid = counts_inside(counts, 1, 1).astype(np.float32)
         self._valid, self._squares = valid.ravel(), self._template * self._template
         self._count, self._least = count, least
         self._spread = square - self._total * self._total / np.maximum(count, 1.0)
@@ -103,9 +102,3 @@ class LocalScores:
         norm = np.sqrt(spread * model_spread, out=np.ones_like(spread), where=textured)
         scores = np.where(textured, (products - self._total[j, i] * sums / count) / norm, 0.0).clip(-1.0, 1.0)
         return np.asarray(np.where(self._count[j, i] < self._least, -1.0, scores))
-
-
-def _boxes(running: NDArray[Any], h: int, w: int) -> NDArray[Any]:
-    """Sums over (h, w) at every position, by running sums (..., H+1, W+1)."""
-    s = running
-    return np.asarray(s[..., h:, w:] - s[..., :-h, w:] - s[..., h:, :-w] + s[..., :-h, :-w])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from engine.kernels import by_opencv, surface_loops
 from engine.kernels.by_opencv import fast_side, transform
-from engine.kernels.sums import integrals
+from engine.kernels.sums import counts, counts_inside, integrals
 from engine.kernels.transform_sizes import FLAT_SHARE
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ def surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ove
         (T, H-h+1, W-w+1) in [-1, 1]: float32 where both pictures are, else float64.
     """
     h, w = templates.shape[1:]
-    common = _inside(valid, h, w)
+    common = counts_inside(counts(valid), h, w)
     is_single = window.dtype == templates.dtype == np.float32
     out = np.zeros((len(templates), *common.shape), np.float32 if is_single else np.float64)
     enough = common >= max(min_overlap * (h * w), 1.0)
@@ -63,12 +63,6 @@ def surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ove
         _score_partial(out, (window, valid, mean), templates, asked)
     out[:, ~enough] = -1.0
     return out
-
-
-def _inside(valid: Mask, h: int, w: int) -> NDArray[np.int32]:
-    """Number of valid pixels under the template (H', W')."""
-    sums = cv2.integral(valid.view(np.uint8))
-    return np.asarray(sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w])
 
 
 def _score_whole(

@@ -111,12 +111,12 @@ def prepared_surface(image: Picture, inverse_norms: Picture, templates: Picture)
     return eager.prepared_surface(image, inverse_norms, templates)
 
 
-def inverse_norm(image: Picture, sums: Picture, h: int, w: int) -> Picture:
+def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Picture:
     """Reciprocal norm about the mean of every patch.
 
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
-        sums: of a tensor its :func:`integrals` (2, H+1, W+1), or a crop of a larger picture's; of an array None.
+        running: :func:`integrals` (2, H+1, W+1) of a tensor, or a crop of a larger picture's; None of an array.
         h: rows of a patch.
         w: columns of a patch.
 
@@ -129,7 +129,8 @@ def inverse_norm(image: Picture, sums: Picture, h: int, w: int) -> Picture:
         return by_opencv.inverse_norm(image, h, w)
     from engine.kernels import eager
 
-    return eager.inverse_norm(sums, h, w)
+    assert running is not None
+    return eager.inverse_norm(running, h, w)
 
 
 def integrals(image: Tensor) -> Tensor:

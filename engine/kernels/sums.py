@@ -64,3 +64,17 @@ def counts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
         (H+1, W+1) int32; the first row and column are 0.
     """
     return np.asarray(cv2.integral(np.ascontiguousarray(valid).view(np.uint8)))
+
+
+def counts_inside(counts: NDArray[np.int32], h: int, w: int) -> NDArray[np.int32]:
+    """Number of valid pixels in every patch.
+
+    Args:
+        counts: (H+1, W+1) from :func:`counts`, or a crop of a larger mask's.
+        h: rows of a patch.
+        w: columns of a patch.
+
+    Returns:
+        (H-h+1, W-w+1) int32.
+    """
+    return np.asarray(counts[h:, w:] - counts[:-h, w:] - counts[h:, :-w] + counts[:-h, :-w])

@@ -1,6 +1,6 @@
 """What surrounds the transforms of a correlation on the CPU, compiled by numba: one pass, no temporaries.
 
-Sums are in float64 and about the window's mean, so that a large offset costs no digits.
+Sums are in float64 and about the window's mean, or of a picture about 0: a large offset would cost digits.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def box_sums(picture, h, w):
     """Sums of the pixels of every patch, and of their squares.
 
     Args:
-        picture: (H, W) float32.
+        picture: (H, W) float32, its mean small against its standard deviation.
         h: rows of a patch.
         w: columns of a patch.
 
@@ -115,7 +115,7 @@ def box_sums(picture, h, w):
 
 @compiled
 def _sum_rows(down, down_squares, picture, y, h, mean):
-    """Sums over rows y to y + h of every column, from those at y - 1, 0 before the first."""
+    """Sums over h rows of every column, the first of them y, from those of y - 1; both are 0 before y = 0."""
     if y > 0:
         _slide(down, down_squares, picture[y + h - 1], picture[y - 1], mean)
         return

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.coarse_to_fine import WIDE_PX
 from engine.confidence import SECOND_LOOK_MODEL, peak_features, probability
 from engine.device import on_host, placed
+from engine.kernels.sums import counts, counts_inside
 from engine.methods.correlation import Aligned, Correlator
 from engine.methods.peak_evidence import PeakCandidate, agreement_of, fix_of
 from engine.ncc_fft import ncc
@@ -170,9 +170,7 @@ def _scores(
 
 def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[np.float64]:
     """Share of the template's pixels on valid map at every place (H', W')."""
-    sums = cv2.integral(valid.astype(np.uint8))
-    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-    return np.asarray(inside / (height * width), np.float64)
+    return np.asarray(counts_inside(counts(valid), height, width) / (height * width), np.float64)
 
 
 def _channels(gray: NDArray[np.uint8], radius_px: int, valid: NDArray[np.bool_] | None) -> FloatImage:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from engine import threads as chosen
 from engine.kernels import by_opencv, eager, reference
-from engine.ncc_fft import ncc, prepare, surface
+from engine.ncc_fft import Search, ncc, prepare, surface
 
 
 def scores_of(search, templates, zero_mean=True):
@@ -111,12 +111,16 @@ def test_dim_and_bright_pictures_score_as_others(scale):
 @settings(max_examples=25)
 def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
     rng = np.random.default_rng(seed)
-    part = prepare(torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))).crop(7, 3, 41, 37)
+    image = torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))
+    part, on_device = (
+        whole.crop(7, 3, 41, 37) for whole in (prepare(image), Search(image, sums=eager.integrals(image)))
+    )
+    assert part.sums is None  # they take four times the picture's memory
     templates = torch.from_numpy(rng.normal(0.0, 1.0, (2, *model)).astype(np.float32))
     centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    norms = eager.inverse_norm(eager.integrals(torch.from_numpy(part.image)), *model)
+    norms = eager.inverse_norm(on_device.sums, *model)
     for count in (1, 2):
-        expected = eager.prepared_surface(torch.from_numpy(part.image), norms, centred[:count])
+        expected = eager.prepared_surface(on_device.image, norms, centred[:count])
         torch.testing.assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
 
 
