@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Angles = TypeVar("Angles", float, Array)
 
 WGS84_A_M = 6378137.0
 """Semi-major axis of the WGS84 ellipsoid (NIMA TR8350.2)."""
@@ -233,6 +235,11 @@ def _turn_by_angles(roll_deg: float, pitch_deg: float) -> Array:
 def wrap_heading_deg(heading_deg: float) -> float:
     """Wrap to [0, 360); twice, since the remainder of a tiny negative angle rounds to 360."""
     return heading_deg % 360.0 % 360.0
+
+
+def wrap_difference_deg(difference_deg: Angles) -> Angles:
+    """Wrap to [-180, 180)."""
+    return (difference_deg + 180.0) % 360.0 - 180.0
 
 
 def chi_square(difference: Array, covariance: Array) -> float:

@@ -19,6 +19,7 @@ from engine.geo import (
     enu_turn_covariance_rad2,
     geodetic_from_ecef,
     transport_covariance,
+    wrap_difference_deg,
     wrap_heading_deg,
 )
 
@@ -177,6 +178,14 @@ def test_attitude_round_trip(roll_deg, pitch_deg, heading_deg):
 )
 def test_heading_never_wraps_to_360(given_deg, expected_deg):
     assert wrap_heading_deg(given_deg) == expected_deg
+
+
+@pytest.mark.parametrize(
+    ("given_deg", "expected_deg"), [(0.0, 0.0), (180.0, -180.0), (-190.0, 170.0), (725.0, 5.0)]
+)
+def test_differences_of_angles_wrap_to_half_a_turn(given_deg, expected_deg):
+    assert wrap_difference_deg(given_deg) == expected_deg
+    assert wrap_difference_deg(np.array([given_deg])) == [expected_deg]
 
 
 def test_heading_of_a_rotation_a_hair_west_of_north_is_below_360():

@@ -15,12 +15,11 @@ from engine.diagnosis.contradictions import (
     contradictions,
     height_sigma_m,
     is_alarming,
-    wrapped_deg,
 )
 from engine.diagnosis.findings import Array, Finding, TelemetrySeries
 from engine.diagnosis.ground_motion import optical_centre, velocity
 from engine.diagnosis.sightings import Sighting
-from engine.geo import enu_from_body
+from engine.geo import enu_from_body, wrap_difference_deg
 
 _OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
 _MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
@@ -74,7 +73,7 @@ def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ..
 
 def _cost(measured_deg: Array, told_deg: Array) -> float:
     """Mean chi-square of a component, each limited."""
-    chi = (wrapped_deg(measured_deg - told_deg) / SIGMA_DEG) ** 2
+    chi = (wrap_difference_deg(measured_deg - told_deg) / SIGMA_DEG) ** 2
     known = np.isfinite(chi)
     return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
 
@@ -222,9 +221,9 @@ def _median_angle(angles_deg: Array) -> tuple[float, float]:
     if not known.size:
         return 0.0, math.inf
     middle = math.atan2(np.sin(known).sum(), np.cos(known).sum())
-    off = wrapped_deg(np.degrees(known - middle))
+    off = wrap_difference_deg(np.degrees(known - middle))
     spread = 1.4826 * float(np.median(np.abs(off - np.median(off))))
-    middle_deg = float(wrapped_deg(np.array(math.degrees(middle) + float(np.median(off)))))
+    middle_deg = wrap_difference_deg(math.degrees(middle) + float(np.median(off)))
     return middle_deg, max(spread, 0.3) * 1.25 / math.sqrt(known.size)
 
 

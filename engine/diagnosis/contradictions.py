@@ -9,6 +9,7 @@ import numpy as np
 from engine.diagnosis.findings import Array, Contradiction, TelemetrySeries
 from engine.diagnosis.ground_motion import leg_differences
 from engine.diagnosis.sightings import Sighting
+from engine.geo import wrap_difference_deg
 
 SIGMA_DEG = np.array([1.2, 1.2, 1.5])
 """Of roll, pitch and heading by features alone, against the telemetry's."""
@@ -29,7 +30,7 @@ def contradictions(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[C
     """
     index = [s.index for s in seen]
     measured = np.array([attitude_deg(s) for s in seen]).reshape(-1, 3)
-    off = wrapped_deg(measured - series.angles_deg[index]) / SIGMA_DEG
+    off = wrap_difference_deg(measured - series.angles_deg[index]) / SIGMA_DEG
     heights = np.array([s.height_agl_m for s in seen])
     columns = {
         "roll": off[:, 0],
@@ -54,11 +55,6 @@ def attitude_deg(seen: Sighting) -> tuple[float, float, float]:
 def height_sigma_m(height_m: Array) -> Array:
     """Standard deviation of heights by features alone."""
     return np.hypot(_HEIGHT_SHARE * height_m, _HEIGHT_M)
-
-
-def wrapped_deg(angles_deg: Array) -> Array:
-    """Differences of angles, from -180 up to 180 degrees."""
-    return np.asarray((angles_deg + 180.0) % 360.0 - 180.0, np.float64)
 
 
 def _counted(field: str, sigmas: Array) -> Contradiction:

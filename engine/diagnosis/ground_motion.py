@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from engine.diagnosis.findings import Array, Finding, TelemetrySeries
 from engine.diagnosis.sightings import Sighting
+from engine.geo import wrap_difference_deg
 
 _OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
 _MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
@@ -53,7 +54,7 @@ class _Leg:
     @property
     def turn_deg(self) -> float:
         """Of the heading, by the sightings; from -180 up to 180."""
-        return _wrapped_deg(self.last.attitude.heading_deg - self.first.attitude.heading_deg)
+        return wrap_difference_deg(self.last.attitude.heading_deg - self.first.attitude.heading_deg)
 
     @property
     def turned(self) -> Array:
@@ -153,14 +154,11 @@ def _tilt_deg(seen: Sighting) -> Array:
     return np.array([seen.attitude.roll_deg, seen.attitude.pitch_deg])
 
 
-def _wrapped_deg(angle_deg: float) -> float:
-    return (angle_deg + 180.0) % 360.0 - 180.0
-
-
 def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
     """Whether the telemetry confirms the turn: to a false sighting and back, both legs would show one offset."""
-    first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2]
-    return abs(_wrapped_deg(leg.turn_deg - (last_deg - first_deg))) < _TURN_OFF_DEG  # not where it is unknown
+    first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2].tolist()
+    off_deg: float = wrap_difference_deg(leg.turn_deg - (last_deg - first_deg))
+    return abs(off_deg) < _TURN_OFF_DEG  # not where it is unknown
 
 
 def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from engine.errors import TelemetryError
 from engine.formats.telemetry import TelemetryRow, take_off_sigma_m
 from engine.formats.truth import truth_from_telemetry
-from engine.geo import wrap_heading_deg
+from engine.geo import wrap_difference_deg, wrap_heading_deg
 from engine.values import Truth
 
 MAX_SAMPLE_GAP_NS = 2_000_000_000
@@ -183,7 +183,7 @@ def interpolate(series: TimeSeries, stamps_ns: Stamps, *, is_angle: bool = False
     near_end = (stamps_ns >= at[0] - END_HOLD_NS) & (stamps_ns <= at[-1] + END_HOLD_NS)
     known = np.isin(stamps_ns, at) | np.where(inside, gap_ns <= MAX_SAMPLE_GAP_NS, near_end)
     if is_angle:
-        result = (result + 180.0) % 360.0 - 180.0
+        result = wrap_difference_deg(result)
     return np.where(known, result, np.nan)
 
 

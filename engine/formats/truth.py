@@ -20,7 +20,7 @@ from engine.formats.tables import (
     write_table,
 )
 from engine.formats.telemetry import TelemetryRow
-from engine.geo import wrap_heading_deg
+from engine.geo import wrap_difference_deg, wrap_heading_deg
 from engine.values import Truth
 
 __all__ = ["Truth", "interpolate_truth", "read_truth", "write_truth"]
@@ -110,7 +110,7 @@ def interpolate_truth(
     return Truth(
         timestamp_ns=timestamp_ns,
         lat_deg=a.lat_deg + fraction * (b.lat_deg - a.lat_deg),
-        lon_deg=a.lon_deg + fraction * _wrap_180(b.lon_deg - a.lon_deg),
+        lon_deg=a.lon_deg + fraction * wrap_difference_deg(b.lon_deg - a.lon_deg),
         alt_amsl_m=_between(a.alt_amsl_m, b.alt_amsl_m, fraction),
         height_agl_m=_between(a.height_agl_m, b.height_agl_m, fraction),
         roll_deg=_between(a.roll_deg, b.roll_deg, fraction),
@@ -119,13 +119,9 @@ def interpolate_truth(
     )
 
 
-def _wrap_180(difference_deg: float) -> float:
-    return (difference_deg + 180.0) % 360.0 - 180.0
-
-
 def _between(a: float | None, b: float | None, fraction: float) -> float | None:
     return None if a is None or b is None else a + fraction * (b - a)
 
 
 def _between_angles(a_deg: float | None, b_deg: float | None, fraction: float) -> float | None:
-    return None if a_deg is None or b_deg is None else a_deg + fraction * _wrap_180(b_deg - a_deg)
+    return None if a_deg is None or b_deg is None else a_deg + fraction * wrap_difference_deg(b_deg - a_deg)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.geo import LocalFrame
+from engine.geo import LocalFrame, wrap_difference_deg
 from engine.sim.conditions import Condition
 from engine.sim.light import Image
 from engine.sim.optics import ExposureMotion, Optics, Sensor, take_picture
@@ -251,7 +251,7 @@ def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
     before, now, after = (motion.at(time_s + step) for step in (-COURSE_STEP_S, 0.0, COURSE_STEP_S))
 
     def rate(ends: tuple[Array, Array]) -> Array:
-        return ((ends[1] - ends[0] + 180.0) % 360.0 - 180.0) / (2.0 * COURSE_STEP_S)
+        return wrap_difference_deg(ends[1] - ends[0]) / (2.0 * COURSE_STEP_S)
 
     angles = ("roll_deg", "pitch_deg", "heading_deg")
     turns = np.column_stack([rate((getattr(before, name), getattr(after, name))) for name in angles])

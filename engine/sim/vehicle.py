@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.geo import wrap_difference_deg
 
 Array = NDArray[np.float64]
 
@@ -221,7 +222,7 @@ def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[f
         along = (end - start) / np.hypot(*(end - start))
         aim = math.degrees(math.atan2(along[0], along[1]))
         before = aim if nose is None else nose
-        nose = before + (aim - before + 180.0) % 360.0 - 180.0
+        nose = before + wrap_difference_deg(aim - before)
         push = leg_accelerations(float(np.hypot(*(end - start))), style)
         pushes += [np.zeros((pause, 2)), np.outer(push, along)]
         noses += [before + turn * (nose - before), np.full(push.size, nose)]
