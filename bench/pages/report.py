@@ -2,7 +2,8 @@
 
     python -m bench.pages.report RUN.json [--quick] [--docs DIR]
 
-Beside the run it measures the growth of cost and the search of a whole large map, which take one process each.
+Beside the run it measures the growth of cost, the search of a whole large map and the stages of a frame, each in a
+process of its own.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def main() -> None:
     rows = [_row(entry) for entry in run["benchmarks"]]
     curves = [] if options.quick else growth.curves()
     big = [] if options.quick else whole_map.run()
-    flown = [] if options.quick else stages.run()
+    flown = [] if options.quick else stages.in_own_process()
     charts = sift.charts(rows)
     if any(row["task"] == "peak" for row in rows):
         charts["ncc-ratio.png"] = _ratio_chart(rows)
