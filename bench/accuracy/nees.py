@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
-from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
+from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
 from bench.pages.text import paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.covariance import AssumedErrors
@@ -94,10 +94,11 @@ class Flight:
 
 @dataclass(frozen=True)
 class Sample:
-    """One match: the error (3,) and covariance (3, 3) of its fix, NaN where it was refused."""
+    """One match: the error (3,) and covariance (3, 3) of its fix, and whether that was refined."""
 
     error_m: Array
     covariance_m2: Array
+    is_refined: bool
 
     @property
     def squared_sigmas(self) -> float:
@@ -123,7 +124,12 @@ def town(seed: int, light: str = "noon") -> Flight:
 def shared(name: str) -> Flight:
     """Every few frames of a shared flight."""
     known = RECORDED[name]
-    flown = recorded(name, EVERY[name], georeference_sigma_m=known.map_m, slope_sigma_deg=known.slope_deg)
+    accuracy = {"georeference_sigma_m": known.map_m, "slope_sigma_deg": known.slope_deg}
+    return flight_of(recorded(name, EVERY[name], **accuracy), known)
+
+
+def flight_of(flown: Recorded, known: Known) -> Flight:
+    """Those frames whose true place is known."""
     frames, truth = [], []
     for frame, _ in flown.frames:
         true = None if frame.timestamp_ns is None else interpolate_truth(flown.truth, frame.timestamp_ns)
@@ -134,7 +140,7 @@ def shared(name: str) -> Flight:
             up = true.alt_amsl_m - flown.ground.ground_amsl_m + flown.ground.ground_m
         frames.append(frame)
         truth.append([*flown.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg), up])
-    return Flight(name, flown.site, flown.camera, frames, np.array(truth), known)
+    return Flight(flown.name, flown.site, flown.camera, frames, np.array(truth), known)
 
 
 def samples(flight: Flight, method: str) -> list[Sample | None]:
@@ -162,7 +168,8 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
         fix = moved_to_middle(fix, flight.site, flight.camera) if flight.name in MIDDLE else fix
         up = np.nan if fix.up_m is None else fix.up_m
         covariance = fix.covariance_m2 + flight.known.truth_m**2 * np.diag([1.0, 1.0, 0.0])
-        out.append(Sample(np.array([fix.east_m, fix.north_m, up]) - true, covariance))
+        error_m = np.array([fix.east_m, fix.north_m, up]) - true
+        out.append(Sample(error_m, covariance, fix.stage == "refined"))
     return out
 
 

@@ -123,10 +123,10 @@ def _heading_rotation(seen: Sighting) -> Array:
 
 def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     """Places that are off forwards or to the right: at every turn of the vehicle they move."""
-    tilts_deg = np.array([_tilt_deg(one) for one in seen])
-    usual_deg = np.median(tilts_deg, axis=0)
-    level = [one for one in seen if np.abs(_tilt_deg(one) - usual_deg).max() < _TILT_OFF_DEG]
-    legs = [leg for leg in _legs(series, level) if _turns_as_told(series, leg)]
+    tilts_deg = np.array([(one.attitude.roll_deg, one.attitude.pitch_deg) for one in seen])
+    off_deg = np.abs(tilts_deg - np.median(tilts_deg, axis=0)).max(axis=1)
+    usual = [one for one, tilt_off_deg in zip(seen, off_deg, strict=True) if tilt_off_deg < _TILT_OFF_DEG]
+    legs = [leg for leg in _legs(series, usual) if _turns_as_told(series, leg)]
     turning = np.array([abs(leg.turn_deg) > _TURN_DEG for leg in legs], bool)
     if len(legs) < _LEAST or not turning.any():
         return None
@@ -148,10 +148,6 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
 def _limited(left: Array) -> float:
     """Mean chi-square of what is left, each limited."""
     return float(np.minimum(left**2, _OUTLIER).mean())
-
-
-def _tilt_deg(seen: Sighting) -> Array:
-    return np.array([seen.attitude.roll_deg, seen.attitude.pitch_deg])
 
 
 def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:

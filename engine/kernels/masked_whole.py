@@ -93,7 +93,7 @@ def _score_partial(
         inner = np.s_[y : y + rows + h - 1, x : x + columns + w - 1]
         mask = valid[inner].astype(np.float32)
         values = np.where(valid[inner], window[inner] - np.float64(mean), 0.0)
-        boxes = integrals(values), cv2.integral(valid[inner].astype(np.uint8))
+        boxes = integrals(values), counts(valid[inner])
         for spectrum, shown in zip(spectra, (values, mask), strict=True):
             _write_spectrum(spectrum, shown)
         for t, model in enumerate(models):
@@ -114,7 +114,7 @@ def _energy(window: NDArray[Any], valid: Mask, mean: float) -> float:
 def _blocks(asked: Mask, h: int, w: int) -> tuple[tuple[int, int], list[tuple[int, int]]]:
     """Rows and columns of the blocks that cost least, and the corners of those with a place to score."""
     height, width = asked.shape
-    sums, best = cv2.integral(asked.view(np.uint8)), (np.inf, (height, width), [(0, 0)])
+    sums, best = counts(asked), (np.inf, (height, width), [(0, 0)])
     for n in _DIVISIONS if asked.size > _SMALL_PX else (1,):
         rows, columns = -(-height // n), -(-width // n)
         y, x = np.arange(0, height, rows), np.arange(0, width, columns)

@@ -144,10 +144,10 @@ def test_a_first_run_that_compiled_is_forgotten_by_the_second():
     assert costs.upper_bound_ms("step", 1.0) == pytest.approx(80.0)  # with the share of waiting
 
 
-@pytest.mark.parametrize(("work", "ms"), [(0.1, 30.0), (1.0, 30.0), (1.0, 150.0)])
-def test_a_first_run_of_more_work_or_little_dearer_still_counts(work, ms):
+@pytest.mark.parametrize(("first_ms", "work", "ms"), [(280.0, 0.1, 30.0), (180.0, 1.0, 30.0), (280.0, 1.0, 150.0)])
+def test_a_first_run_of_more_work_or_little_dearer_still_counts(first_ms, work, ms):
     costs = Costs()
-    costs.learn("step", 1.0, 180.0 if ms == 30.0 and work == 1.0 else 280.0)
+    costs.learn("step", 1.0, first_ms)
     costs.learn("step", work, ms)
     assert costs.upper_bound_ms("step", 1.0) > 90.0
 
