@@ -48,6 +48,7 @@ def run_without(lines):
     return json.loads(done.stdout.rpartition("CODES ")[2]), done.stderr
 
 
+@pytest.mark.slow
 def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
     picture, out = sorted((flight / "frames").iterdir())[0], tmp_path / "out"
     truth = (flight / "truth.csv").read_text(encoding="utf-8").splitlines()[1].split(",")
@@ -70,6 +71,17 @@ def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
     assert (out / "report.html").is_file()
     assert not list(out.glob("*.png"))
     assert stated.count("no plots are drawn: expected matplotlib to be installed, got none: pip install") == 2
+
+
+def test_a_flight_is_tracked_without_an_extra_of_a_desk(files, tmp_path, monkeypatch, capsys):
+    for name in OF_DESKS:
+        monkeypatch.setitem(sys.modules, name, None)
+    out = tmp_path / "out"
+    assert run(["track", *files, "--threads=1", f"--out={out}"]) == 0
+    said = capsys.readouterr().err
+    assert said.count("no plots are drawn: expected matplotlib to be installed, got none: pip install") == 1
+    assert (out / "report.html").is_file()
+    assert not list(out.glob("*.png"))
 
 
 @pytest.mark.parametrize(
