@@ -13,6 +13,8 @@ from engine.cli.app import app, run
 from engine.report.campaign import CampaignRow
 from tests.cli.test_json import LEAVES
 
+pytestmark = pytest.mark.usefixtures("bare_runs")
+
 
 @pytest.mark.parametrize("command", [pytest.param(command, id=" ".join(words)) for words, command in LEAVES])
 def test_every_command_says_what_is_next(command):
@@ -75,7 +77,6 @@ def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, 
     assert "--every" not in next_of(capsys, given)
 
 
-@pytest.mark.usefixtures("bare_runs")
 @pytest.mark.parametrize(("runs", "drawn"), [(["ncc"], "comparison.png"), (["ncc", "sift"], "comparison.html")])
 def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs, drawn):
     out = tmp_path / "two  spaces"
@@ -131,7 +132,6 @@ def test_names_with_spaces_stay_one_word(capsys):
     assert shlex.split(said)[2:] == ["track", "--map", "a map.tif", "--log-offset-s", "2"]
 
 
-@pytest.mark.usefixtures("bare_runs")
 def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_path, capsys):
     """An export would refuse it. By ncc every frame is refused under a heading that is 90 degrees off."""
     names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
@@ -151,7 +151,6 @@ def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_
     assert set(files) | set(wrong) <= set(words)
 
 
-@pytest.mark.usefixtures("bare_runs")
 def test_compare_uses_the_settings_file_that_is_there(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenematch.toml").touch()

@@ -41,6 +41,7 @@ from engine.runs.executors import on_ray
 from engine.runs.inputs import FOLDER_LAYOUT
 
 FRAMES = 3
+pytestmark = pytest.mark.usefixtures("bare_runs")
 
 
 class Recorded(Progress):
