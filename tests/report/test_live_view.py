@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 from collections import defaultdict
+from functools import cache
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from engine.runs.settings import TrackSettings
 from engine.runs.simulation import write_flight
 from engine.runs.tracking import track
 from engine.sim import plan_flight
+from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -60,25 +62,37 @@ def has_content(row):
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """A flight with a black frame, tracked without and with a recording."""
+def flown(tmp_path_factory):
+    """A flight with a black frame, and what tracks it by a method and says where the results are."""
     folder = tmp_path_factory.mktemp("live")
     files = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
     cv2.imwrite(str(folder / "flight" / "frames" / f"{DARK:06d}.jpg"), np.zeros((300, 300, 3), np.uint8))
-    for method in ("ncc", "sift"):
-        for name, target in (("off", NO_LIVE_VIEW), ("on", LiveViewTarget(folder / f"{method}.rrd"))):
-            out = folder / f"{method}-{name}"
+
+    @cache
+    def tracked(method, name):
+        target = LiveViewTarget(folder / f"{method}.rrd") if name == "on" else NO_LIVE_VIEW
+        out = folder / f"{method}-{name}"
+        with bare_runs():
             track(files, out, TrackSettings(device="cpu", method=method), report=False, live_view=target)
-    return folder
+        return folder
+
+    return tracked
+
+
+@pytest.fixture(scope="module")
+def runs(flown):
+    """The flight tracked by NCC, with a recording."""
+    return flown("ncc", "on")
 
 
 # ------------------------------------------------------------------------------------------- the recording
 
 
-@pytest.mark.parametrize("method", ["ncc", "sift"])
-def test_it_changes_no_result(runs, method):
+@pytest.mark.parametrize("method", ["ncc", pytest.param("sift", marks=pytest.mark.slow)])
+def test_it_changes_no_result(flown, method):
     tables = []
     for name in ("off", "on"):
+        runs = flown(method, name)
         lines = (runs / f"{method}-{name}" / "track.csv").read_text(encoding="utf-8").splitlines()
         latency = lines[0].split(",").index("latency_ms")
         tables.append([[c for k, c in enumerate(line.split(",")) if k != latency] for line in lines])
@@ -111,8 +125,8 @@ def test_a_fixed_frame_has_all_that_is_promised_and_a_refused_one_does_not_show_
     assert rows["state"][DARK][0]["StateChange:state"] == ["coasting"]
 
 
-def test_sift_shows_its_matches(runs):
-    rows = rows_of(runs / "sift.rrd")
+def test_sift_shows_its_matches(flown):
+    rows = rows_of(flown("sift", "on") / "sift.rrd")
     fixed = [frame for frame in range(FRAMES) if frame != DARK]
     assert all(has_content(rows["matches"][frame][0]) for frame in fixed)
     assert not any(has_content(rows["surface"][frame][0]) for frame in fixed)
