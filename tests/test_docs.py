@@ -136,6 +136,7 @@ def test_pages_use_the_words_of_the_field():
 PATH = re.compile(r"`(engine/[\w/]+(?:\.\w+)?)`")
 
 
+@pytest.mark.slow
 def test_architecture_is_drawn_from_the_code():
     """``python docs/draw_architecture.py`` draws it anew."""
     page = read("docs/architecture.md")

@@ -115,6 +115,7 @@ class NodeOfNoRos:
         beat()
 
 
+@pytest.mark.slow
 def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monkeypatch, capsys):
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     module = types.ModuleType("engine.adapters.ros1")

@@ -107,6 +107,7 @@ def test_tracking_by_ncc_loads_no_torch(tmp_path):
     assert (tmp_path / "out" / "report.html").exists()
 
 
+@pytest.mark.slow
 def test_torch_takes_the_threads_that_were_chosen_before_it_was_loaded():
     program = (
         "import sys, engine; engine.set_threads(3); assert 'torch' not in sys.modules\n"

@@ -16,6 +16,7 @@ def test_without_cuda_it_says_so_in_one_line(capsys, monkeypatch):
     assert out.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_for_every_task(capsys):
     gpu.main(["--device", "cpu", "--quick"])
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]

@@ -69,6 +69,7 @@ def test_completion_loads_nothing_that_only_work_needs():
     assert done.stdout.endswith("HEAVY []\n")
 
 
+@pytest.mark.slow
 def test_commands_that_match_nothing_load_no_torch(tmp_path):
     site, affine = tmp_path / "m.tif", [[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_000_000.0]]
     write_geotiff(site, np.full((500, 500), 9, np.uint8), affine, 32633)

@@ -45,7 +45,7 @@ def in_process(interpret, tmp_path):
     return pool
 
 
-@pytest.fixture(scope="module", params=["interpreter", "cuda"])
+@pytest.fixture(scope="module", params=[pytest.param("interpreter", marks=pytest.mark.slow), "cuda"])
 def on(request, tmp_path_factory):
     """Runs a check, a function of this module, with Triton; its first argument is the device."""
     if request.param == "cuda":
