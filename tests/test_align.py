@@ -71,8 +71,7 @@ def test_half_pixel_of_the_map_a_geotiff_counts_from_the_corner_of_the_first_pix
     assert (result.east_m, result.north_m) == (pytest.approx(east, abs=0.08), pytest.approx(north, abs=0.08))
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("lon_deg", "sign"), [(17.9, 1.0), (12.1, -1.0)])
+@pytest.mark.parametrize(("method", "lon_deg", "sign"), [("ncc", 17.9, 1.0), ("sift", 12.1, -1.0)])
 def test_meridian_convergence_heading_is_from_true_north_and_not_from_the_maps_up(camera, method, lon_deg, sign):
     """At 60 degrees north and 2.9 degrees off the central meridian the map's up is 2.5 degrees off north."""
     ground = Ground(lat_deg=60.0, lon_deg=lon_deg)
@@ -152,8 +151,7 @@ def test_scale_of_frames_much_finer_than_the_map_keeps_their_place(ground, size)
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0])
-@pytest.mark.parametrize("roll_deg", [8.0, -15.0])
+@pytest.mark.parametrize(("roll_deg", "heading_deg"), [(8.0, 90.0), (-15.0, 0.0), (-15.0, 200.0)])
 def test_sign_of_roll_is_right_side_down(ground, camera, roll_deg, heading_deg, method):
     frame = ground.frame(camera, NADIR, roll_deg=roll_deg, heading_deg=heading_deg)
     assert_found(locate(ground, camera, frame, method))
@@ -171,8 +169,7 @@ def test_sign_of_roll_right_side_down_the_camera_looks_to_the_left():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0])
-@pytest.mark.parametrize("pitch_deg", [8.0, -15.0])
+@pytest.mark.parametrize(("pitch_deg", "heading_deg"), [(8.0, 90.0), (-15.0, 0.0), (-15.0, 200.0)])
 def test_sign_of_pitch_is_nose_up(ground, camera, pitch_deg, heading_deg, method):
     frame = ground.frame(camera, NADIR, pitch_deg=pitch_deg, heading_deg=heading_deg)
     assert_found(locate(ground, camera, frame, method))

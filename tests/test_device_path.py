@@ -218,7 +218,13 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=list(OPTIONS))
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(options, id=name, marks=[pytest.mark.slow] if name in ("not doubled", "strongest") else [])
+        for name, options in OPTIONS.items()
+    ],
+)
 def test_features_do_not_make_the_host_wait_and_are_the_cpus(options):
     pictures = scenes()
     mask = torch.ones_like(pictures, dtype=torch.bool)
@@ -278,6 +284,7 @@ def test_a_picture_of_any_size_has_features_on_a_device(size):
     assert np.isfinite(angles).all()
 
 
+@pytest.mark.slow
 def test_a_picture_with_more_extrema_than_there_is_room_for_keeps_what_fits():
     ramp = torch.arange(240) // 4
     chess = ((ramp[:, None] + ramp) % 2).float()[None, None]
@@ -308,7 +315,7 @@ COPIES = {"ncc": (1, 1), "sift": (2, 1), "auto": (3, 2)}
 METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-6}
 
 
-@pytest.mark.parametrize("method", list(COPIES))
+@pytest.mark.parametrize("method", ["ncc", "sift", pytest.param("auto", marks=pytest.mark.slow)])
 def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, monkeypatch):
     scene = flight(3)
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu")

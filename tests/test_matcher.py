@@ -117,8 +117,15 @@ def test_the_covariance_of_a_fix_is_finite_symmetric_and_positive_definite(match
         assert 0.1 < fix.sigma_m < 10.0
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("profile", ["engine", "paper"])
+@pytest.mark.parametrize(
+    ("method", "profile"),
+    [
+        ("ncc", "engine"),
+        ("sift", "engine"),
+        ("ncc", "paper"),
+        pytest.param("sift", "paper", marks=pytest.mark.slow),
+    ],
+)
 def test_the_same_question_has_the_same_answer_in_any_order(ground, camera, frame, prior, method, profile):
     options = MatcherOptions(profile=profile)
     other = ground.frame(camera, NADIR + 12.0, heading_deg=200.0, timestamp_ns=77)
@@ -330,7 +337,7 @@ def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
 def test_features_of_the_map_prepared_or_found_per_frame_give_the_same_place(ground, camera, upright):
     prepared = with_sift(ground, camera, upright=upright)
     per_frame = with_sift(ground, camera, upright=upright, map_features="per_frame")
-    for heading in (0.0, 45.0, 160.0, 300.0):
+    for heading in (45.0, 300.0):
         shown = ground.frame(camera, NADIR, heading_deg=heading, roll_deg=4.0)
         fixes = [matcher.locate(shown, ground.prior(NADIR)) for matcher in (prepared, per_frame)]
         assert max(distance_px(fix) for fix in fixes) < 0.3
@@ -342,7 +349,7 @@ def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_nor
     matcher = with_sift(ground, camera, second_look=False, max_turn_deg=8.0)
     oriented = with_sift(ground, camera, second_look=False, upright=False, max_turn_deg=8.0)
     for mount in (camera.mount, np.array([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]) @ camera.mount):
-        for heading in (10.0, 100.0, 250.0):
+        for heading in (100.0, 250.0):
             shown = ground.frame(camera, NADIR, heading_deg=heading, pitch_deg=8.0)
             given = shown if mount is camera.mount else replace(shown, image=shown.image[::-1, ::-1].copy())
             for each in (matcher, oriented):
@@ -511,7 +518,14 @@ def test_an_answer_after_the_budget_is_late_in_the_papers_profile(ground, camera
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["prior", "whole map"])
+def test_a_frame_of_another_town_is_refused(other_site, sim_flight, method):
+    matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
+    assert {type(matcher.locate(shown, HERE)) for shown in sim_flight.frames[:5]} == {NoFix}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
 def test_a_frame_of_another_town_is_refused_in_nearly_all_tries(other_site, sim_flight, method, known):
     matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
     results = [matcher.locate(shown, HERE if known else None) for shown in sim_flight.frames[:20]]
@@ -521,7 +535,7 @@ def test_a_frame_of_another_town_is_refused_in_nearly_all_tries(other_site, sim_
 @pytest.mark.parametrize("method", METHODS)
 def test_noise_is_refused(matchers, prior, method):
     rng = np.random.default_rng(4)
-    for _ in range(5):
+    for _ in range(3):
         image = rng.integers(0, 256, (300, 300), dtype=np.uint8)
         for given in (prior, None):
             assert isinstance(matchers[method].locate(with_telemetry(image), given), NoFix)
@@ -609,12 +623,10 @@ def test_options_by_which_every_frame_would_fail_are_refused(options, name, valu
 @pytest.mark.parametrize("method", METHODS)
 def test_the_papers_profile_finds_the_place_of_a_level_frame(ground, camera, prior, method):
     matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
-    for heading in (0.0, 60.0, 250.0):
-        level = ground.frame(camera, NADIR, heading_deg=heading)
-        for given in (prior, None):
-            fix = matcher.locate(level, given)
-            assert distance_px(fix) < (1.0 if method == "ncc" else 2.0)  # whole pixels; no attitude to lean on
-            assert fix.method == method
+    for heading, given in ((0.0, prior), (60.0, None), (250.0, prior)):
+        fix = matcher.locate(ground.frame(camera, NADIR, heading_deg=heading), given)
+        assert distance_px(fix) < (1.0 if method == "ncc" else 2.0)  # whole pixels; no attitude to lean on
+        assert fix.method == method
 
 
 def test_the_papers_profile_turns_by_the_heading_less_the_maps(camera):
@@ -624,7 +636,7 @@ def test_the_papers_profile_turns_by_the_heading_less_the_maps(camera):
     image = ground.picture(camera, NADIR, 150.0, heading_deg=40.0)
     scores = {
         heading: matcher.locate(with_telemetry(image, 150.0, heading, 0.0, 0.0), ground.prior(NADIR)).score
-        for heading in (35.0, 37.5, 40.0, 42.5, 45.0)
+        for heading in (37.5, 40.0, 42.5)
     }
     assert max(scores, key=scores.get) == 40.0
 
