@@ -217,26 +217,37 @@ def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
     assert [found.cause for found in findings(series(angles_deg=angles), poses, 1.0)] == ["radians"]
 
 
-def test_pictures_say_it_by_themselves():
-    """The whole way, on a drawn town: a heading that is off, mirrored pictures, stamps in milliseconds."""
+@pytest.fixture(scope="module")
+def over_a_town():
+    """Eight frames of a flight over a drawn town, and what finds the causes in such frames."""
     town = drawn_town()
     plan = plan_flight(town=town, frames=8)
-    frames, site, camera = list(plan.iter_frames()), site_of(town), plan.camera
-    first = plan.truth_rows()[0]
+    site, camera, first = site_of(town), plan.camera, plan.truth_rows()[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=15.0)
-    assert diagnose(frames, frames.__getitem__, site, camera, start=start).findings == []
+    return list(
+        plan.iter_frames()
+    ), lambda frames: diagnose(frames, frames.__getitem__, site, camera, start=start).findings
+
+
+def test_pictures_say_it_by_themselves(over_a_town):
+    """The whole way, on a drawn town: nothing where all fits, and a heading that is off."""
+    frames, found_in = over_a_town
+    assert found_in(frames) == []
     off = [replace(frame, heading_deg=(frame.heading_deg + 9.0) % 360.0) for frame in frames]
-    (found,) = diagnose(off, off.__getitem__, site, camera, start=start).findings
+    (found,) = found_in(off)
     assert found.cause == "heading"
     assert found.value == pytest.approx(-9.0, abs=1.0)
+
+
+@pytest.mark.slow
+def test_pictures_also_say_that_they_are_mirrored_hurried_or_frozen(over_a_town):
+    frames, found_in = over_a_town
     mirrored = [replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1])) for frame in frames]
-    assert diagnose(mirrored, mirrored.__getitem__, site, camera, start=start).findings[0].cause == "mirrored"
+    assert found_in(mirrored)[0].cause == "mirrored"
     hurried = [replace(frame, timestamp_ns=frame.timestamp_ns // 1_000_000) for frame in frames]
-    assert diagnose(hurried, hurried.__getitem__, site, camera, start=start).findings[0].cause == "stamps"
+    assert found_in(hurried)[0].cause == "stamps"
     still = [replace(frame, image=frames[3 * (k // 3)].image) for k, frame in enumerate(frames)]
-    assert "frozen" in [
-        found.cause for found in diagnose(still, still.__getitem__, site, camera, start=start).findings
-    ]
+    assert "frozen" in [found.cause for found in found_in(still)]
 
 
 def radians_near_north(turning):

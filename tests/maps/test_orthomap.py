@@ -650,6 +650,7 @@ def test_satellite_map_with_a_colour_table_and_a_black_collar():
     assert (site.gray(whole(site))[~valid] == 0).all()  # index 255 of the table, which stands for black
 
 
+@pytest.mark.slow
 @needs_data
 def test_geographic_orthophoto_with_a_black_collar(tmp_path):
     folder = SHARED / "caliterra"

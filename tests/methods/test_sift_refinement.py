@@ -154,7 +154,7 @@ def test_foreign_ground_is_refused_as_before(ground, camera, matcher):
     assert result.reason in (Reason.BAD_POSE, Reason.TOO_FEW_MATCHES, Reason.AMBIGUOUS)
 
 
-@pytest.mark.parametrize("heading_off_deg", [0.0, 6.0])
+@pytest.mark.parametrize("heading_off_deg", [pytest.param(0.0, marks=pytest.mark.slow), 6.0])
 def test_after_the_warm_up_nothing_is_prepared_in_flight(ground, site, camera, heading_off_deg):
     """Also where refinement has to begin on a coarser level."""
     matcher = SceneMatcher(site, camera, "sift", "cpu")
@@ -241,7 +241,7 @@ def test_samples_of_another_method_are_shared(site, camera):
     assert parts["sift"].samples is parts["ncc"].samples
 
 
-@pytest.mark.parametrize("scale", [0.35, 0.5, 1.0])
+@pytest.mark.parametrize("scale", [0.35, 1.0])
 def test_the_cost_of_features_goes_by_the_pixels_that_are_drawn(ground, camera, matcher, monkeypatch, scale):
     """Not by the frame's: at one height they are up to four times as many as at another. Borders are not shown."""
     shown = []

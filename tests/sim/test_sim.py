@@ -163,6 +163,7 @@ def test_a_town_has_buildings_ground_and_colour(town):
     np.testing.assert_allclose(fine.reshape(1000, 2, 900, 2).mean(axis=(1, 3)), town.surface_m, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_another_town():
     small = {"width_px": 300, "height_px": 280}
     one, again, other = (build_town(seed, **small) for seed in (5, 5, 6))

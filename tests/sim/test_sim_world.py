@@ -47,7 +47,9 @@ def hilly():
 # ---------------------------------------------------------------------------------------------- conditions
 
 
-@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize(
+    "light", [light if k == 0 else pytest.param(light, marks=pytest.mark.slow) for k, light in enumerate(LIGHTS)]
+)
 def test_a_condition_of_light_alone_is_that_light(light):
     own = Condition(light=LIGHTS[light])
     plain, named = build_town(5, **SMALL, condition=own), build_town(5, **SMALL, condition=light)
