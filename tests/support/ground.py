@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from pyproj import Transformer
@@ -46,6 +46,16 @@ def ground_hits(camera, xy_px, height_m, *, roll_deg=0.0, pitch_deg=0.0, heading
     return ray[..., :2] * (height_m / -ray[..., 2:])
 
 
+@lru_cache(maxsize=8)
+def texture_of(seed, count):
+    """Spline coefficients (N, N) of grey levels: grounds that differ in their place alone have one texture."""
+    rng = np.random.default_rng(seed)
+    fine = gaussian_filter(rng.standard_normal((count, count)), 2.0)
+    broad = gaussian_filter(rng.standard_normal((count, count)), 6.0)
+    mixed = fine / fine.std() + broad / broad.std()
+    return spline_filter(128.0 + 40.0 * mixed / mixed.std(), order=3)
+
+
 @dataclass(frozen=True)
 class Ground:
     """Flat ground with a random smooth texture, its map, and pictures of it from anywhere.
@@ -61,14 +71,9 @@ class Ground:
     size: tuple[int, int] = (600, 640)
     seed: int = 5
 
-    @cached_property
+    @property
     def _texture(self):
-        rng = np.random.default_rng(self.seed)
-        count = int(2.2 * max(self.size) * self.gsd_m / LATTICE_M)
-        fine = gaussian_filter(rng.standard_normal((count, count)), 2.0)
-        broad = gaussian_filter(rng.standard_normal((count, count)), 6.0)
-        mixed = fine / fine.std() + broad / broad.std()
-        return spline_filter(128.0 + 40.0 * mixed / mixed.std(), order=3)
+        return texture_of(self.seed, int(2.2 * max(self.size) * self.gsd_m / LATTICE_M))
 
     def levels(self, east_m, north_m):
         """Grey level, unrounded, at true east and north."""
