@@ -287,8 +287,9 @@ def with_sift(ground, camera, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("heading", [True, False], ids=["heading", "no heading"])
-@pytest.mark.parametrize("factor", [0.5, 0.7, 1.0, 1.4, 2.0, None])
+@pytest.mark.parametrize(
+    ("factor", "heading"), [(0.5, False), (0.7, True), (1.0, False), (1.4, False), (2.0, True), (None, False)]
+)
 def test_sift_is_as_good_with_a_height_that_is_wrong_or_unknown(matchers, ground, camera, heading, factor):
     for height_m, turn in ((150.0, 200.0), (90.0, 25.0)):
         shown = ground.frame(camera, NADIR, height_m, heading_deg=turn)
@@ -349,7 +350,7 @@ def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_nor
     matcher = with_sift(ground, camera, second_look=False, max_turn_deg=8.0)
     oriented = with_sift(ground, camera, second_look=False, upright=False, max_turn_deg=8.0)
     for mount in (camera.mount, np.array([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]) @ camera.mount):
-        for heading in (100.0, 250.0):
+        for heading in (100.0 if mount is camera.mount else 250.0,):
             shown = ground.frame(camera, NADIR, heading_deg=heading, pitch_deg=8.0)
             given = shown if mount is camera.mount else replace(shown, image=shown.image[::-1, ::-1].copy())
             for each in (matcher, oriented):

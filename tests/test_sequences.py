@@ -33,7 +33,7 @@ def tiny():
 
 
 @given(steps=st.lists(STEPS, min_size=1, max_size=10), method=st.sampled_from(METHODS), start=st.booleans())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
     fly(tiny, steps, method, start=start)
 

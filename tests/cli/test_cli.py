@@ -491,8 +491,7 @@ def test_a_surface_of_another_place(copy, tmp_path, capsys):
     refused(capsys, copy, tmp_path / "out", 1, "surface", "far.tif", surface="far.tif")
 
 
-@pytest.mark.parametrize("index", [0, 3])
-@pytest.mark.parametrize("kind", ["empty", "truncated", "text", "other size"])
+@pytest.mark.parametrize(("kind", "index"), [("empty", 0), ("truncated", 3), ("text", 0), ("other size", 3)])
 def test_broken_pictures_are_found_before_the_run(kind, index, copy, tmp_path, capsys):
     path = copy / "frames" / f"{index:06d}.jpg"
     if kind == "other size":

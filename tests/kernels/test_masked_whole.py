@@ -50,9 +50,8 @@ def reference(window, valid, templates, min_overlap):
     return masked.ncc_surface(*tensors, shown, min_overlap=min_overlap)[0].numpy()
 
 
-@pytest.mark.parametrize("small_px", [0, 1 << 17])
+@pytest.mark.parametrize(("small_px", "min_overlap"), [(0, 0.3001), (1 << 17, 0.8999)])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("min_overlap", [0.3001, 0.8999])
 @pytest.mark.parametrize(("size", "model"), [((230, 317), (48, 61)), ((400, 260), (21, 20)), ((97, 90), (90, 90))])
 def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, small_px, monkeypatch):
     monkeypatch.setattr(masked_whole, "_SMALL_PX", small_px)
