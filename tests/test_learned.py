@@ -69,6 +69,7 @@ def test_points_are_pixels_of_the_pictures_that_came_in():
     assert second.tolist() == [[11, 7]]
 
 
+@pytest.mark.slow
 def test_a_cell_of_loftr_lies_on_its_eighth_pixel():
     """What a cell sees is centred on pixel (8x, 8y): not half a cell further, and not half a pixel."""
     torch.manual_seed(1)

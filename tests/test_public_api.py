@@ -127,7 +127,6 @@ def fresh():
     return {"printed": before + done.stderr, **json.loads(found)}
 
 
-@pytest.mark.slow
 def test_importing_the_engine_prints_nothing(fresh):
     assert fresh["printed"] == ""
 

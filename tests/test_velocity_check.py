@@ -47,7 +47,7 @@ def flown(stated=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=
     return check, doubted
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 30.0])
+@pytest.mark.parametrize("rate_hz", [1.0, pytest.param(5.0, marks=pytest.mark.slow), 30.0])
 def test_a_right_velocity_is_believed(rate_hz):
     """Some 30,000 matches in all: the rate of false alarms that is stated is 1 in 10,000."""
     assert [flown(rate_hz=rate_hz, seed=seed)[1] for seed in range(round(150 / rate_hz))] == [

@@ -53,7 +53,7 @@ def apart(xy, others):
 # Where they are
 
 
-@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize("upright", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_tiles_join_as_if_the_level_had_been_described_in_one_piece(site, monkeypatch, upright):
     monkeypatch.setattr(landmarks, "MAX_PER_CELL", 255)
     once = sift(as_picture(site.gray(whole(site)), CPU), max_keypoints=20_000, upright=upright, spread=1)

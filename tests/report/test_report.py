@@ -243,6 +243,7 @@ def test_short_tracks_and_missing_stamps_are_drawn(tmp_path, count):
     assert draw_figures(tmp_path, rows, truth)
 
 
+@pytest.mark.slow
 def test_a_path_off_the_map_is_drawn_on_blank_ground(tmp_path):
     rows = [fix_at(5000.0 + t, 5000.0, t) for t in range(3)]
     assert draw_figures(tmp_path, rows, None, site=TiltedMap())
@@ -293,6 +294,7 @@ def _within(label, ax):
     return low <= label.get_position()[0] <= high
 
 
+@pytest.mark.slow
 def test_the_heading_of_a_narrow_path_is_not_cut_off(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
