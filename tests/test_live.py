@@ -52,7 +52,7 @@ class Sink:
             self.answers.append(answer)
             self.changed.notify_all()
 
-    def wait_for(self, count: int, timeout_s: float = 20.0):
+    def wait_for(self, count: int, timeout_s: float = 60.0):
         with self.changed:
             assert self.changed.wait_for(lambda: len(self.answers) >= count, timeout_s), self.answers
             return list(self.answers)
@@ -66,7 +66,7 @@ def no_threads():
     return not [thread for thread in threading.enumerate() if thread.name.startswith("scenematch-_")]
 
 
-def wait_until(condition, timeout_s: float = 5.0):
+def wait_until(condition, timeout_s: float = 60.0):
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end, "it did not come to that"
@@ -75,7 +75,7 @@ def wait_until(condition, timeout_s: float = 5.0):
 
 def test_each_frame_has_its_own_fix():
     sink, navigator = Sink(), Slow(0)
-    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=5000)) as live:
+    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
         for number in range(20):
             live.submit(frame(number))
             sink.wait_for(number + 1)
@@ -87,7 +87,7 @@ def test_each_frame_has_its_own_fix():
 def test_the_newest_wins_and_drops_are_counted():
     gate, sink = threading.Event(), Sink()
     navigator = Slow(0, {0: gate.wait})
-    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=20_000)) as live:
+    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
         live.submit(frame(0))
         while not navigator.budgets:
             time.sleep(0.001)
@@ -99,6 +99,7 @@ def test_the_newest_wins_and_drops_are_counted():
     assert live.counts.dropped == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [2, 5, 10])
 def test_more_frames_than_it_can_take(times):
     """The age at output stays within the deadline and one frame, however many come."""
@@ -120,7 +121,8 @@ def test_more_frames_than_it_can_take(times):
 
 def test_an_answer_comes_at_the_deadline_and_the_late_fix_never():
     gate, sink = threading.Event(), Sink()
-    with Live(lambda start: Slow(0, {0: gate.wait}), sink, options=LiveOptions(deadline_ms=50)) as live:
+    options = LiveOptions(deadline_ms=50, patience_ms=60_000)
+    with Live(lambda start: Slow(0, {0: gate.wait}), sink, options=options) as live:
         live.submit(frame(0))
         assert reasons(sink.wait_for(1)) == [Reason.LATE]
         gate.set()
@@ -132,17 +134,18 @@ def test_an_answer_comes_at_the_deadline_and_the_late_fix_never():
 
 def test_the_navigator_is_given_what_is_left():
     sink, navigator = Sink(), Slow(0)
-    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=5000)) as live:
+    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
         live.submit(frame(0), captured_ns=time.monotonic_ns() - 3_000_000_000)
         sink.wait_for(1)
-        live.submit(frame(1), captured_ns=time.monotonic_ns() - 6_000_000_000)
+        live.submit(frame(1), captured_ns=time.monotonic_ns() - 61_000_000_000)
         answers = sink.wait_for(2)
-    assert 0 < navigator.budgets[0] <= 2000
+    assert 0 < navigator.budgets[0] <= 57_000
     assert len(navigator.budgets) == 1  # nothing is begun that cannot be in time
     assert reasons(answers) == ["fix", Reason.LATE]
     assert answers[0].age_ms >= 3000
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
     gate, sink, starts = threading.Event(), Sink(), []
 
@@ -150,7 +153,7 @@ def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
         starts.append(start)
         return Slow(0, {1: gate.wait} if len(starts) == 1 else {})
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=40, patience_ms=40)) as live:
+    with Live(make, sink, options=LiveOptions(deadline_ms=1000, patience_ms=1000)) as live:
         live.submit(frame(0))
         sink.wait_for(1)
         live.submit(frame(1))
@@ -182,7 +185,7 @@ def test_a_worker_that_dies_is_replaced_and_its_frame_answered():
         made.append(Slow(0, {} if made else {0: die}))
         return made[-1]
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=5000)) as live:
+    with Live(make, sink, options=LiveOptions(deadline_ms=60_000)) as live:
         live.submit(frame(0))
         sink.wait_for(1)
         live.submit(frame(1))
@@ -198,13 +201,14 @@ def test_a_frame_that_cannot_be_used_costs_no_worker():
         raise TelemetryError("timestamp_ns: expected later than 5, got 0")
 
     sink = Sink()
-    with Live(lambda start: Slow(0, {0: refuse}), sink, options=LiveOptions(deadline_ms=5000)) as live:
+    with Live(lambda start: Slow(0, {0: refuse}), sink, options=LiveOptions(deadline_ms=60_000)) as live:
         live.submit(frame(0))
         answers = sink.wait_for(1)
     assert reasons(answers) == [Reason.FAILED]
     assert live.counts.workers_replaced == 0
 
 
+@pytest.mark.slow
 def test_a_maker_that_fails_is_asked_again(caplog):
     sink, calls = Sink(), []
 
@@ -217,7 +221,7 @@ def test_a_maker_that_fails_is_asked_again(caplog):
             raise OSError("map is gone")
         return Slow(0, {0: die} if len(calls) == 1 else {})
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=30, patience_ms=30)) as live:
+    with Live(make, sink, options=LiveOptions(deadline_ms=1000, patience_ms=1000)) as live:
         live.submit(frame(0))
         sink.wait_for(1)
         number = 1
@@ -236,7 +240,7 @@ def test_a_receiver_that_fails_stops_nothing(caplog):
         sink(answer)
         raise ValueError("the receiver's own")
 
-    with Live(lambda start: Slow(0), deliver, options=LiveOptions(deadline_ms=5000)) as live:
+    with Live(lambda start: Slow(0), deliver, options=LiveOptions(deadline_ms=60_000)) as live:
         for number in range(3):
             live.submit(frame(number))
             sink.wait_for(number + 1)
@@ -257,13 +261,16 @@ def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it():
 
     def work():
         begun.set()
-        gate.wait(10.0)
+        gate.wait(60.0)
         over.append(True)
 
-    live = Live(lambda start: Slow(0, {0: work}), sink, options=LiveOptions(deadline_ms=20, patience_ms=20_000))
-    live.submit(frame(0))
-    assert reasons(sink.wait_for(1)) == [Reason.LATE]
-    assert begun.is_set()
+    navigator = Slow(0, dict.fromkeys(range(1000), work))
+    live = Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=60_000))
+    for number in range(1000):
+        live.submit(frame(number))
+        assert reasons(sink.wait_for(number + 1)) == [Reason.LATE] * (number + 1)
+        if begun.is_set():  # on a machine that is busy a frame may be due before its work begins
+            break
     threading.Timer(0.1, gate.set).start()
     live.close()
     assert over
@@ -281,12 +288,12 @@ def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
             raise OSError("map is gone")
         return Slow(0, {0: die})
 
-    live = Live(make, sink, options=LiveOptions(deadline_ms=5000, patience_ms=60))
+    live = Live(make, sink, options=LiveOptions(deadline_ms=60_000, patience_ms=60))
     live.submit(frame(0))
     sink.wait_for(1)
     wait_until(lambda: len(calls) > 1)
     live.close()
-    wait_until(no_threads, timeout_s=2.0)
+    wait_until(no_threads, timeout_s=60.0)
     made, replaced = len(calls), live.counts.workers_replaced
     time.sleep(0.15)
     assert (len(calls), live.counts.workers_replaced) == (made, replaced)
@@ -296,15 +303,22 @@ def test_closing_waits_for_a_worker_that_was_given_up():
     """A process that ends while a thread of its is within compiled code is aborted."""
     gate, over, sink = threading.Event(), [], Sink()
 
+    begun = threading.Event()
+
     def slow():
-        gate.wait(2.0)
+        begun.set()
+        gate.wait(60.0)
         time.sleep(0.3)
         over.append(True)
 
-    with Live(lambda _: Slow(0, {0: slow}), sink, options=LiveOptions(deadline_ms=20, patience_ms=30)) as live:
-        live.submit(frame(0))
-        sink.wait_for(1)
-        wait_until(lambda: live.counts.workers_replaced == 1)
+    navigator = Slow(0, dict.fromkeys(range(1000), slow))
+    with Live(lambda _: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=30)) as live:
+        for number in range(1000):
+            live.submit(frame(number))
+            sink.wait_for(number + 1)
+            if begun.is_set():
+                break
+        wait_until(lambda: live.counts.workers_replaced > 0)
         assert not over
         gate.set()
     assert over
@@ -316,6 +330,7 @@ def test_nothing_is_waited_for_longer_than_a_minute(name):
         LiveOptions(**{name: 1e13})
 
 
+@pytest.mark.slow
 def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
     monkeypatch.setattr("engine.live._JOIN_S", 0.05)
     gate, sink, starts = threading.Event(), Sink(), []
@@ -324,16 +339,17 @@ def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
         starts.append(start)
         return Slow(0, {0: gate.wait})
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=20, patience_ms=60)) as live:
+    with Live(make, sink, options=LiveOptions(deadline_ms=500, patience_ms=2000)) as live:
         live.submit(frame(0))
         assert reasons(sink.wait_for(1)) == [Reason.LATE]
-    time.sleep(0.1)
+    time.sleep(2.5)
     assert len(starts) == 1
     assert live.counts.workers_replaced == 0
     gate.set()
     wait_until(no_threads)
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
     gate, sink, calls = threading.Event(), Sink(), []
 

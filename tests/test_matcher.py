@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import cv2
@@ -32,6 +32,7 @@ from engine import (
     Window,
 )
 from engine.acceptance import PeakRule
+from engine.budget import Deadline
 from engine.covariance import AssumedErrors
 from engine.methods.feature_pose import FeatureMatcher
 from engine.methods.options import NccOptions, SiftOptions
@@ -315,10 +316,11 @@ def test_without_a_second_look_a_height_off_by_two_is_refused(ground, camera, fr
 def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
     ground, camera, frame, prior, monkeypatch, budget_ms, looks
 ):
-    hypotheses = []
+    hypotheses, clock = [], SimpleNamespace(now_ns=0)
+    monkeypatch.setattr("engine.matcher.Deadline", partial(Deadline, clock_ns=lambda: clock.now_ns))
 
     def look(matcher, hypothesis):
-        time.sleep(0.03)
+        clock.now_ns += 30_000_000
         hypotheses.append(hypothesis)
         return matcher.query.refuse(Reason.TOO_FEW_MATCHES, "none", "sift")
 

@@ -30,13 +30,15 @@ def test_work_within_work_does_not_wait_for_itself(count):
 
 @pytest.mark.parametrize("who", ["the caller", "a worker", "either"])
 def test_after_an_error_nothing_is_begun_and_nobody_works_on(count, who):
-    caller, begun, ended = threading.current_thread(), [], []
+    caller, begun, ended, failed = threading.current_thread(), [], [], threading.Event()
 
     def work(number):
         begun.append(number)
         is_caller = threading.current_thread() is caller
         if count == 1 or who == "either" or is_caller == (who == "the caller"):
+            failed.set()
             raise ValueError("no")
+        failed.wait(60.0)
         time.sleep(0.02)
         ended.append(number)
 

@@ -39,7 +39,7 @@ fixes = 0
 for index in range(6):
     shown, prior = frame(index)
     fixes += isinstance(matcher.locate(shown, prior), Fix)
-    fixes += isinstance(matcher.locate(shown, prior, Budget(total_ms=5000)), Fix)
+    fixes += isinstance(matcher.locate(shown, prior, Budget(total_ms=60_000)), Fix)
     fixes += isinstance(navigator.update(shown), Fix)
 fixes += isinstance(matcher.locate(frame(3)[0]), Fix)  # of the whole map
 matcher.locate(taken(gray[:120:-1, 380:][:120], 0), frame(0)[1])  # of no place, upside down

@@ -38,7 +38,7 @@ def command(tmp_path):
     return make
 
 
-def taken(source, until, timeout_s=20.0, **options):
+def taken(source, until, timeout_s=120.0, **options):
     """What is captured until something holds of it."""
     pictures, end = [], time.monotonic() + timeout_s
     for picture in capture(source, **options):
@@ -85,8 +85,8 @@ def test_a_camera_that_never_starts_is_opened_again(command, monkeypatch, caplog
 
 
 def test_a_picture_that_repeats_is_none(command):
-    stream = CameraStream(command(count=12, repeats=6, wait_s=5.0))
-    found = [stream.next(2.0) for _ in range(2)]
+    stream = CameraStream(command(count=12, repeats=6, wait_s=120.0))
+    found = [stream.next(60.0) for _ in range(2)]
     assert all(found)
     assert stream.next(0.6) is None
     assert stream.failure is None  # it hangs, and opening it again would not help

@@ -462,7 +462,9 @@ def test_a_rangefinder_without_a_stamp_counts_from_its_arrival():
 def test_the_date_is_the_autopilots_or_where_it_has_none_this_machines():
     telemetry, unix_us = MavlinkTelemetry(), 1_700_000_000_000_000
     telemetry.update(mavlink.MAVLink_system_time_message(0, 5000), 10_000_000_000)  # no date before a GPS fix
-    assert telemetry.unix_ns(time.monotonic_ns()) == pytest.approx(time.time_ns(), abs=1e8)  # this machine's
+    before_ns = time.time_ns()
+    stamp_ns = telemetry.unix_ns(time.monotonic_ns())
+    assert before_ns - 1e8 < stamp_ns < time.time_ns() + 1e8  # this machine's
     telemetry.update(mavlink.MAVLink_system_time_message(unix_us, 6000), 11_000_000_000)
     assert telemetry.unix_ns(12_000_000_000) == unix_us * 1000 + 1_000_000_000
 
@@ -949,7 +951,7 @@ def bridge_to():
         bridge.close()
 
 
-def fly(bridge, until, *, timeout_s=20.0, every_s=0.05):
+def fly(bridge, until, *, timeout_s=120.0, every_s=0.05):
     """Pictures at 20 Hz until something holds; their captures."""
     image, captures, end = np.zeros((4, 4, 3), np.uint8), [], time.monotonic() + timeout_s
     while not until():
@@ -1158,7 +1160,7 @@ def test_a_second_receiver_repeats_the_first_until_the_vehicle_is_armed(bridge_t
 
 
 def test_the_pilot_is_told_when_fixes_begin_and_stop(bridge_to, monkeypatch):
-    monkeypatch.setattr("engine.adapters.notices._STOPPED_S", 0.3)
+    monkeypatch.setattr("engine.adapters.notices._STOPPED_S", 1.5)
     made = bridge_to()
     with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
         fly(made.bridge, lambda: pilot.of("STATUSTEXT"))
@@ -1274,7 +1276,7 @@ def test_the_other_firmware_is_not_steered(bridge_to):
 
 
 def test_reconnects_after_silence_and_to_a_new_address(bridge_to, monkeypatch):
-    monkeypatch.setattr("engine.adapters.mavlink._SILENCE_NS", 600_000_000)
+    monkeypatch.setattr("engine.adapters.mavlink._SILENCE_NS", 2_000_000_000)
     made = bridge_to()
     with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
         fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
@@ -1346,7 +1348,7 @@ def test_a_flood_and_a_stranger_do_not_steer_it(bridge_to):
 def test_tcp_reconnects_after_the_link_drops(monkeypatch):
     monkeypatch.setattr("engine.adapters.mavlink._REOPEN_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(10.0)
+        server.settimeout(60.0)
         port = server.getsockname()[1]
         made = autopilot()
         with MavlinkBridge(
@@ -1359,10 +1361,7 @@ def test_tcp_reconnects_after_the_link_drops(monkeypatch):
                     other.sendall(packet[:5])
                     time.sleep(0.05)
                     other.sendall(packet[5:])
-                    end = time.monotonic() + 10.0
-                    while not bridge.connected and time.monotonic() < end:
-                        time.sleep(0.01)
-                    assert bridge.connected
+                    wait_until(lambda: bridge.connected)
                     assert other.recv(1) == b"\xfd"
                     assert bridge.status.reconnections == expected
 
@@ -1391,7 +1390,7 @@ def test_a_serial_port_takes_halves_and_its_loss_is_survived(monkeypatch):
     os.close(port)
 
 
-def wait_until(holds, timeout_s=10.0):
+def wait_until(holds, timeout_s=60.0):
     end = time.monotonic() + timeout_s
     while not holds():
         assert time.monotonic() < end

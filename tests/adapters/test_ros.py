@@ -557,7 +557,7 @@ class StandIn:
 
     def wait_for(self, output, count):
         with self.changed:
-            assert self.changed.wait_for(lambda: len(self.of(output)) >= count, 20.0), self.published
+            assert self.changed.wait_for(lambda: len(self.of(output)) >= count, 60.0), self.published
 
 
 class Answers:
@@ -574,7 +574,7 @@ class Answers:
 @contextlib.contextmanager
 def bridge_of(node, site, make, **options):
     navigator = Answers(make)
-    bridge = RosBridge(node, site, lambda start: navigator, RosOptions(), None, LiveOptions(deadline_ms=10_000))
+    bridge = RosBridge(node, site, lambda start: navigator, RosOptions(), None, LiveOptions(deadline_ms=60_000))
     try:
         yield bridge, navigator
     finally:
@@ -716,7 +716,7 @@ def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
     node, answers = StandIn(maker), threading.Event()
 
     def slowly(frame):
-        answers.wait(5.0)
+        answers.wait(60.0)
         return a_fix(sim_site)
 
     bridge = RosBridge(

@@ -93,7 +93,7 @@ def settings(middle):
     """Settings of a fetch about the middle of the raster."""
 
     def make(source, radius_m=60.0, **others):
-        others = {"gsd_m_per_px": 0.5, "pause_ms": 0.0, "timeout_s": 5.0} | others
+        others = {"gsd_m_per_px": 0.5, "pause_ms": 0.0, "timeout_s": 60.0} | others
         return FetchSettings(around=middle, radius_m=radius_m, source=source, **others)
 
     return make

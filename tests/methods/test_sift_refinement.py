@@ -1,6 +1,7 @@
 """SIFT's pose refined densely, from few features where these are beyond doubt."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -112,6 +113,13 @@ def test_a_refinement_that_is_abandoned_leaves_the_fix(ground, camera, matcher, 
     assert fix.stage == "fine"
 
 
+@pytest.fixture
+def clock_stands(monkeypatch):
+    """Budgets are compared with what is said to be the cost, and no work takes any time."""
+    monkeypatch.setattr("engine.matcher.Deadline", partial(Deadline, clock_ns=lambda: 0))
+
+
+@pytest.mark.usefixtures("clock_stands")
 def test_few_features_are_better_than_none_where_time_is_short(ground, site, camera):
     """With no time for all features nor for refinement."""
     matcher = SceneMatcher(site, camera, "sift", "cpu")
@@ -165,6 +173,7 @@ def test_after_the_warm_up_nothing_is_prepared_in_flight(ground, site, camera, h
     assert matcher.cache_counters == before
 
 
+@pytest.mark.usefixtures("clock_stands")
 @pytest.mark.parametrize("wrong", [{"roll_deg": 5.0}, {"pitch_deg": 0.0}], ids=str)
 def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site, camera, wrong):
     """There is time for nothing else; a tilt that is off by 2 degrees displaces them by metres."""
@@ -181,6 +190,7 @@ def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site,
     assert np.mean(chi_squares) / 2.0 < 2.0
 
 
+@pytest.mark.usefixtures("clock_stands")
 def test_few_features_leave_the_time_for_all(ground, camera, site, monkeypatch):
     """A frame whose few features may fail is not lost to them: with time for one of both it is all features'."""
     matcher, tried = SceneMatcher(site, camera, "sift", "cpu"), []

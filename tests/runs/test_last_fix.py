@@ -26,14 +26,15 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_it_grows_uncertain_while_nobody_watches():
-    memory = LastFix()
+def test_it_grows_uncertain_while_nobody_watches(monkeypatch):
+    memory, clock = LastFix(), SimpleNamespace(now_s=time.monotonic())
+    monkeypatch.setattr(last_fix.time, "monotonic", lambda: clock.now_s)
     assert memory.prior(15.0) is None
     memory.keep(FIX)
-    time.sleep(0.1)
+    clock.now_s += 0.1
     prior = memory.prior(15.0)
     assert (prior.lat_deg, prior.lon_deg) == (48.2, 16.37)
-    assert 2.0 <= prior.sigma_m < 10.0
+    assert prior.sigma_m == pytest.approx(0.5 + 15.0 * 0.1)
 
 
 def test_it_outlives_a_process_that_is_killed(tmp_path):
