@@ -216,6 +216,7 @@ def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, m
     assert fix.stage == "coarse"
 
 
+@pytest.mark.usefixtures("clock_stands")
 def test_few_features_that_were_too_dear_once_are_tried_again(ground, camera, site):
     matcher = SceneMatcher(site, camera, "sift", "cpu")
     matcher.warmup()
