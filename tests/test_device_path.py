@@ -221,7 +221,7 @@ OPTIONS = {
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param(options, id=name, marks=[pytest.mark.slow] if name in ("not doubled", "strongest") else [])
+        pytest.param(options, id=name, marks=[] if name in ("usual", "upright") else [pytest.mark.slow])
         for name, options in OPTIONS.items()
     ],
 )

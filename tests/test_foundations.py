@@ -330,7 +330,9 @@ def test_the_tree_of_errors_is_whole():
 @pytest.mark.parametrize(
     ("words", "environment", "expected"),
     [
-        (["nobody", "before", "after"], {}, ["nobody 1 1", "before 2 2", "after 2 2"]),
+        pytest.param(
+            ["nobody", "before", "after"], {}, ["nobody 1 1", "before 2 2", "after 2 2"], marks=pytest.mark.slow
+        ),
         pytest.param(["environment"], {"OMP_NUM_THREADS": "2"}, ["environment 2"], marks=pytest.mark.slow),
     ],
 )

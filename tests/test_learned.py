@@ -139,6 +139,7 @@ def test_nothing_found_is_no_match():
 # Loaded from a file.
 
 
+@pytest.mark.slow
 def test_loftr_is_what_the_file_says(files):
     matcher = load_loftr(files / "loftr.ckpt", device="cpu", min_confidence=0.0)
     stored = torch.load(files / "loftr.ckpt", weights_only=True)["state_dict"]

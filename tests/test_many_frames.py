@@ -66,7 +66,9 @@ def values(result):
     return result.timestamp_ns, *place, result.score, result.window, result.stage, result.confidence
 
 
-@pytest.mark.parametrize("method", ["ncc", "sift", pytest.param("auto", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["ncc", *(pytest.param(method, marks=pytest.mark.slow) for method in ("sift", "auto"))]
+)
 def test_many_frames_have_the_answers_of_each_alone_in_order(matchers, questions, method):
     matcher, (frames, priors) = matchers[method], questions
     alone = [values(matcher.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]

@@ -125,6 +125,7 @@ def test_a_fixed_frame_has_all_that_is_promised_and_a_refused_one_does_not_show_
     assert rows["state"][DARK][0]["StateChange:state"] == ["coasting"]
 
 
+@pytest.mark.slow
 def test_sift_shows_its_matches(flown):
     rows = rows_of(flown("sift", "on") / "sift.rrd")
     fixed = [frame for frame in range(FRAMES) if frame != DARK]

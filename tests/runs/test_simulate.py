@@ -92,6 +92,7 @@ def test_a_map_of_ones_own_is_the_world_and_the_day_changes_its_pictures(folder,
     assert pictures[0] != pictures[1]
 
 
+@pytest.mark.slow
 def test_a_closed_loop_leaves_a_flight_folder_with_its_results(loop):
     names = {path.name for path in loop.iterdir()}
     assert names >= FOLDER | LOOP
@@ -108,6 +109,7 @@ def test_a_closed_loop_leaves_a_flight_folder_with_its_results(loop):
         assert np.hypot(row.east_m - place[0], row.north_m - place[1]) < 5.0
 
 
+@pytest.mark.slow
 def test_its_figures_are_those_of_its_record(loop):
     figures = json.loads((loop / "loop.json").read_text())
     with (loop / "loop.csv").open() as file:
@@ -122,6 +124,7 @@ def test_its_figures_are_those_of_its_record(loop):
     assert {r["mode"] for r in rows} == {"follow"}
 
 
+@pytest.mark.slow
 def test_evaluate_scores_it_again(loop):
     before = json.loads((loop / "summary.json").read_text())
     assert run(["evaluate", str(loop)]) == 0
@@ -130,6 +133,7 @@ def test_evaluate_scores_it_again(loop):
     assert (loop / "loop.json").exists()
 
 
+@pytest.mark.slow
 def test_a_flight_that_was_tracked_into_a_loops_folder_was_steered_by_nothing(folder, loop, tmp_path):
     assert "Closed loop: steered by" in (loop / "report.html").read_text(encoding="utf-8")
     out = Path(shutil.copytree(loop, tmp_path / "loop"))
@@ -141,6 +145,7 @@ def test_a_flight_that_was_tracked_into_a_loops_folder_was_steered_by_nothing(fo
         assert "Closed loop" not in (out / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, loop, capsys):
     before = (loop / "truth.csv").read_bytes()
     assert run(["simulate", "--out", str(loop), "--frames", "1"]) == 2

@@ -249,6 +249,7 @@ def quality(
     return float(near[inside].any(1).mean()), float(good.mean()), float(good.sum())
 
 
+@pytest.mark.slow
 def test_quality_is_opencvs():
     warps = [(0, 1.0, (3.3, -2.6)), (35, 1.0, (0, 0)), (-80, 1.25, (4, 1)), (160, 0.8, (0, 3)), (10, 0.7, (1, 1))]
     ours, theirs = [], []
