@@ -70,6 +70,16 @@ def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
         yield from _by_workers(work, range(done, count), workers)
 
 
+def start_helper(work: Callable[[], None]) -> BaseProcess | None:
+    """Begin some work in a copy of this process, for its caller to end; None where such a copy is not safe."""
+    if safe_count() < 2:
+        return None
+    with _forkable():
+        helper = multiprocessing.get_context("fork").Process(target=work, daemon=True)
+        helper.start()
+    return helper
+
+
 def _by_workers(work: Callable[[int], T], tasks: range, workers: int) -> Iterator[T]:
     """The results of tasks in their order; what one raised is raised in its turn."""
     started: _Workers = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 _MAX_SIDE = 2048  # cells along a side of the histogram
 _ROUNDS = 4  # of the mean shift from the fullest cells to the middle of the points
@@ -12,7 +12,7 @@ _FIRST_REACH = 1.25  # of the radius about the fullest cells, whose middle is of
 _REACH = 2  # cells to either side that are counted with one
 
 
-@compiled
+@compiled("(f8[:, ::1], f8)")
 def densest(points, radius):
     """Mark the points within a radius of the place about which most lie.
 
@@ -39,11 +39,12 @@ def densest(points, radius):
         held, x, y = _mark_near(points, x, y, radius, near)
         if held > most:
             most = held
-            best[:] = near
+            for n in range(count):
+                best[n] = near[n]
     return best
 
 
-@compiled
+@inlined
 def _mark_near(points, x, y, radius, near):
     """Mark the points within a radius of a place; how many there are, and their mean."""
     held, east, north = 0, 0.0, 0.0
@@ -57,7 +58,7 @@ def _mark_near(points, x, y, radius, near):
     return held, east / max(held, 1), north / max(held, 1)
 
 
-@compiled
+@inlined
 def _place_of_fullest_cells(points, radius):
     """The middle of the cell about which most points lie, the first of equal ones row by row."""
     left, top, right, bottom = points[0, 0], points[0, 1], points[0, 0], points[0, 1]
@@ -82,7 +83,7 @@ def _place_of_fullest_cells(points, radius):
     return left + (at_column + 0.5) * cell, top + (at_row + 0.5) * cell
 
 
-@compiled
+@compiled("(f8[::1], f8[::1], f8[::1], f8[::1], f8)")
 def count_near_pairs(ax, ay, bx, by, radius):
     """How many pairs of one set's points (N,) with another's (M,) lie within a radius."""
     total = 0

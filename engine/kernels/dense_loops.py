@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 _BIWEIGHT = 4.685  # standard deviations at which the weight of Tukey's biweight reaches 0
 _MAD = 1.4826  # standard deviation of normal noise over its median absolute value
 _MEDIAN_STEP = 3  # the median is taken over every third difference
 
 
-@compiled
+@compiled(
+    "(f4[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8, i8)"
+)
 def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradients, known, edge_px, cells):
     """Project samples into the picture by a pose, and read levels and gradients there.
 
@@ -57,14 +59,14 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
     return levels, points, shown, expected, weights, cell, count
 
 
-@compiled
+@inlined
 def _from_camera(offset_m, n, shift, slope):
     """East, north and up from the camera to a sample on the sloped ground."""
     up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
     return offset_m[0, n] + shift[0], offset_m[1, n] + shift[1], up
 
 
-@compiled
+@inlined
 def _from_map(expected, rotation, gradients, n, e, north, up):
     """Write the derivatives by a point in the camera, from the map's gradient; they are 0 along the ray."""
     by_e, by_n = gradients[n, 0], gradients[n, 1]
@@ -73,20 +75,20 @@ def _from_map(expected, rotation, gradients, n, e, north, up):
         expected[k, n] = rotation[k, 0] * by_e + rotation[k, 1] * by_n + rotation[k, 2] * by_up
 
 
-@compiled
+@inlined
 def _rotated(rotation, a, b, c):
     x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
     y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
     return x, y, rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
 
 
-@compiled
+@inlined
 def _pixel(matrix, across, down):
     u = matrix[0, 0] * across + matrix[0, 1] * down + matrix[0, 2]
     return u, matrix[1, 0] * across + matrix[1, 1] * down + matrix[1, 2]
 
 
-@compiled
+@inlined
 def _by_point(matrix, by_u, by_v, across, down, z):
     """Derivatives by a point in the camera, from those by its pixel."""
     by_x = (matrix[0, 0] * by_u + matrix[1, 0] * by_v) / z
@@ -94,7 +96,7 @@ def _by_point(matrix, by_u, by_v, across, down, z):
     return by_x, by_y, -(by_x * across + by_y * down)
 
 
-@compiled
+@inlined
 def _bilinear(picture, u, v):
     """Level of the picture at (u, v), and its derivatives by central differences, all bilinear."""
     column, row = int(u), int(v)
@@ -110,7 +112,7 @@ def _bilinear(picture, u, v):
     return level, 0.5 * by_u, 0.5 * by_v
 
 
-@compiled
+@compiled("(f8[::1], f8[::1], f8[::1])")
 def compare_levels(levels, values, weights):
     """Differences of picture and map up to gain and bias, robust weights, the correlation and the gain.
 
@@ -128,7 +130,7 @@ def compare_levels(levels, values, weights):
     return differences, _biweight(differences, weights), correlation, gain
 
 
-@compiled
+@compiled()
 def _up_to_gain(levels, values, weights):
     """Differences, correlation, gain."""
     total = level = value = 0.0
@@ -150,7 +152,7 @@ def _up_to_gain(levels, values, weights):
     return differences, both / max(np.sqrt(own * other), 1e-12), gain
 
 
-@compiled
+@compiled()
 def _biweight(differences, weights):
     sizes, index = np.empty(weights.size), 0
     for n in range(weights.size):
@@ -167,7 +169,7 @@ def _biweight(differences, weights):
     return out
 
 
-@compiled
+@compiled()
 def median(values):
     """The median of values (N,), NaN of none, by Hoare's selection, which reorders them.
 

@@ -10,11 +10,15 @@ import numpy as np
 
 from engine.kernels.dense_loops import compare_levels, project
 from engine.kernels.jit import compiled
+from engine.kernels.small_matrices import mirror, solve, turn, turn_between
 
 _PARAMETERS = 8
 
 
-@compiled
+@compiled(
+    "(f4[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], "
+    "f8[::1], f8[:, ::1], f8[::1], f8, i8, i8, i8, f8, f8)"
+)
 def gauss_newton(
     picture, matrix, rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope, precision,
     offset_m, values, gradients, known, edge_px, cells, least, steps, excess, last_step,
@@ -48,29 +52,45 @@ def gauss_newton(
         (3, N), derivatives (3, N) by the picture and by the map, weights (N,) and cells (N,).
     """
     rotation, center_m, slope = rotation.copy(), center_m.copy(), slope.copy()
-    step, found, converged, at_first = np.zeros(_PARAMETERS), True, False, np.nan
+    seen, step, off = rotation.copy(), np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
+    found, converged, at_first = True, False, np.nan
     while True:
-        seen = rotation.copy()
+        for i in range(3):
+            for j in range(3):
+                seen[i, j] = rotation[i, j]
         levels, points, shown, expected, weights, cell, count = project(
             picture, matrix, seen, center_m, slope, offset_m, prior_center_m, gradients, known, edge_px, cells
         )
         if count < least:
             found = False
         differences, weights, correlation, gain = compare_levels(levels, values, weights)
-        expected *= gain
+        for k in range(3):
+            for n in range(known.size):
+                expected[k, n] *= gain
         if np.isnan(at_first):
             at_first = correlation
         if found:
             normal, score = normal_equations(shown, expected, points, offset_m, seen, weights, differences, excess)
-            normal += precision
-            off = parameters_between(rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope)
-            score -= small_product(precision, off.reshape(_PARAMETERS, 1))[:, 0]
+            turn_between(rotation, prior_rotation, off[3:6])
+            for i in range(3):
+                off[i] = center_m[i] - prior_center_m[i]
+            for i in range(2):
+                off[6 + i] = slope[i] - prior_slope[i]
+            for i in range(_PARAMETERS):
+                for j in range(_PARAMETERS):
+                    normal[i, j] += precision[i, j]
+                    score[i] -= precision[i, j] * off[j]
             found = solve(normal, score, step)
         if found:
-            rotation = small_product(rotation_of(step[3:6]), rotation)
-            center_m += step[:3]
-            slope += step[6:]
-            converged = np.sum(step * score) < last_step
+            turn(seen, step[3:6], rotation)
+            size = 0.0
+            for i in range(_PARAMETERS):
+                size += step[i] * score[i]
+            for i in range(3):
+                center_m[i] += step[i]
+            for i in range(2):
+                slope[i] += step[6 + i]
+            converged = size < last_step
         steps -= 1
         if not found or converged or steps == 0:
             break
@@ -80,7 +100,7 @@ def gauss_newton(
     )  # fmt: skip
 
 
-@compiled
+@compiled()
 def normal_equations(shown, expected, points, offset_m, rotation, weights, differences, excess):
     """Normal matrix (8, 8) and right side (8,); the mean of both gradients converges from farther than one."""
     total = square = 0.0
@@ -108,15 +128,7 @@ def normal_equations(shown, expected, points, offset_m, rotation, weights, diffe
     return normal, score
 
 
-@compiled
-def mirror(matrix):
-    """Complete a symmetric matrix (N, N) of which the lower triangle is known, in place."""
-    for i in range(matrix.shape[0]):
-        for j in range(i):
-            matrix[j, i] = matrix[i, j]
-
-
-@compiled
+@compiled()
 def by_parameters(row, a, b, c, points, offset_m, rotation, n):
     """Write the derivatives (8,) by the parameters of one difference, from those by its point in the camera."""
     x, y, z = points[0, n], points[1, n], points[2, n]
@@ -126,7 +138,7 @@ def by_parameters(row, a, b, c, points, offset_m, rotation, n):
     row[6], row[7] = -row[2] * offset_m[0, n], -row[2] * offset_m[1, n]
 
 
-@compiled
+@compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8[::1], i8)")
 def information(shown, expected, points, offset_m, rotation, weights, differences, cell, cells):
     """Sums over the samples, for the covariance.
 
@@ -161,86 +173,7 @@ def information(shown, expected, points, offset_m, rotation, weights, difference
                 own[i, j] += first * one[j]
                 common[i, j] += 0.5 * (first * two[j] + second * one[j])
                 of_map[i, j] += second * two[j]
-    for sums in (own, common, of_map):
-        mirror(sums)
+    mirror(own)
+    mirror(common)
+    mirror(of_map)
     return own, common, of_map, by_cell
-
-
-@compiled
-def solve(matrix, right, out):
-    """Solve by Cholesky's decomposition, which overwrites the matrix; False where it is not positive definite."""
-    size = right.size
-    for i in range(size):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                if not value > 0.0:
-                    return False
-                matrix[i, i] = np.sqrt(value)
-            else:
-                matrix[i, j] = value / matrix[j, j]
-    for i in range(size):
-        value = right[i]
-        for k in range(i):
-            value -= matrix[i, k] * out[k]
-        out[i] = value / matrix[i, i]
-    for i in range(size - 1, -1, -1):
-        value = out[i]
-        for k in range(i + 1, size):
-            value -= matrix[k, i] * out[k]
-        out[i] = value / matrix[i, i]
-    return True
-
-
-@compiled
-def rotation_of(vector):
-    """The rotation (3, 3) of a rotation vector (Rodrigues)."""
-    angle = np.sqrt(np.sum(vector * vector))
-    sine = 1.0 - angle * angle / 6.0 if angle < 1e-4 else np.sin(angle) / angle
-    cosine = 0.5 if angle < 1e-4 else (1.0 - np.cos(angle)) / (angle * angle)
-    x, y, z = vector[0], vector[1], vector[2]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + sine * cross + cosine * small_product(cross, cross)
-
-
-@compiled
-def parameters_between(rotation, center_m, slope, other_rotation, other_center_m, other_slope):
-    """The parameters (8,) of the step from another pose to this one."""
-    out = np.empty(_PARAMETERS)
-    out[:3], out[6:] = center_m - other_center_m, slope - other_slope
-    out[3:6] = rotation_vector(small_product(rotation, np.ascontiguousarray(other_rotation.T)))
-    return out
-
-
-@compiled
-def rotation_vector(turn):
-    """The rotation vector (3,) of a rotation (3, 3)."""
-    sine = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    size, cosine = np.sqrt(np.sum(sine * sine)), 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
-    angle = np.arctan2(size, cosine)
-    if cosine > -0.9:
-        return sine * (1.0 if size < 1e-9 else angle / size)
-    # Towards half a turn the sine vanishes: the axis is that of the symmetric part, 1 - cosine times a a^T.
-    k = 0
-    for i in range(1, 3):
-        if turn[i, i] > turn[k, k]:
-            k = i
-    axis = np.empty(3)
-    axis[k] = np.sqrt(max((turn[k, k] - cosine) / (1.0 - cosine), 0.0))
-    for i in range(3):
-        if i != k:
-            axis[i] = (turn[k, i] + turn[i, k]) / (2.0 * (1.0 - cosine) * axis[k])
-    return axis * (-angle if np.sum(axis * sine) < 0.0 else angle)
-
-
-@compiled
-def small_product(a, b):
-    """Of two small matrices; numba's own needs SciPy."""
-    out = np.zeros((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for j in range(b.shape[1]):
-            for k in range(a.shape[1]):
-                out[i, j] += a[i, k] * b[k, j]
-    return out

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 _SEEN = 0.999  # of the weights of nodes that the frame can show, below which one of them is hidden
 
 
-@compiled
+@compiled("(f4[:, :, ::1], f4, f4, f4[:, ::1], f4[:, ::1], u1[:, ::1])")
 def places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside):
     """Interpolate a lattice at every pixel of a picture, bilinear from corner to corner.
 
@@ -39,7 +39,7 @@ def places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside):
             shown[c] = in_frame & (ahead[c] > seen)
 
 
-@compiled
+@inlined
 def _steps(nodes, count):
     """For each of ``count`` pixels from end to end the node before it, and its share of the way to the next."""
     first, share = np.empty(count, np.int64), np.empty(count, np.float32)
@@ -50,7 +50,7 @@ def _steps(nodes, count):
     return first, share
 
 
-@compiled
+@inlined
 def _along(line, steps, out):
     first, share = steps
     for c in range(out.size):

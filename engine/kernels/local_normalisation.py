@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 MAX_RADIUS_PX = 180
 """Of the largest neighbourhood whose sum of squares fits into int32."""
 _MIDDLE = 128  # from which levels are counted: squares lose fewer digits
 
 
-@compiled
+@compiled("(u1[:, ::1], i8, f8)")
 def normalised(picture, radius_px, noise_variance):
     """Each pixel less the mean of its neighbourhood, over its standard deviation.
 
@@ -56,7 +56,7 @@ def normalised(picture, radius_px, noise_variance):
     return out
 
 
-@compiled
+@inlined
 def _mirrored(index, size):
     """The index inside of one that is beyond an edge; the outermost pixel is not repeated."""
     if size == 1:
@@ -66,7 +66,7 @@ def _mirrored(index, size):
     return index
 
 
-@compiled
+@inlined
 def _add(down, squares, row):
     """Add a row to the sums over rows."""
     for x in range(row.size):
@@ -75,7 +75,7 @@ def _add(down, squares, row):
         squares[x] += value * value
 
 
-@compiled
+@inlined
 def _replace(down, squares, new, old):
     """Move the sums over rows down by one row."""
     for x in range(new.size):
@@ -84,7 +84,7 @@ def _replace(down, squares, new, old):
         squares[x] += value * value - gone * gone
 
 
-@compiled
+@inlined
 def _accumulate(along, values, left, right):
     """Write running sums along a row and what is beyond its edges; 0 comes first."""
     total, at = np.int32(0), 1

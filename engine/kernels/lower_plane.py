@@ -7,7 +7,7 @@ import numpy as np
 from engine.kernels.jit import compiled
 
 
-@compiled
+@compiled("(f8[:, ::1], f8[::1], f8, f8, i8)")
 def lower_plane(offsets, heights_m, share, on_plane_m, rounds):
     """The plane with a given share of the heights below it.
 

@@ -10,7 +10,7 @@ import numpy as np
 from engine.kernels.jit import compiled
 
 
-@compiled
+@compiled("(f8[:, ::1], f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1])")
 def polynomials(points, centre, half, coefficients, out):
     """Evaluate two polynomials of the plane.
 
@@ -39,7 +39,7 @@ def polynomials(points, centre, half, coefficients, out):
     return True
 
 
-@compiled
+@compiled("(f4[:, ::1], f8[:, ::1], f8[::1])")
 def bilinear_heights(grid, at, out):
     """Bilinear heights at places in pixels of their grid.
 
@@ -63,7 +63,7 @@ def bilinear_heights(grid, at, out):
         out[n] = top * (1.0 - v) + bottom * v
 
 
-@compiled
+@compiled("(Tuple((f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])), UniTuple(i8, 2), UniTuple(i8, 2), i8, i8)")
 def every_nth(arrays, first, last, columns, step):
     """Every so manieth sample of a part of a grid of samples.
 

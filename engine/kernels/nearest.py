@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 FORBIDDEN = -1e30
 """In place of the cosine of a pair that is not allowed."""
 
 
-@compiled
+@compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4, f4, i8, f4[::1], i8[::1], f4[::1], b1[::1])")
 def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, second, mutual):
     """For each query the largest cosine among the allowed pairs, its row, and the second largest, of rows so far.
 
@@ -46,7 +46,7 @@ def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, sec
             mutual[n] = larger == 0
 
 
-@compiled
+@inlined
 def _forbid_scales(row, logs, own, most):
     """Forbid pairs of other scales, and by a comparison with NaN those that are not valid."""
     forbidden = np.float32(FORBIDDEN)
@@ -54,7 +54,7 @@ def _forbid_scales(row, logs, own, most):
         row[m] = row[m] if abs(logs[m] - own) <= most else forbidden
 
 
-@compiled
+@inlined
 def _forbid_angles(row, cos, sin, own_cos, own_sin, least):
     forbidden = np.float32(FORBIDDEN)
     for m in range(row.size):

@@ -9,14 +9,14 @@ import math
 
 import numpy as np
 
-from engine.kernels.gauss_newton import mirror, rotation_of, rotation_vector, small_product, solve
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
+from engine.kernels.small_matrices import mirror, solve, turn, turn_between
 
 _SIX = 6
 _FAR_PX = 1e9  # assigned coordinates of points behind the camera
 
 
-@compiled
+@compiled("(f8[::1, :], f8[::1, :], f8[:, ::1], f8[:, ::1], f8[::1])")
 def reproject(points, pixels, matrix, rotation, center):
     """Reproject all matches.
 
@@ -51,7 +51,10 @@ def reproject(points, pixels, matrix, rotation, center):
     return tangents, projected, squared
 
 
-@compiled
+@compiled(
+    "(f8[::1, :], f8[::1, :], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, i8, f8[:, ::1], f8[::1], i8, "
+    "f8, f8, f8)"
+)
 def fit_pose(
     points, pixels, matrix, weights, attitude, precision, tolerance_px, noise_floor_px, least,
     rotation, center, steps, slack, reach_sigmas, step_sigmas,
@@ -82,46 +85,54 @@ def fit_pose(
     square = tolerance_px * tolerance_px
     reach = slack * slack * square
     variance, freedom, found = reach / 9.0, np.inf, True
+    rotation, center, before = rotation.copy(), center.copy(), rotation.copy()
+    delta, angles, covariance = np.empty(_SIX), np.empty(3), np.empty((_SIX, _SIX))
+    inliers, information = np.empty(weights.size, np.bool_), np.zeros((_SIX, _SIX))
     tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
-    inliers, information = squared <= reach, np.zeros((_SIX, _SIX))
+    count = _mark_within(squared, reach, inliers)
     while True:
-        count = np.count_nonzero(inliers)
         found = count >= least
         if not found:
             break
         gain, noise = biweight_factors(0.5 * reach / variance)
         scale = noise * student(freedom) * variance
         normal, gradient = normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, scale)
-        covariance = np.zeros((_SIX, _SIX))
         found = _invert(normal, precision, covariance)
         if not found:
             break
-        turn = rotation_vector(small_product(rotation, np.ascontiguousarray(attitude.T)))
+        turn_between(rotation, attitude, angles)
         for i in range(3):
             for j in range(3):
-                gradient[3 + i] -= precision[i, j] * turn[j]
-        delta = np.zeros(_SIX)
+                gradient[3 + i] -= precision[i, j] * angles[j]
+        size = determined = 0.0
         for i in range(_SIX):
+            delta[i] = 0.0
             for j in range(_SIX):
                 delta[i] += covariance[i, j] * gradient[j]
-        center = center + _turned_back(rotation, delta)
-        rotation = small_product(rotation_of(delta[3:]), rotation)
+                determined += covariance[i, j] * normal[i, j]
+                information[i, j] = gain * normal[i, j]
+            size += delta[i] * gradient[i]
+        for i in range(3):
+            for j in range(3):
+                center[i] += rotation[j, i] * delta[j]
+                before[i, j] = rotation[i, j]
+        turn(before, delta[3:], rotation)
         tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
         # The trace is the number of parameters that the matches determine; the prior determines the rest.
-        freedom = 2.0 * count - np.sum(covariance * normal)
-        mean = 0.0
+        freedom, mean = 2.0 * count - determined, 0.0
         for n in range(weights.size):
             if inliers[n]:
                 mean += weights[n] * squared[n]
         variance = variance_px2(mean / freedom, tolerance_px, noise_floor_px)
-        inliers, reach, information = squared <= square, max(square, reach_sigmas**2 * variance), gain * normal
+        count = _mark_within(squared, square, inliers)
+        reach = max(square, reach_sigmas**2 * variance)
         steps -= 1
-        if np.sum(delta * gradient) < step_sigmas**2 or steps == 0:
+        if size < step_sigmas**2 or steps == 0:
             break
     return found, rotation, center, tangents, projected, squared, inliers, information, variance
 
 
-@compiled
+@compiled()
 def normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, variance):
     """J^T W J (6, 6) and -J^T W r (6,), W over the variance, for a step of the centre and of the rotation.
 
@@ -150,31 +161,33 @@ def normal_equations(tangents, projected, squared, pixels, matrix, weights, reac
     return normal, gradient
 
 
-@compiled
-def _turned_back(rotation, delta):
-    """The step of the centre, from the camera's axes to the map's."""
-    out = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            out[i] += rotation[j, i] * delta[j]
-    return out
+@inlined
+def _mark_within(squared, reach, inliers):
+    """Mark the matches of which the squared distance is within a reach; returns how many they are."""
+    count = 0
+    for n in range(squared.size):
+        inliers[n] = squared[n] <= reach
+        count += inliers[n]
+    return count
 
 
-@compiled
+@inlined
 def _invert(information, precision, out):
     """Write the inverse of what the matches and the known attitude say; False where that is not definite."""
+    total, right = np.empty((_SIX, _SIX)), np.empty(_SIX)
     for column in range(_SIX):
-        total, right = information.copy(), np.zeros(_SIX)
-        for i in range(3):
-            for j in range(3):
-                total[3 + i, 3 + j] += precision[i, j]
-        right[column] = 1.0
+        for i in range(_SIX):
+            right[i] = 1.0 if i == column else 0.0
+            for j in range(_SIX):
+                total[i, j] = information[i, j]
+                if i >= 3 and j >= 3:
+                    total[i, j] += precision[i - 3, j - 3]
         if not solve(total, right, out[column]):
             return False
     return True
 
 
-@compiled
+@compiled()
 def biweight_factors(u):
     """The efficiency factors of the biweight w = (1 - r^2 / T^2)^2 for normal noise s, u = T^2 / (2 s^2).
 
@@ -196,7 +209,7 @@ def biweight_factors(u):
     return sensitivity / weight, noise / sensitivity
 
 
-@compiled
+@compiled("(f8, f8, f8)")
 def variance_px2(mean, tolerance_px, noise_floor_px):
     """The variance s^2 at which distances r, truncated at T, have this mean square per axis.
 
@@ -211,7 +224,7 @@ def variance_px2(mean, tolerance_px, noise_floor_px):
     return variance
 
 
-@compiled
+@compiled()
 def student(freedom):
     """The variance of Student's t over a normal's, since the variance is itself estimated."""
     return 1.0 if np.isinf(freedom) else freedom / max(freedom - 2.0, 1.0)

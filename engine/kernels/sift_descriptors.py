@@ -11,13 +11,13 @@ import math
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 _BOUND = 0.2  # of an entry before the last normalisation
 _LEAST = 1e-24  # which keeps an empty descriptor zero
 
 
-@compiled
+@inlined
 def _sample(buffer, layout, x, y, cos, sin, patch):
     """Fill a square patch with bilinear samples on a grid rotated and scaled by (cos, sin), edges extended."""
     height, width, base, per_row = layout
@@ -40,7 +40,7 @@ def _sample(buffer, layout, x, y, cos, sin, patch):
             patch[row, column] = upper + fy * (lower - upper)
 
 
-@compiled
+@inlined
 def _sample_upright(buffer, layout, x, y, spacing, line, patch):
     """The same on a grid that is not rotated, whose columns and rows are found once each: half the time."""
     height, width, base, per_row = layout
@@ -65,13 +65,13 @@ def _sample_upright(buffer, layout, x, y, spacing, line, patch):
             patch[row, column] = upper + fy * (lower - upper)
 
 
-@compiled
+@inlined
 def _layout(table, octave, level):
     height, width, offset, per_level, per_row = table[octave]
     return height, width, offset + level * per_level, per_row
 
 
-@compiled
+@inlined
 def _turn(x, y):
     """Direction of a vector in turns, [0, 1], to 2e-6: Abramowitz and Stegun 4.4.49, without a branch."""
     ax, ay = abs(x), abs(y)
@@ -85,7 +85,7 @@ def _turn(x, y):
     return np.float32(1) - turn if y < 0 else turn
 
 
-@compiled
+@compiled("(f4[::1], i8[:, ::1], f4[:, ::1], f4, f4[:, ::1], f4[:, ::1])")
 def angles(buffer, table, keypoints, step, window, smooth):
     """Direction of the highest peak in the histogram of gradient directions.
 
@@ -123,7 +123,7 @@ def angles(buffer, table, keypoints, step, window, smooth):
     return out
 
 
-@compiled
+@inlined
 def _highest_bin(raw, smooth, histogram):
     """Position of the peak of a histogram once smoothed, in bins, by a parabola through its neighbours."""
     bins, best = len(smooth), 0
@@ -138,7 +138,7 @@ def _highest_bin(raw, smooth, histogram):
     return best + 0.5 * (left - right) / min(left - 2 * top + right, -1e-12)
 
 
-@compiled
+@compiled("(f4[::1], i8[:, ::1], f4[:, ::1], f4[::1], f4, f4[:, ::1], b1)")
 def descriptors(buffer, table, keypoints, angle, step, tent, root):
     """Lowe's cells of 8 orientations, of unit L2 norm.
 
@@ -182,7 +182,7 @@ def descriptors(buffer, table, keypoints, angle, step, tent, root):
     return out
 
 
-@compiled
+@inlined
 def _normalise(values, root):
     """Unit L2 norm with entries bounded before (Lowe), and then the roots of shares for RootSIFT."""
     bound, total = np.float32(_BOUND), np.float32(_LEAST)
@@ -200,7 +200,7 @@ def _normalise(values, root):
         values[k] = math.sqrt(values[k] * gain) if root else values[k] * gain
 
 
-@compiled
+@inlined
 def _orient_row(patch, row, p):
     """Split a row's gradients between 8 directions: w_k = max(0, min(p_(k-1), p_(k+1))), see engine.sift."""
     half, zero = np.float32(math.sqrt(0.5)), np.float32(0)
@@ -218,7 +218,7 @@ def _orient_row(patch, row, p):
         p[7, x] = max(zero, min(-gy, gx))
 
 
-@compiled
+@inlined
 def _pool(columns, tent, out):
     """Weight the samples of every row of cells along x, into (cells^2 * 8,)."""
     cells, side = tent.shape

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 TAPS = 4
 """Taps of a filter that one pass over a strip applies; filters are padded with zeros to a multiple of it."""
 _STRIP = 8  # rows of the octave that are written at a time; a multiple of a word of flags and of both phases
 
 
-@compiled
+@compiled(
+    "(f4[:, ::1], Tuple((f4[:, :, ::1], i8[::1], f4[:, :, ::1])), Tuple((f4[:, :, ::1], i8[::1], f4[:, :, ::1])), "
+    "f4[::1], UniTuple(i8, 5), UniTuple(i8, 2), i8, f4)"
+)
 def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
     """Write the Gaussian levels of one picture's octave, and find the extrema of their differences.
 
@@ -57,7 +60,7 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
     return found[:count]
 
 
-@compiled
+@inlined
 def _padding(reach):
     largest = reach[0]
     for level in range(1, reach.size):
@@ -65,7 +68,7 @@ def _padding(reach):
     return largest + TAPS
 
 
-@compiled
+@inlined
 def _between_zeros(source, reach, margin, low, high):
     """Rows that the filters of rows ``low`` to ``high`` read, flat, zeros beyond the picture and in a margin."""
     height, width = source.shape
@@ -79,13 +82,13 @@ def _between_zeros(source, reach, margin, low, high):
     return tall
 
 
-@compiled
+@inlined
 def _taps(reach, up):
     """Taps of a filter with its padding; of two phases the second is one sample further on."""
     return (2 * reach + up + TAPS - 1) // TAPS * TAPS
 
 
-@compiled
+@inlined
 def _filter_down(lines, size, tall, at, wide, level, down):
     """Filter the columns about a strip of the source that begins at ``at``: its rows once for each phase."""
     weights, reach, _ = down
@@ -98,20 +101,20 @@ def _filter_down(lines, size, tall, at, wide, level, down):
         )
 
 
-@compiled
+@inlined
 def _filter_across(buffer, lines, size, filtered, wide, strip, level, across, down, layout):
     """Filter a strip along its rows, and write it with the gains that make up for the edges."""
     height, width, offset, per_level, per_row = layout
     weights, reach, gains = across
     up = len(lines)
     start, taps = _padding(reach) - reach[level], _taps(reach[level], up)
-    size -= 2 * _padding(reach)  # the last row's margin is only read
+    size, along = size - 2 * _padding(reach), np.int64(1)  # the last row's margin is only read
     for phase in range(up):
         if up == 1:
-            _slide(filtered[0, :size], lines[0], start, 1, weights[level, 0], taps)
+            _slide(filtered[0, :size], lines[0], start, along, weights[level, 0], taps)
         else:
             even, odd = weights[level, 0], weights[level, 1]
-            _slide_both(filtered[0, :size], filtered[1, :size], lines[phase], start, 1, even, odd, taps)
+            _slide_both(filtered[0, :size], filtered[1, :size], lines[phase], start, along, even, odd, taps)
         for y in range(strip[0] + phase, strip[1], up):
             at, begin = offset + level * per_level + y * per_row, (y - strip[0]) // up * wide
             out = buffer[at : at + width]
@@ -119,7 +122,7 @@ def _filter_across(buffer, lines, size, filtered, wide, strip, level, across, do
             _apply_gains(out, gains[:, level], _gain_of(down[2], level, y, height))
 
 
-@compiled
+@inlined
 def _interleave(out, filtered, begin, up):
     if up == 1:
         row = filtered[0, begin : begin + out.size]
@@ -134,7 +137,7 @@ def _interleave(out, filtered, begin, up):
         out[out.size - 1] = even[out.size // 2]
 
 
-@compiled
+@inlined
 def _apply_gains(out, gains, gain):
     """Apply the gains of the first and of the last columns, and that of the row."""
     edge, width = gains.shape[1], out.size
@@ -147,7 +150,7 @@ def _apply_gains(out, gains, gain):
             out[x] *= gain
 
 
-@compiled
+@inlined
 def _gain_of(gains, level, y, height):
     """The gain of one output along an axis, of the first and the last of which they are kept."""
     edge = gains.shape[2]
@@ -156,7 +159,7 @@ def _gain_of(gains, level, y, height):
     return gains[1, level, y - height + edge] if y >= height - edge else np.float32(1)
 
 
-@compiled
+@compiled()
 def _slide(out, values, start, stride, weights, taps):
     """out[m] = sum over k of weights[k] values[start + k stride + m]."""
     n = out.size
@@ -175,7 +178,7 @@ def _slide(out, values, start, stride, weights, taps):
                 out[m] += a * p[m] + b * q[m] + (c * r[m] + d * s[m])
 
 
-@compiled
+@compiled()
 def _slide_both(first, second, values, start, stride, even, odd, taps):
     """:func:`_slide` with two filters at once, so that the values are read once."""
     n = first.size
@@ -197,7 +200,7 @@ def _slide_both(first, second, values, start, stride, even, odd, taps):
                 second[m] += e * p[m] + f * q[m] + (g * r[m] + h * s[m])
 
 
-@compiled
+@inlined
 def _differ(sizes, buffer, strip, layout):
     """Append |DoG| of a strip to that of the two rows before it."""
     _, width, offset, per_level, per_row = layout
@@ -213,7 +216,7 @@ def _differ(sizes, buffer, strip, layout):
                 row[x] = abs(coarser[x] - finer[x])
 
 
-@compiled
+@inlined
 def _extrema_of_strip(sizes, width, strip, searched, border, threshold, work, found, count):
     """Append to ``found`` the extrema of all rows but the last of a strip, and of the last before it."""
     highest, flags = work

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 _COLUMNS = 6  # x, y, growth, contrast, level, octave of a refined keypoint
 
 
-@compiled
+@compiled("(f4[::1], UniTuple(i8, 5), i8[:, ::1], Tuple((i8, i8, f8, f8, f8)), i8)")
 def refine_extrema(buffer, layout, voxels, limits, octave):
     """Fit a quadratic at voxels, move where the extremum is in a neighbour, drop low contrast and edges.
 
@@ -53,7 +53,7 @@ def refine_extrema(buffer, layout, voxels, limits, octave):
     return kept[:count]
 
 
-@compiled
+@inlined
 def _derivatives(buffer, at, per_level, per_row):
     """The DoG at a voxel, its gradient (x, y, s) and its second derivatives (xx, yy, ss, xy, xs, ys)."""
     d = _dog(buffer, at, per_level)
@@ -68,7 +68,7 @@ def _derivatives(buffer, at, per_level, per_row):
     return d, gradient, (xx, yy, ss, xy, xs, ys)
 
 
-@compiled
+@inlined
 def _extremum(gradient, hessian):
     """The shift -H^-1 g to the extremum of the quadratic, by the adjugate."""
     gx, gy, gs = gradient
@@ -83,18 +83,18 @@ def _extremum(gradient, hessian):
     return dx, dy, ds
 
 
-@compiled
+@inlined
 def _dog(buffer, at, per_level):
     return buffer[at + per_level] - buffer[at]
 
 
-@compiled
+@inlined
 def _cross(buffer, at, i, j, per_level):
     """Mixed second difference of the DoG along the strides i and j."""
     same = _dog(buffer, at + i + j, per_level) + _dog(buffer, at - i - j, per_level)
     return (same - _dog(buffer, at + i - j, per_level) - _dog(buffer, at - i + j, per_level)) / 4
 
 
-@compiled
+@inlined
 def _step(shift):
     return 1 if shift > 0.5 else (-1 if shift < -0.5 else 0)

@@ -7,7 +7,7 @@ import numpy as np
 from engine.kernels.jit import compiled
 
 
-@compiled
+@compiled("(i8[::1], i8, f8, i8)")
 def spread_out(cells, count, share, most):
     """Choose among keypoints by falling strength: those beyond their cell's share come after all others.
 

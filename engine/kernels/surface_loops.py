@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.kernels.jit import compiled, inlined
 
 # A patch is flat where its sum of squares is below this share of the window's, which is rounding.
 _FLAT_SHARE = 1e-12
@@ -17,7 +17,7 @@ _FLAT_SHARE = 1e-12
 _FLAT_TEMPLATE = 1e-24
 
 
-@compiled
+@compiled("(f4[:, ::1], b1)")
 def moments(picture, zero_mean):
     """Mean and sum of squares.
 
@@ -42,7 +42,7 @@ def moments(picture, zero_mean):
     return start + total / picture.size, 0.0 if spread < 0.0 else spread
 
 
-@compiled
+@compiled("(f4[:, ::1], b1)")
 def unit(template, zero_mean):
     """A template (h, w) float32 scaled to a norm of 1, zeros where flat, and its sum of squares."""
     mean, energy = moments(template, zero_mean)
@@ -54,7 +54,7 @@ def unit(template, zero_mean):
     return model, energy
 
 
-@compiled
+@compiled("(f4[:, ::1], f8, f8, i8, i8, b1)")
 def inverse_norms(window, mean, energy, h, w, zero_mean):
     """Reciprocal norm of every patch.
 
@@ -88,7 +88,7 @@ def inverse_norms(window, mean, energy, h, w, zero_mean):
     return out
 
 
-@compiled
+@compiled("(f4[:, ::1], i8, i8)")
 def box_sums(picture, h, w):
     """Sums of the pixels of every patch, and of their squares.
 
@@ -113,7 +113,7 @@ def box_sums(picture, h, w):
     return out
 
 
-@compiled
+@inlined
 def _sum_rows(down, down_squares, picture, y, h, mean):
     """Sums over h rows of every column, the first of them y, from those of y - 1; both are 0 before y = 0."""
     if y > 0:
@@ -123,7 +123,7 @@ def _sum_rows(down, down_squares, picture, y, h, mean):
         _add(down, down_squares, picture[first], mean)
 
 
-@compiled
+@inlined
 def _sum_along(along, along_squares, down, down_squares):
     """Running sums along a row, from 0."""
     total, square = 0.0, 0.0
@@ -133,7 +133,7 @@ def _sum_along(along, along_squares, down, down_squares):
         along[x + 1], along_squares[x + 1] = total, square
 
 
-@compiled
+@inlined
 def _units(energy):
     """Reciprocals of a window's energy and norm: patches are counted in these, for float32 to hold them."""
     if energy <= 0.0:
@@ -141,7 +141,7 @@ def _units(energy):
     return 1.0 / energy, np.float32(1.0 / math.sqrt(energy))
 
 
-@compiled
+@inlined
 def _add(down, down_squares, row, mean):
     for x in range(len(row)):
         value = row[x] - mean
@@ -149,7 +149,7 @@ def _add(down, down_squares, row, mean):
         down_squares[x] += value * value
 
 
-@compiled
+@inlined
 def _slide(down, down_squares, after, before, mean):
     """Add one row and take another away."""
     for x in range(len(after)):
@@ -158,7 +158,7 @@ def _slide(down, down_squares, after, before, mean):
         down_squares[x] += (new - old) * (new + old)
 
 
-@compiled
+@compiled("(f4[:, ::1], f4[:, ::1], f8)")
 def centre(out, picture, mean):
     """Write a picture less a mean to the top left of ``out``, zeros elsewhere; returns its sum of squares."""
     (height, width), energy = picture.shape, 0.0
@@ -173,7 +173,7 @@ def centre(out, picture, mean):
     return energy
 
 
-@compiled
+@compiled("(f4[:, :, ::1], f4[:, ::1], f8, f8, f4[:, ::1])")
 def pack(out, window, mean, scale, model):
     """Write a window less its mean, scaled, and a template as real and imaginary part, zeros where they end.
 
@@ -197,7 +197,7 @@ def pack(out, window, mean, scale, model):
                 to[x, 1] = values[x]
 
 
-@compiled
+@compiled("(f4[:, :, ::1], f4[:, ::1], f4[:, ::1], b1)")
 def packed_pair(out, window, template, zero_mean):
     """All that one template in one window needs before the transform, at once: on small windows calls cost most.
 
@@ -218,7 +218,7 @@ def packed_pair(out, window, template, zero_mean):
     return (mean, energy), squares, model, norms, largest
 
 
-@compiled
+@compiled("(f4[:, ::1], f4[:, :, ::1])")
 def packed_product(out, packed):
     """Spectrum of the correlation of two real pictures that were transformed as one complex picture.
 
@@ -246,7 +246,7 @@ def packed_product(out, packed):
                 column[2 * y] = imaginary
 
 
-@compiled
+@inlined
 def _product(a, b, c, d):
     """One spectrum times the conjugate of the other, from a + ib and c + id at opposite frequencies."""
     quarter = np.float32(0.25)
@@ -254,7 +254,7 @@ def _product(a, b, c, d):
     return (real * along - imaginary * across) * quarter, (real * across + imaginary * along) * quarter
 
 
-@compiled
+@compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4)")
 def normalise(out, products, inverse, factor):
     """Write ``products * inverse * factor`` to ``out``, in [-1, 1]; all float32, products of at least its size."""
     for y in range(out.shape[0]):
@@ -264,7 +264,9 @@ def normalise(out, products, inverse, factor):
             to[x] = min(max(score, np.float32(-1.0)), np.float32(1.0))
 
 
-@compiled
+@compiled(
+    "(f4[:, ::1], b1[:, ::1], f8[:, :, ::1], Tuple((f8[:, :, ::1], i4[:, ::1])), UniTuple(i8, 2), UniTuple(f8, 2))"
+)
 def masked_scores(out, asked, sums, boxes, model, floors):
     """Write the scores of a template that is whole at the places of a block that are asked for.
 
@@ -296,6 +298,6 @@ def masked_scores(out, asked, sums, boxes, model, floors):
             out[y, x] = min(max(score, -1.0), 1.0)
 
 
-@compiled
+@inlined
 def _box(sums, y, x, h, w):
     return sums[y + h, x + w] - sums[y, x + w] - sums[y + h, x] + sums[y, x]

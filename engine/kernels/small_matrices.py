@@ -1,0 +1,108 @@
+"""Rotations and linear equations of a few unknowns for the compiled pose fits.
+
+Scalars and loops only: an expression of whole arrays takes numba longer to compile than all of these together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from engine.kernels.jit import compiled, inlined
+
+
+@compiled()
+def mirror(matrix):
+    """Complete a symmetric matrix (N, N) of which the lower triangle is known, in place."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
+
+
+@compiled()
+def solve(matrix, right, out):
+    """Solve by Cholesky's decomposition, which overwrites the matrix; False where it is not positive definite."""
+    size = right.size
+    for i in range(size):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if not value > 0.0:
+                    return False
+                matrix[i, i] = np.sqrt(value)
+            else:
+                matrix[i, j] = value / matrix[j, j]
+    for i in range(size):
+        value = right[i]
+        for k in range(i):
+            value -= matrix[i, k] * out[k]
+        out[i] = value / matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        value = out[i]
+        for k in range(i + 1, size):
+            value -= matrix[k, i] * out[k]
+        out[i] = value / matrix[i, i]
+    return True
+
+
+@compiled()
+def turn(rotation, vector, out):
+    """Write exp([vector]) rotation to ``out``, all (3, 3), by Rodrigues' formula."""
+    x, y, z = vector[0], vector[1], vector[2]
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    sine = 1.0 - square / 6.0 if angle < 1e-4 else np.sin(angle) / angle
+    cosine = 0.5 if angle < 1e-4 else (1.0 - np.cos(angle)) / square
+    for j in range(3):
+        a, b, c = rotation[0, j], rotation[1, j], rotation[2, j]
+        along = cosine * (x * a + y * b + z * c)
+        rest = 1.0 - cosine * square
+        out[0, j] = rest * a + x * along + sine * (y * c - z * b)
+        out[1, j] = rest * b + y * along + sine * (z * a - x * c)
+        out[2, j] = rest * c + z * along + sine * (x * b - y * a)
+
+
+@compiled()
+def turn_between(rotation, other, out):
+    """Write the rotation vector (3,) of rotation other^T, which turns the other rotation into this one."""
+    trace = 0.0
+    for i in range(3):
+        for k in range(3):
+            trace += rotation[i, k] * other[i, k]
+    square = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = 0.5 * (_entry(rotation, other, k, j) - _entry(rotation, other, j, k))
+        square += out[i] * out[i]
+    size, cosine = np.sqrt(square), 0.5 * (trace - 1.0)
+    angle = np.arctan2(size, cosine)
+    if cosine > -0.9:
+        for i in range(3):
+            out[i] *= 1.0 if size < 1e-9 else angle / size
+        return
+    # Towards half a turn the sine vanishes: the axis is that of the symmetric part, 1 - cosine times a a^T.
+    first = 0
+    for i in range(1, 3):
+        if _entry(rotation, other, i, i) > _entry(rotation, other, first, first):
+            first = i
+    scale = 1.0 - cosine
+    largest = np.sqrt(max((_entry(rotation, other, first, first) - cosine) / scale, 0.0))
+    along, sine_at_first = 0.0, out[first]
+    for i in range(3):
+        axis = largest
+        if i != first:
+            axis = (_entry(rotation, other, first, i) + _entry(rotation, other, i, first)) / (
+                2.0 * scale * largest
+            )
+            along += axis * out[i]
+        out[i] = axis
+    along += largest * sine_at_first
+    for i in range(3):
+        out[i] *= -angle if along < 0.0 else angle
+
+
+@inlined
+def _entry(rotation, other, i, j):
+    """An entry of rotation other^T."""
+    return rotation[i, 0] * other[j, 0] + rotation[i, 1] * other[j, 1] + rotation[i, 2] * other[j, 2]
