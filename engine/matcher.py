@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,14 +18,13 @@ from engine.align import to_gray
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
 from engine.errors import EngineError, OptionError
-from engine.kernels import loops_compiled
+from engine.kernels import loops_compiled, prepare_loops
 from engine.methods import method_type
-from engine.methods.costs import Costs
 from engine.methods.explanation import Explanation
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions
 from engine.methods.query import Query
-from engine.methods.scheduler import OutOfTime, Scheduler
+from engine.methods.scheduler import Costs, OutOfTime, Scheduler
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
@@ -95,24 +94,25 @@ class SceneMatcher:
         # What an undistorted picture obeys; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 
-    def warmup(self) -> None:
-        """Do before take-off what is done once: find the map's features, compile, plan, and learn what steps cost.
+    def warmup(self, report: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Do before take-off what is done once: compile, find the map's features, plan, and learn what steps cost.
 
         Features are found on every level of at most :data:`engine.indexes.landmarks.PREPARED_PX` pixels; those of
         a map that comes from a file are kept for the next start. The frames that are matched are the map's own.
+
+        Args:
+            report: takes how many of how many loops are compiled, or loaded from the cache of an earlier start.
         """
+        prepare_loops(self._method.loops, report)
         self._method.prepare()
-        # What compiles and plans in the first pass is no cost of a flight's.
-        for rounds in (1, self._method.warmup_rounds):
-            self._costs = Costs()
-            for share in _WARMUP_SHARES:
-                frame, prior = self._synthetic_frame(share)
-                for _ in range(rounds):
-                    self.locate(frame, prior)
-                    self._method.warmup(self._query(frame, prior, Deadline(Budget())))
-                if rounds > 1 or share == _WARMUP_SHARES[-1]:  # one search compiles what all need
-                    self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
-            if self.site.is_searchable:
+        for share in _WARMUP_SHARES:
+            frame, prior = self._synthetic_frame(share)
+            for _ in range(self._method.warmup_rounds):
+                self.locate(frame, prior)
+                self._method.warmup(self._query(frame, prior, Deadline(Budget())))
+            self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
+        if self.site.is_searchable:
+            for _ in range(2):  # a step that ran once would be begun whatever it took
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
         _give_back_memory()
         self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # takes again what a frame needs of it
@@ -152,7 +152,14 @@ class SceneMatcher:
         Raises:
             CalibrationError: the frame is not of the camera's resolution.
         """
-        deadline = Deadline(budget or Budget(), searches=prior is None or frame.is_doubted)
+        compiled = loops_compiled()
+        result = self._located(frame, prior, budget or Budget())
+        if isinstance(result, NoFix) and result.reason is Reason.LATE and loops_compiled() != compiled:
+            return replace(result, detail=f"{result.detail}; compiling: call warmup() before take-off")
+        return result
+
+    def _located(self, frame: Frame, prior: Prior | None, budget: Budget) -> Fix | NoFix:
+        deadline = Deadline(budget, searches=prior is None or frame.is_doubted)
         query = self._query(frame, prior, deadline)
         if query.prior_px is not None and not np.isfinite(query.prior_px).all():
             return query.refuse_outside(self.method)  # nowhere in the map's coordinate system
@@ -166,7 +173,7 @@ class SceneMatcher:
         if isinstance(result, Fix) and not deadline.met:
             detail = "the answer came after the budget"
             return query.refuse(Reason.LATE, detail, result.method, window=result.window)
-        return replace(result, timings=query.scheduler.timings)
+        return replace(result, timings=query.timings)
 
     def locate_many(
         self,

@@ -26,7 +26,7 @@ from engine import (
     SiftOptions,
 )
 from engine import workers as processes
-from engine.methods.costs import Costs
+from engine.methods.scheduler import Costs
 
 METHODS = ("ncc", "sift", "auto")
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
@@ -105,11 +105,11 @@ def test_threads_learn_one_cost():
 
     def learn(_):
         for work in range(1, 200):
-            costs.learn("step", float(work), 2.0 * work)
+            costs.learn("step", float(work), 2.0 * work, 2.0 * work)
 
     with ThreadPoolExecutor(4) as threads:
         list(threads.map(learn, range(8)))
-    assert costs.upper_bound_ms("step", 100.0) == pytest.approx(200.0, rel=1e-6)
+    assert costs.needed_ms("step", 100.0) == pytest.approx(200.0, rel=1e-6)
 
 
 def test_no_frames_have_no_answers(matchers):

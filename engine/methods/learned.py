@@ -57,8 +57,8 @@ class Learned(Method):
         works = {share: query.gray.size * self._scale(query, share) ** 2 for share in _REDUCED}
         share = query.scheduler.first_affordable(METHOD, works)
         if share is None:
-            return query.refuse_late(METHOD, METHOD)
-        with query.scheduler.costed(METHOD, works[share]):
+            return query.refuse_late(METHOD, (METHOD, _REDUCED[-1]))
+        with query.scheduler.costed((METHOD, share), works[share]):
             matcher = self._feature_matcher(query, share)
             found = matcher.find()
         result = found if isinstance(found, NoFix) else matcher.judge(found)

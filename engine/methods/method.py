@@ -34,6 +34,9 @@ class Method(ABC):
     warmup_rounds: ClassVar[int] = 3
     """How often each frame of the warm-up is matched to learn what the steps cost."""
 
+    loops: ClassVar[tuple[str, ...]] = ()
+    """Modules of :mod:`engine.kernels` whose compiled loops it calls."""
+
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""

@@ -27,7 +27,7 @@ from engine.methods.peak_evidence import (
     with_confidence,
 )
 from engine.methods.query import Query
-from engine.methods.refinement import Refinement, with_unconfirmed_tilt
+from engine.methods.refinement import Refinement, improved, with_unconfirmed_tilt
 from engine.methods.scheduler import OutOfTime
 from engine.methods.second_look import can_look_coarsely, candidate_of, hopeful_look, second_look
 from engine.orthomap import OrthoMap
@@ -44,6 +44,18 @@ _MIN_CONFIDENCE_TURNED = 0.9995
 _MIN_CONFIDENCE_COARSE = 0.999  # of a peak of the coarsest level, from which refinement begins
 
 
+LOOPS = (
+    "map_points",
+    "gauss_newton",
+    "surface_loops",
+    "local_normalisation",
+    "lattice",
+    "lower_plane",
+    "dense_loops",
+)
+"""Compiled loops of aligning, correlating and refining, see :attr:`Method.loops`."""
+
+
 class Ncc(Method):
     """Normalised cross-correlation; needs height and heading, or the time to search for the heading.
 
@@ -52,6 +64,8 @@ class Ncc(Method):
         device: where pictures are correlated.
         options: settings; ``options.ncc`` counts.
     """
+
+    loops = LOOPS
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.options = options.ncc
@@ -100,7 +114,7 @@ class Ncc(Method):
         is_certain = (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
         try:
             with scheduler.with_fix():
-                if is_certain and scheduler.can_afford(_AT_ONCE, work_px):
+                if is_certain and scheduler.can_afford({_AT_ONCE: work_px}):
                     with scheduler.costed(_AT_ONCE, work_px):
                         refined = Refinement(query, self.samples, self.options).refine_at_once(coarse)
                     if refined is not None:
@@ -132,9 +146,9 @@ class Ncc(Method):
         is_wide = query.site.is_large and works[coarser] > MAX_WINDOW_PX
         if not (coarser and query.telemetry.has_tilt and query.site.has_surface) or is_wide:
             return None
-        if not scheduler.can_afford_all({step: works[coarser], _AT_ONCE: float(query.gray.size)}):
-            if scheduler.can_afford(step, works[coarser]):
-                scheduler.note_refusal(_AT_ONCE)
+        if not scheduler.can_afford({(step, coarser): works[coarser], _AT_ONCE: float(query.gray.size)}):
+            if scheduler.can_afford({(step, coarser): works[coarser]}):
+                scheduler.costs.note_refusal(_AT_ONCE)
             return None
         _, result = self._find_and_judge(query, step, works, coarser)
         return None if isinstance(result, NoFix) else replace(result, stage="coarse")
@@ -159,10 +173,10 @@ class Ncc(Method):
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
         if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
-            query.scheduler.note_refusal(step)
+            query.scheduler.costs.note_refusal((step, max(works)))
             return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
-            return query.refuse_late(METHOD, step)
+            return query.refuse_late(METHOD, (step, max(works)))
         found, result = self._find_and_judge(query, step, works, coarser)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             with suppress(OutOfTime):  # the refusal that there is stands
@@ -179,7 +193,7 @@ class Ncc(Method):
         self, query: Query, step: str, works: dict[int, float], coarser: int
     ) -> tuple[PeakCandidate | NoFix, Result]:
         """The highest peak on a level, and what becomes of it; a variant of a step, whose cost is learned."""
-        with query.scheduler.costed(step, works[coarser]):
+        with query.scheduler.costed((step, coarser), works[coarser]):
             found = self.find(query, coarser=coarser)
             return found, found if isinstance(found, NoFix) else self.judge(query, found)
 
@@ -202,7 +216,7 @@ class Ncc(Method):
             frame = replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
             query = replace(query, frame=frame)
         refinement = Refinement(query, self.samples, self.options)
-        return query.scheduler.improved(result, "refinement", float(query.gray.size), refinement.refine)
+        return improved(query, result, "refinement", refinement.refine)
 
     def _can_refine(self, query: Query) -> bool:
         """Whether poses are refined: a height that was searched for is not the frame's."""
@@ -289,14 +303,14 @@ class Ncc(Method):
         rule = replace(self.options.rule, min_confidence=_MIN_CONFIDENCE_TURNED)
         best: Fix | None = None
         for turn_deg in _TURNS_DEG:
-            if not query.scheduler.can_afford("ncc", work):
+            if not query.scheduler.can_afford({("ncc", coarser): work}):
                 break
             assert query.frame.heading_deg is not None  # the first look had one
             heading_deg = wrap_heading_deg(query.frame.heading_deg + turn_deg)
             turned = replace(
                 query, frame=replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
             )
-            with query.scheduler.costed("ncc", work):
+            with query.scheduler.costed(("ncc", coarser), work):
                 found = self.find(turned, coarser=coarser, min_confidence=_MIN_CONFIDENCE_TURNED)
             if isinstance(found, NoFix) or judge_peak(
                 found.peak, found.aligned.template.size, found.features, found.fix.confidence, rule
@@ -336,14 +350,14 @@ class Ncc(Method):
         window = window or found.fix.window
         correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)
         if can_look_coarsely(correlator, found.aligned, window):
-            if not scheduler.can_afford(_HOPEFUL_LOOK, work_px):
+            if not scheduler.can_afford({_HOPEFUL_LOOK: work_px}):
                 return None
             with scheduler.costed(_HOPEFUL_LOOK, work_px), scheduler.stage("second look"):
                 hopeful = hopeful_look(correlator, found.aligned, window)
             best = None if hopeful is None else candidate_of(correlator, found, hopeful)
             if best is not None and is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
                 return best
-        if not scheduler.can_afford(_SECOND_LOOK, work_px):
+        if not scheduler.can_afford({_SECOND_LOOK: work_px}):
             return None
         with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
             looked = second_look(correlator, found.aligned, window)

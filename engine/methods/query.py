@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -17,7 +18,7 @@ from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transp
 from engine.methods.scheduler import Scheduler
 from engine.orthomap import OrthoMap
 from engine.pose import AttitudePrior
-from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, Window
+from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, Timings, Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
@@ -231,7 +232,7 @@ class Query:
             score=score,
             method=method,
             window=window,
-            timings=self.scheduler.timings,
+            timings=self.timings,
             map_xy_px=(float(nadir_px[0]), float(nadir_px[1])),
             map_sigma_m=map_sigma_m,
             attitude_covariance_deg2=angles_deg2,
@@ -243,6 +244,11 @@ class Query:
         turn_deg = self.site.frame.convergence_deg(lat_deg, lon_deg)
         heading_deg = wrap_heading_deg(grid_attitude.heading_deg - turn_deg)
         return Attitude(grid_attitude.roll_deg, grid_attitude.pitch_deg, heading_deg)
+
+    @property
+    def timings(self) -> Timings:
+        """What was measured so far."""
+        return Timings(dict(self.scheduler.stages_ms))
 
     def refuse(
         self,
@@ -261,7 +267,7 @@ class Query:
             method=method,
             score=score,
             window=window,
-            timings=self.scheduler.timings,
+            timings=self.timings,
         )
 
     def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
@@ -281,9 +287,9 @@ class Query:
         """The refusal of a frame whose window has nothing in common with the map."""
         return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
 
-    def refuse_late(self, method: str, step: str) -> NoFix:
+    def refuse_late(self, method: str, step: Hashable) -> NoFix:
         """The refusal of a frame for whose quickest variant of a step there is no time, see :class:`Scheduler`."""
-        self.scheduler.note_late(step)
+        self.scheduler.costs.note_refusal(step)
         left_ms = self.scheduler.deadline.remaining_ms
         detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
         return self.refuse(Reason.LATE, detail, method)

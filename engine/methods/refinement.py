@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +27,7 @@ from engine.scores import enhance
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
+_T = TypeVar("_T")
 
 # Refinement that does not succeed at once on the frame's own level begins so many levels above it: one where the
 # tilt is known; two where it is not, or that failed as well.
@@ -47,6 +51,18 @@ _UNCONFIRMED_TILT_DEG = 1.5
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # of a coarser level
+
+
+def improved(query: Query, fix: Fix, step: str, improve: Callable[[Fix], _T]) -> Fix | _T:
+    """What a step makes of a fix; the fix itself if there is no time for the step."""
+    scheduler, work_px = query.scheduler, float(query.gray.size)
+    with scheduler.with_fix():
+        if not scheduler.can_afford({step: work_px}):
+            scheduler.costs.note_refusal(step)
+            return fix
+        with suppress(OutOfTime), scheduler.costed(step, work_px):
+            return improve(fix)
+    return fix
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from engine.methods.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseC
 from engine.methods.method import Method
 from engine.methods.options import MatcherOptions, SiftOptions
 from engine.methods.query import Query
-from engine.methods.refinement import MIN_CORRELATION_AT_ONCE, Refinement, with_unconfirmed_tilt
+from engine.methods.refinement import MIN_CORRELATION_AT_ONCE, Refinement, improved, with_unconfirmed_tilt
 from engine.methods.scheduler import OutOfTime
 from engine.methods.views import coarser_scale, drawn_px
 from engine.orthomap import OrthoMap
@@ -29,6 +29,23 @@ _FEW_SHARE = 0.5  # of the keypoints, where a pose is refined from few
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
 
+LOOPS = (
+    "map_points",
+    "gauss_newton",
+    "local_normalisation",
+    "lattice",
+    "dense_loops",
+    "pose_fit",
+    "clusters",
+    "nearest",
+    "sift_selection",
+    "sift_refinement",
+    "sift_descriptors",
+    "sift_extrema",
+)
+"""Compiled loops of features, pose and refinement, see :attr:`Method.loops`."""
+
+
 class Sift(Method):
     """Scale-invariant features and PnP; needs neither height nor heading.
 
@@ -38,6 +55,8 @@ class Sift(Method):
         options: settings; ``options.sift`` counts, and for the refinement how NCC enhances the map.
         samples: of the map for the refinement, where another method has them already.
     """
+
+    loops = LOOPS
 
     def __init__(
         self, site: OrthoMap, device: Device, options: MatcherOptions, samples: SampleMap | None = None
@@ -73,7 +92,7 @@ class Sift(Method):
         prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), torch.device(query.device))
         self._by_few_features(query)
         for share, work_px in self._work_px(query).items():
-            with query.scheduler.costed("sift", work_px):
+            with query.scheduler.costed(("sift", share), work_px):
                 result = self._at_scale(query, share)
             if isinstance(result, Fix) and self._can_refine(query):
                 self._refined(query, result)
@@ -132,12 +151,12 @@ class Sift(Method):
     def _has_time_for_few(self, query: Query) -> bool:
         """Whether there is time for few features first and then for all of them, or only for few."""
         scheduler, works = query.scheduler, self._work_px(query)
-        if scheduler.can_afford_all({_FEW: works[1.0], "sift": min(works.values())}):
+        if scheduler.can_afford({_FEW: works[1.0], ("sift", _REDUCED[-1]): works[_REDUCED[-1]]}):
             return True
         is_only = scheduler.has_fix or scheduler.first_affordable("sift", works) is None
-        if is_only and scheduler.can_afford(_FEW, works[1.0]):
+        if is_only and scheduler.can_afford({_FEW: works[1.0]}):
             return True
-        scheduler.note_refusal(_FEW)
+        scheduler.costs.note_refusal(_FEW)
         return False
 
     def _is_certain(self, fix: Fix) -> bool:
@@ -154,7 +173,7 @@ class Sift(Method):
             with query.scheduler.with_fix():
                 result = self._by_all_features(query)
         except OutOfTime:
-            result = query.refuse_late(METHOD, "sift")
+            result = query.refuse_late(METHOD, ("sift", _REDUCED[-1]))
         if isinstance(result, Fix) or result.reason is not Reason.LATE:
             return result
         return replace(with_unconfirmed_tilt(query, few), stage="coarse")
@@ -167,8 +186,8 @@ class Sift(Method):
         works = self._work_px(query)
         share = query.scheduler.first_affordable(step, works)
         if share is None:
-            return query.refuse_late(METHOD, step)
-        with query.scheduler.costed(step, works[share]):
+            return query.refuse_late(METHOD, (step, _REDUCED[-1]))
+        with query.scheduler.costed((step, share), works[share]):
             return self._at_scale(query, share)
 
     def _can_refine(self, query: Query) -> bool:
@@ -188,7 +207,7 @@ class Sift(Method):
         def improve(fix: Fix) -> Fix:
             return refinement.refine_at_once(fix) or refinement.refine_from_coarser(fix) or fix
 
-        return query.scheduler.improved(fix, _REFINEMENT, float(query.gray.size), improve)
+        return improved(query, fix, _REFINEMENT, improve)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

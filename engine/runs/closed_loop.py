@@ -118,7 +118,8 @@ def fly_closed_loop(
     town, camera = world.build(), world.camera()
     site = town.site()
     matcher = SceneMatcher(site, camera, loop.method, loop.device)
-    matcher.warmup()
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
     flight = plan_closed_loop(town, camera, matcher, world.seed, loop)
     prepare_folder(out, force, (*FOLDER_OWNED, *LOOP_OWNED))
     with open_view(matcher, live_view) as view:

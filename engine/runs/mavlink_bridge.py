@@ -211,7 +211,8 @@ def run_mavlink_bridge(
     camera = files.load_camera(progress)
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
-    matcher.warmup()
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
     # A camera's bridge may start in the air; a flight that is played begins where it began.
     resumes = files.camera_source is not None
     last_fix = LastFix(

@@ -130,7 +130,8 @@ def run_ros_bridge(
     node = node or _node(ros.version, ros.arguments)
     camera = camera or _heard_camera(node, ros, progress)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
-    matcher.warmup()
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
 
     with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)

@@ -78,7 +78,8 @@ def track(
     inputs = inputs or open_inputs(files, [settings], progress=progress)
     site, flight = inputs.site, inputs.flight
     matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings.matcher_options())
-    matcher.warmup()
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
     prepare_folder(out, force, OWNED)
     options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
     navigator = Navigator(matcher, start, budget, options)

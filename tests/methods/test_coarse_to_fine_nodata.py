@@ -238,12 +238,12 @@ def test_every_place_is_scored_only_where_there_is_time_for_it():
     prior = GROUND.prior(nadir, sigma_m=80.0)
     asked: list[str] = []
 
-    def can_afford_all(self, works):
+    def can_afford(self, works):
         asked.extend(works)
         return _EVERY_PLACE not in works
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("engine.methods.scheduler.Scheduler.can_afford_all", can_afford_all)
+        patch.setattr("engine.methods.scheduler.Scheduler.can_afford", can_afford)
         patch.setattr("engine.methods.peak_evidence.is_hopeless", lambda *_: False)
         result = matcher.locate(frame, prior, budget=Budget(total_ms=60_000.0))
     assert _EVERY_PLACE in asked
@@ -263,12 +263,12 @@ def test_a_second_look_at_every_place_is_a_step_of_its_own():
     shown = np.clip(255.0 - frame.image.astype(float), 0, 255).astype(np.uint8)  # grey levels the other way round
     asked: list[str] = []
 
-    def can_afford_all(self, works):
+    def can_afford(self, works):
         asked.extend(works)
         return module._SECOND_LOOK not in works
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("engine.methods.scheduler.Scheduler.can_afford_all", can_afford_all)
+        patch.setattr("engine.methods.scheduler.Scheduler.can_afford", can_afford)
         patch.setattr(module, "is_hopeless", lambda *_: False)
         result = matcher.locate(replace(frame, image=shown), GROUND.prior(nadir, sigma_m=60.0))
     assert [step for step in asked if "second look" in step][:2] == [module._HOPEFUL_LOOK, module._SECOND_LOOK]
