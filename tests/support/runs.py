@@ -45,5 +45,5 @@ def bare_runs() -> Iterator[None]:
         for plot in ("_path", "_position", "_height", "_error"):
             patch.setattr(figures, plot, lambda *_: Figure(figsize=(1, 1)))
         patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(BLANK))
-        patch.setattr(SceneMatcher, "warmup", lambda _: None)
+        patch.setattr(SceneMatcher, "warmup", lambda *_: None)
         yield
