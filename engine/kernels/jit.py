@@ -16,7 +16,7 @@ from engine import workers
 
 _FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by zero
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "no_cfunc_wrapper": True}
-_signatures: list[tuple[Any, Any]] = []  # of the loops that Python calls
+_signatures: list[tuple[Any, str]] = []  # of the loops that Python calls
 
 
 def compiled(*signatures: str):
@@ -31,8 +31,7 @@ def compiled(*signatures: str):
             loop = njit(cache=True, **_OPTIONS)(function)
         except RuntimeError:  # no folder is writable
             loop = njit(**_OPTIONS)(function)
-        types = [normalize_signature(signature)[0] for signature in signatures]  # type: ignore[no-untyped-call]
-        _signatures.extend((loop, each) for each in types)
+        _signatures.extend((loop, signature) for signature in signatures)
         return loop
 
     return decorate
@@ -54,7 +53,9 @@ def prepare(modules: Iterable[str], report: Callable[[int, int], None] = lambda 
         report: takes how many loops are done, and of how many.
     """
     names = [import_module(f"{__package__}.{module}").__name__ for module in modules]
-    loops = [entry for name in names for entry in _signatures if entry[0].__module__ == name]
+    written = [entry for name in names for entry in _signatures if entry[0].__module__ == name]
+    # As a first call has them: the cache tells a text from the types that it stands for.
+    loops = [(loop, normalize_signature(text)[0]) for loop, text in written]  # type: ignore[no-untyped-call]
     helper, is_collecting = None, gc.isenabled()
     gc.disable()  # of what a compiler allocates little is garbage before it is done
     try:

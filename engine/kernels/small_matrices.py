@@ -54,10 +54,10 @@ def turn(rotation, vector, out):
     angle = np.sqrt(square)
     sine = 1.0 - square / 6.0 if angle < 1e-4 else np.sin(angle) / angle
     cosine = 0.5 if angle < 1e-4 else (1.0 - np.cos(angle)) / square
+    rest = 1.0 - cosine * square
     for j in range(3):
         a, b, c = rotation[0, j], rotation[1, j], rotation[2, j]
         along = cosine * (x * a + y * b + z * c)
-        rest = 1.0 - cosine * square
         out[0, j] = rest * a + x * along + sine * (y * c - z * b)
         out[1, j] = rest * b + y * along + sine * (z * a - x * c)
         out[2, j] = rest * c + z * along + sine * (x * b - y * a)

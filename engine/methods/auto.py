@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from engine.acceptance import agree_in_height, agree_in_place, offset_between_m
 from engine.device import Device
-from engine.methods import ncc, sift
 from engine.methods.explanation import Explanation
 from engine.methods.method import Method
 from engine.methods.ncc import Ncc
@@ -32,7 +31,7 @@ class Auto(Method):
         options: settings of both.
     """
 
-    loops = tuple(dict.fromkeys(ncc.LOOPS + sift.LOOPS))
+    loops = tuple(dict.fromkeys(Ncc.loops + Sift.loops))
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.ncc = Ncc(site, device, options)

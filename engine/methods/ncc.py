@@ -44,18 +44,6 @@ _MIN_CONFIDENCE_TURNED = 0.9995
 _MIN_CONFIDENCE_COARSE = 0.999  # of a peak of the coarsest level, from which refinement begins
 
 
-LOOPS = (
-    "map_points",
-    "gauss_newton",
-    "surface_loops",
-    "local_normalisation",
-    "lattice",
-    "lower_plane",
-    "dense_loops",
-)
-"""Compiled loops of aligning, correlating and refining, see :attr:`Method.loops`."""
-
-
 class Ncc(Method):
     """Normalised cross-correlation; needs height and heading, or the time to search for the heading.
 
@@ -65,7 +53,15 @@ class Ncc(Method):
         options: settings; ``options.ncc`` counts.
     """
 
-    loops = LOOPS
+    loops = (
+        "map_points",
+        "gauss_newton",
+        "surface_loops",
+        "local_normalisation",
+        "lattice",
+        "lower_plane",
+        "dense_loops",
+    )
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.options = options.ncc

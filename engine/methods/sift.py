@@ -29,23 +29,6 @@ _FEW_SHARE = 0.5  # of the keypoints, where a pose is refined from few
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
 
-LOOPS = (
-    "map_points",
-    "gauss_newton",
-    "local_normalisation",
-    "lattice",
-    "dense_loops",
-    "pose_fit",
-    "clusters",
-    "nearest",
-    "sift_selection",
-    "sift_refinement",
-    "sift_descriptors",
-    "sift_extrema",
-)
-"""Compiled loops of features, pose and refinement, see :attr:`Method.loops`."""
-
-
 class Sift(Method):
     """Scale-invariant features and PnP; needs neither height nor heading.
 
@@ -56,7 +39,20 @@ class Sift(Method):
         samples: of the map for the refinement, where another method has them already.
     """
 
-    loops = LOOPS
+    loops = (
+        "map_points",
+        "gauss_newton",
+        "local_normalisation",
+        "lattice",
+        "dense_loops",
+        "pose_fit",
+        "clusters",
+        "nearest",
+        "sift_selection",
+        "sift_refinement",
+        "sift_descriptors",
+        "sift_extrema",
+    )
 
     def __init__(
         self, site: OrthoMap, device: Device, options: MatcherOptions, samples: SampleMap | None = None
