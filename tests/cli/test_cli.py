@@ -151,7 +151,7 @@ def test_track_prints_a_table_and_keeps_the_rest_from_standard_output(flight, tm
 
 def test_json_is_all_there_is_on_standard_output(flight, tmp_path, capsys):
     out = tmp_path / "out"
-    assert run(track(flight, out, "--json", "--method=sift", "--budget-ms=60000")) == 0
+    assert run(track(flight, out, "--json", "--method=sift", "--budget-ms=3600000")) == 0
     printed = capsys.readouterr()
     summary = json.loads(printed.out)
     assert printed.err == ""

@@ -245,7 +245,7 @@ def test_every_place_is_scored_only_where_there_is_time_for_it():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("engine.methods.scheduler.Scheduler.can_afford", can_afford)
         patch.setattr("engine.methods.peak_evidence.is_hopeless", lambda *_: False)
-        result = matcher.locate(frame, prior, budget=Budget(total_ms=60_000.0))
+        result = matcher.locate(frame, prior, budget=Budget(total_ms=3_600_000.0))
     assert _EVERY_PLACE in asked
     assert isinstance(result, NoFix)
     assert result.reason is Reason.LATE

@@ -258,7 +258,7 @@ def flown(tmp_path_factory):
     black = folder / "frames" / f"{DARK:06d}.jpg"
     Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
     with bare_runs():
-        track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=60_000.0))
+        track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=3_600_000.0))
     return folder.parent / "out"
 
 
