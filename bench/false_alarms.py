@@ -14,9 +14,9 @@ import numpy as np
 
 from bench.faults import START_SIGMA_M
 from engine import Prior
-from engine.diagnosis import Diagnosis, diagnose
-from engine.sim import CONDITIONS, FlightStyle, plan_flight
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.check import Diagnosis, diagnose
+from scenematch.simulator import CONDITIONS, FlightStyle, plan_flight
 
 HEIGHTS_M, SPEEDS_MPS = (90.0, 160.0), (4.0, 12.0)
 RATE_HZ = 1.12 / 2  # of the pictures; ``check`` looks at sixteen of them and the next ones

@@ -23,9 +23,9 @@ from bench import DOCS
 from bench.inputs.faults import Fault, FlightInputs, faults, load
 from bench.pages.text import table
 from engine import Fix, Navigator, Prior, SceneMatcher
-from engine.diagnosis import diagnose
-from engine.formats.truth import interpolate_truth
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.check import diagnose
+from scenematch.files.truth import interpolate_truth
 
 BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0

@@ -20,9 +20,9 @@ from torch import Tensor
 from bench.inputs.scenes import flight, pair
 from bench.pages.text import table
 from engine import Fix, SceneMatcher
-from engine.device import resolve, synchronise
 from engine.kernels.summits import match as match_on_device
 from engine.ncc_fft import Search, match_template, match_templates, prepare
+from engine.runtime.device import resolve, synchronise
 from engine.values import Peak
 
 PAIRS = [(425, 228), (512, 256), (1024, 256), (1024, 512)]  # window and template, px; the first is the paper's

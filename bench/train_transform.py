@@ -21,10 +21,10 @@ from torch import Tensor
 from bench import ROOT
 from bench.accuracy.years import YEARS, opened, places, shift, vintages
 from bench.transform import SHAPES, Weights, forward
-from engine.scores import enhance
-from engine.sim import build_town
-from engine.threads import set_threads
+from engine.kernels.scores import enhance
+from engine.runtime.threads import set_threads
 from engine.values import Window
+from scenematch.simulator import build_town
 
 Gray = NDArray[np.uint8]
 Pair = tuple[Gray, Gray, NDArray[np.float64]]  # two pictures of one place, and the shift of the second

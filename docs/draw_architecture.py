@@ -13,6 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE, PICTURE = ROOT / "docs" / "architecture.md", ROOT / "docs" / "img" / "architecture.svg"
+PACKAGES = ("engine", "scenematch")
 WIDTH_PX, BOX_PX, GAP_PX, ROW_PX, LETTER_PX = 960, 26, 10, 46, 7.3  # of the picture
 
 
@@ -20,14 +21,22 @@ def floors(root: Path = ROOT) -> list[list[str]]:
     """Modules and packages of each floor, the top first, as import-linter keeps them."""
     settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
     layers = next(contract["layers"] for contract in settings["contracts"] if contract["type"] == "layers")
-    return [[part.strip().removeprefix("engine.") for part in re.split(r"[|:]", layer)] for layer in layers]
+    return [[part.strip() for part in re.split(r"[|:]", layer)] for layer in layers]
 
 
 def members(root: Path = ROOT) -> dict[str, Path]:
-    """The file that says what each module or package at the top of the engine is, by name."""
-    modules = {path.stem: path for path in (root / "engine").glob("*.py") if path.stem != "__init__"}
-    packages = {path.parent.name: path for path in (root / "engine").glob("*/__init__.py")}
-    return modules | packages
+    """The file that says what each module or package at the top of the two packages is, by its dotted name."""
+    found = {}
+    for package in PACKAGES:
+        files = [*(root / package).glob("*.py"), *(root / package).glob("*/__init__.py")]
+        found |= {_member(path.relative_to(root)): path for path in files if path.parent.name != path.stem}
+    return {name: path for name, path in found.items() if name not in PACKAGES}
+
+
+def _member(path: Path) -> str:
+    """The member that a file is, or lies in."""
+    parts = path.with_suffix("").parts
+    return ".".join(part for part in parts[:2] if part != "__init__")
 
 
 def first_line(path: Path) -> str:
@@ -40,24 +49,33 @@ def first_line(path: Path) -> str:
 def imports(root: Path = ROOT) -> dict[str, set[str]]:
     """Which members each member imports, wherever in its files."""
     found: dict[str, set[str]] = {name: set() for name in members(root)}
-    for path in sorted((root / "engine").rglob("*.py")):
-        parts = path.relative_to(root / "engine").with_suffix("").parts
-        if parts[0] in found:
-            found[parts[0]] |= {name for name in _imported(path) if name in found and name != parts[0]}
+    for path in _files(root):
+        member = _member(path.relative_to(root))
+        if member in found:
+            found[member] |= {name for name in _imported(path) if name in found and name != member}
     return found
 
 
+def _files(root: Path) -> list[Path]:
+    return sorted(path for package in PACKAGES for path in (root / package).rglob("*.py"))
+
+
 def _imported(path: Path) -> set[str]:
-    """Names below ``engine`` that a file imports."""
+    """Members that a file imports when it runs; what it imports for its types alone is left out."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        pending += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module == "engine":
-            names |= {f"engine.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module in PACKAGES:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names.add(node.module)
-    return {name.split(".")[1] for name in names if name.startswith("engine.")}
+    return {".".join(name.split(".")[:2]) for name in names if name.split(".")[0] in PACKAGES}
 
 
 def direct(graph: dict[str, set[str]]) -> dict[str, list[str]]:
@@ -83,14 +101,15 @@ def table(root: Path = ROOT) -> str:
     for number, names in zip(range(len(layers), 0, -1), layers, strict=True):
         for name in sorted(names):
             shown = f"`{name}/`" if files[name].name == "__init__.py" else f"`{name}`"
-            lines.append(f"| {number} | {shown} | {first_line(files[name])} | {', '.join(below[name])} |")
+            imported = ", ".join(other.removeprefix("engine.") for other in below[name])
+            lines.append(f"| {number} | {shown} | {first_line(files[name])} | {imported} |")
     return "\n".join(lines)
 
 
 def listing(root: Path = ROOT) -> str:
     """The files of every folder, by name."""
     lines = ["| folder | files |", "|---|---|"]
-    for folder in sorted({path.parent for path in (root / "engine").rglob("*.py")}):
+    for folder in sorted({path.parent for path in _files(root)}):
         names = [f"`{path.stem}`" for path in sorted(folder.glob("*.py")) if path.stem != "__init__"]
         where = folder.relative_to(root).as_posix()
         if names:

@@ -3,14 +3,12 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from engine.lazy_names import imported_on_use
+from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from engine import features, ncc_fft
-    from engine.acceptance import PeakRule
     from engine.budget import Budget
     from engine.camera import Camera
-    from engine.covariance import AssumedErrors
     from engine.errors import (
         BackendError,
         CalibrationError,
@@ -24,16 +22,23 @@ if TYPE_CHECKING:
         StateError,
         TelemetryError,
     )
-    from engine.live import Answer, Live, LiveOptions
-    from engine.matcher import SceneMatcher
-    from engine.methods.options import LearnedOptions, MatcherOptions, NccOptions, SiftOptions
-    from engine.navigator import Navigator
-    from engine.navigator_options import NavigatorOptions
-    from engine.navigator_state import NavigatorState
+    from engine.matching.matcher import SceneMatcher
+    from engine.navigation.live import Answer, Live, LiveOptions
+    from engine.navigation.navigator import Navigator
+    from engine.navigation.state import NavigatorState
+    from engine.options import (
+        AssumedErrors,
+        LearnedOptions,
+        MatcherOptions,
+        NavigatorOptions,
+        NccOptions,
+        PeakRule,
+        PoseOptions,
+        SiftOptions,
+    )
     from engine.orthomap import OrthoMap
-    from engine.pose import PoseOptions
-    from engine.realtime import Realtime, set_realtime
-    from engine.threads import set_threads
+    from engine.runtime.realtime import Realtime, set_realtime
+    from engine.runtime.threads import set_threads
     from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
 
 __all__ = [
@@ -81,22 +86,19 @@ __all__ = [
 ]
 
 _NAMES = {
-    "engine.acceptance": "PeakRule",
     "engine.budget": "Budget",
     "engine.camera": "Camera",
-    "engine.covariance": "AssumedErrors",
-    "engine.threads": "set_threads",
+    "engine.runtime.threads": "set_threads",
     "engine.errors": "BackendError CalibrationError DeviceError DtypeError EngineError MapError MissingExtraError "
     "OptionError ShapeError StateError TelemetryError",
-    "engine.live": "Answer Live LiveOptions",
-    "engine.matcher": "SceneMatcher",
-    "engine.methods.options": "LearnedOptions MatcherOptions NccOptions SiftOptions",
-    "engine.navigator": "Navigator",
-    "engine.navigator_options": "NavigatorOptions",
-    "engine.navigator_state": "NavigatorState",
+    "engine.navigation.live": "Answer Live LiveOptions",
+    "engine.matching.matcher": "SceneMatcher",
+    "engine.options": "AssumedErrors LearnedOptions MatcherOptions NavigatorOptions NccOptions PeakRule "
+    "PoseOptions SiftOptions",
+    "engine.navigation.navigator": "Navigator",
+    "engine.navigation.state": "NavigatorState",
     "engine.orthomap": "OrthoMap",
-    "engine.pose": "PoseOptions",
-    "engine.realtime": "Realtime set_realtime",
+    "engine.runtime.realtime": "Realtime set_realtime",
     "engine.values": "Attitude Fix Frame NoFix Prior Reason Timings Window",
 }
 """The public names by module. A module is imported when one of its names is used: torch alone takes seconds."""

@@ -28,13 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.runtime.tensors import Tensor, torch
+from engine.runtime.threads import in_parallel
 from engine.sift.descriptors import describe, dominant_angle
 from engine.sift.keypoints import Points, find_points, strongest
 from engine.sift.matching import match
 from engine.sift.scale_space import band, gaussian_levels, make_plan, octaves_of
 from engine.sift.values import Features, Matches
-from engine.tensors import Tensor, torch
-from engine.threads import in_parallel
 
 Floats = NDArray[np.float32]
 _FARTHEST = 1e6  # of a pixel's value

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from engine import coarse_to_fine
-from engine.device import Picture, as_float, as_tensor, element_type, like, plain
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.kernels import coarse_to_fine
 from engine.kernels import ncc as kernels
-from engine.peaks import find_peak, peak_of
-from engine.search_levels import Search, prepare
+from engine.kernels.peaks import find_peak, peak_of
+from engine.kernels.search_levels import Search, prepare
+from engine.runtime.device import Picture, as_float, as_tensor, element_type, like, plain
 from engine.values import Peak
 
 if TYPE_CHECKING:
-    from engine.tensors import Tensor
+    from engine.runtime.tensors import Tensor
 
 __all__ = [
     "Peak",
@@ -180,8 +180,8 @@ def _of_kind(search: Search, template: Picture) -> Picture:
 def match_template(search: Search, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
     """The peak of one template in a prepared part of a map, all pixels of which are taken for valid.
 
-    Coarse to fine, see :mod:`engine.coarse_to_fine`. Where that is not certain, and with ``exhaustive`` or on
-    another device than the CPU, all positions are scored at full resolution.
+    Coarse to fine, see :mod:`engine.kernels.coarse_to_fine`. Where that is not certain, and with ``exhaustive`` or
+    on another device than the CPU, all positions are scored at full resolution.
 
     Args:
         search: from :func:`prepare`.
@@ -190,8 +190,8 @@ def match_template(search: Search, template: Picture, *, exclusion_px: float, ex
         exhaustive: score all positions at full resolution; the peak is then the reference's.
 
     Returns:
-        Peak: as :func:`engine.peaks.find_peak`; on the CPU without ``exhaustive`` the second score may be that of
-        a coarse level.
+        Peak: as :func:`engine.kernels.peaks.find_peak`; on the CPU without ``exhaustive`` the second score may be
+        that of a coarse level.
 
     Raises:
         ShapeError: the template is not (h, w), is empty, or is larger than the map.

@@ -5,8 +5,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from engine import Camera, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.adapters.mavlink import MavlinkBridge, MavlinkOptions, NedOrigin, parse_connection
-from engine.adapters.pictures import capture, replay
+from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions, NedOrigin, parse_connection
+from scenematch.bridges.pictures import capture, replay
 
 if not 5 <= len(sys.argv) <= 6:
     sys.exit(__doc__)

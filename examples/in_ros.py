@@ -4,14 +4,14 @@ import sys
 from importlib import import_module
 
 from engine import Camera, Navigator, OrthoMap, SceneMatcher
-from engine.adapters.ros import RosBridge, RosOptions, RosTopics
+from scenematch.bridges.ros import RosBridge, RosOptions, RosTopics
 
 if sys.argv[1:2] not in (["1"], ["2"]):
     sys.exit(__doc__)
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 matcher = SceneMatcher(site, Camera.load("camera.yaml"), method="auto")
 matcher.warmup()
-node = import_module(f"engine.adapters.ros{sys.argv[1]}").Node("scenematch", tuple(sys.argv[2:]))
+node = import_module(f"scenematch.bridges.ros{sys.argv[1]}").Node("scenematch", tuple(sys.argv[2:]))
 bridge = RosBridge(node, site, lambda prior: Navigator(matcher, prior), RosOptions())
 topics = RosTopics(
     image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from engine import Fix
-from engine.sim import plan_flight
+from scenematch.simulator import plan_flight
 from tests.support import towns
 from tests.support.paths import NO_SHARED, SHARED
 from tests.support.towns import drawn_once, drawn_town, site_of
@@ -71,7 +71,12 @@ def _workers_share_towns(tmp_path_factory):
 def _towns_drawn_once(_workers_share_towns):
     """Who draws a town below the tests takes the one that was drawn before; tests of towns call `build_town`."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("engine.sim", "engine.sim.flight", "engine.runs.simulation", "bench.inputs.scenes"):
+        for module in (
+            "scenematch.simulator",
+            "scenematch.simulator.flight",
+            "scenematch.runs.simulation",
+            "bench.inputs.scenes",
+        ):
             patch.setattr(f"{module}.build_town", drawn_once)
         yield
 

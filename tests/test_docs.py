@@ -9,16 +9,12 @@ from typer.main import get_command
 
 from docs.draw_architecture import drawn, members, picture
 from docs.site_roles import on_page_content
-from engine.acceptance import PeakRule
-from engine.cli.app import app
-from engine.covariance import AssumedErrors
-from engine.formats.track import COLUMNS
-from engine.methods.options import SiftOptions
-from engine.navigator_options import NavigatorOptions
-from engine.pose import PoseOptions
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from engine.options import AssumedErrors, NavigatorOptions, PeakRule, PoseOptions, SiftOptions
 from engine.values import Reason
+from scenematch.cli.app import app
+from scenematch.files.track import COLUMNS
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
 
@@ -77,7 +73,7 @@ def test_every_example_is_shown_by_a_page():
 
 def test_no_role_is_shown_raw_on_the_site():
     found = Counter()
-    for path in (ROOT / "engine").rglob("*.py"):
+    for path in [*(ROOT / "engine").rglob("*.py"), *(ROOT / "scenematch").rglob("*.py")]:
         for role, name in re.findall(r"(:[a-z]+:)`([^`]*)`", path.read_text(encoding="utf-8")):
             html = on_page_content(f"<p>see {role}<code>{name}</code>, and more</p>")
             assert role not in html, f"{path.name}: {role}`{name}`"
@@ -149,10 +145,10 @@ def test_floors_on_the_page_are_those_that_import_linter_keeps():
     layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
     kept = [{part.strip() for part in re.split(r"[|:]", layer)} for layer in layers]
     shown = {}
-    for floor, name in re.findall(r"^\| (\d+) \| `(\w+)/?` \|", read("docs/architecture.md"), re.MULTILINE):
-        shown.setdefault(int(floor), set()).add(f"engine.{name}")
+    for floor, name in re.findall(r"^\| (\d+) \| `([\w.]+)/?` \|", read("docs/architecture.md"), re.MULTILINE):
+        shown.setdefault(int(floor), set()).add(name)
     assert [shown[floor] for floor in sorted(shown, reverse=True)] == kept
-    assert sorted(name for names in kept for name in names) == sorted(f"engine.{name}" for name in members())
+    assert sorted(name for names in kept for name in names) == sorted(members())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine.formats.flight import open_flight
-from engine.formats.truth import read_truth
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from scenematch.files.flight import open_flight
+from scenematch.files.truth import read_truth
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
@@ -83,14 +83,14 @@ def test_a_video_and_its_telemetry_are_the_flight_again(flight, monkeypatch):
 
 
 class NodeOfNoRos:
-    """What :mod:`engine.adapters.ros1` has, without ROS: it plays three pictures and keeps what is published."""
+    """:mod:`scenematch.bridges.ros1` without ROS: it plays three pictures and keeps what is published."""
 
     made = None
 
     def __init__(self, name, arguments=()):
         from rosbags.typesys import Stores, get_typestore
 
-        from engine.formats.ros.messages import MessageFactory
+        from scenematch.files.ros.messages import MessageFactory
 
         self.messages = MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
         self.published, self.topics = [], None
@@ -118,9 +118,9 @@ class NodeOfNoRos:
 @pytest.mark.slow
 def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monkeypatch, capsys):
     pytest.importorskip("rosbags", reason="rosbags is not installed")
-    module = types.ModuleType("engine.adapters.ros1")
+    module = types.ModuleType("scenematch.bridges.ros1")
     module.Node = NodeOfNoRos
-    monkeypatch.setitem(sys.modules, "engine.adapters.ros1", module)
+    monkeypatch.setitem(sys.modules, "scenematch.bridges.ros1", module)
     monkeypatch.setattr(sys, "argv", ["in_ros.py", "1"])
     monkeypatch.chdir(flight)
     runpy.run_path(str(EXAMPLES / "in_ros.py"))

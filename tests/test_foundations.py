@@ -39,8 +39,8 @@ from engine import (
     Window,
 )
 from engine.budget import Deadline
-from engine.device import resolve, synchronise
-from engine.threads import set_threads
+from engine.runtime.device import resolve, synchronise
+from engine.runtime.threads import set_threads
 from engine.values import Peak
 
 IMAGE = np.zeros((4, 6), np.uint8)
@@ -340,7 +340,7 @@ def test_a_matcher_takes_one_thread_unless_somebody_chose(words, environment, ex
     """In processes of their own: the number of threads is the process's. Forks share what was imported."""
     program = """
 import numpy as np, os, torch, cv2, sys
-import engine.methods.ncc, numba, pyproj, rasterio  # what a map and a matcher load
+import engine.matching.ncc, numba, pyproj, rasterio  # what a map and a matcher load
 from engine import Camera, OrthoMap, SceneMatcher, set_threads
 for chosen in sys.argv[1:]:
     if os.fork():

@@ -59,24 +59,25 @@ PUBLIC = [
     "set_threads",
 ]
 MODULES = {
-    "adapters.mavlink": "pymavlink",
-    "adapters.pictures": None,
-    "adapters.ros": None,
-    "adapters.ros1": None,
-    "adapters.ros2": None,
-    "adapters.vehicle": None,
-    "formats.flight": None,
-    "formats.telemetry": None,
-    "formats.track": None,
-    "formats.truth": None,
-    "learned": None,
-    "runs": None,
-    "sim": None,
-    "sim.loop": None,
-    "sim.pilot": None,
-    "sim.quadrotor": None,
+    "scenematch.bridges.mavlink": "pymavlink",
+    "scenematch.bridges.pictures": None,
+    "scenematch.bridges.ros": None,
+    "scenematch.bridges.ros1": None,
+    "scenematch.bridges.ros2": None,
+    "scenematch.bridges.vehicle": None,
+    "scenematch.files.flight": None,
+    "scenematch.files.telemetry": None,
+    "scenematch.files.track": None,
+    "scenematch.files.truth": None,
+    "engine.learned": None,
+    "scenematch": None,
+    "scenematch.simulator": None,
+    "scenematch.simulator.loop": None,
+    "scenematch.simulator.pilot": None,
+    "scenematch.simulator.quadrotor": None,
 }
-"""The named public modules, whose ``__all__`` counts, and the optional package that importing one needs."""
+"""Public modules besides the engine, whose ``__all__`` counts, and the optional package that importing one needs."""
+PACKAGES = ("engine", "scenematch")
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
 UNUSED = (
     "matplotlib",
@@ -118,8 +119,8 @@ def fresh():
         "found['reach'] = [callable(engine.ncc_fft.ncc), callable(engine.features.sift)]; "
         "[getattr(engine, name) for name in engine.__all__]; found['loaded'] = top(); import torch; "
         "found['cuda'] = torch.cuda.is_initialized(); "
-        "found['modules'] = sorted(n for n in sys.modules if n.startswith('engine.')); "
-        "import engine.runs.tracking, engine.runs.closed_loop, engine.runs.mavlink_bridge; "
+        "found['modules'] = sorted(n for n in sys.modules if n.startswith(('engine', 'scenematch'))); "
+        "import scenematch.runs.tracking, scenematch.runs.closed_loop, scenematch.runs.mavlink_bridge; "
         "found['rerun'] = 'rerun' in sys.modules; print('REPORT', json.dumps(found))"
     )
     done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)
@@ -153,9 +154,8 @@ def test_the_public_names_do_not_touch_the_gpu(fresh):
     assert fresh["cuda"] is False
 
 
-def test_the_public_names_load_no_upper_floor(fresh):
-    floors = ("adapters", "cli", "formats", "report", "sim")
-    assert not [name for name in fresh["modules"] if name.split(".")[1] in floors]
+def test_the_engine_loads_nothing_of_the_product(fresh):
+    assert not [name for name in fresh["modules"] if name.split(".")[0] == "scenematch"]
 
 
 def test_functions_on_tensors_are_reached_through_their_modules(fresh):
@@ -197,7 +197,7 @@ def public_module(name):
     """A named public module, skipped where the optional package that it needs is missing."""
     if MODULES[name] is not None:
         pytest.importorskip(MODULES[name])
-    return importlib.import_module(f"engine.{name}")
+    return importlib.import_module(name)
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
@@ -220,10 +220,10 @@ def engine_imports(path):
     )
     for block in blocks:
         for node in ast.walk(ast.parse(block)):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "engine":
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
                 yield from ((node.module, alias.name) for alias in node.names)
             elif isinstance(node, ast.Import):
-                yield from ((alias.name, None) for alias in node.names if alias.name.split(".")[0] == "engine")
+                yield from ((alias.name, None) for alias in node.names if alias.name.split(".")[0] in PACKAGES)
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
@@ -232,18 +232,18 @@ def test_documents_and_examples_import_public_names_only(path):
         if module == "engine":
             assert name is None or name in engine.__all__, f"{path.name}: engine.{name}"
             continue
-        assert module.removeprefix("engine.") in MODULES, f"{path.name}: {module} is no public module"
-        assert name in public_module(module.removeprefix("engine.")).__all__, f"{path.name}: {module}.{name}"
+        assert module in MODULES, f"{path.name}: {module} is no public module"
+        assert name in public_module(module).__all__, f"{path.name}: {module}.{name}"
 
 
 def test_documents_mention_public_modules_only():
     """A module that a page tells users to call, as in ``engine.set_threads(1)``, is a public one."""
-    public = {*MODULES, *(name for name in engine.__all__ if inspect.ismodule(getattr(engine, name)))}
+    public = {*MODULES, *(f"engine.{name}" for name in engine.__all__)}
     for path in TEXTS:
-        for module in re.findall(r"\bengine\.((?:\w+\.)*\w+)\.\w+\(", path.read_text(encoding="utf-8")):
-            assert module in public or module.split(".")[0] in engine.__all__, f"{path.name}: engine.{module}"
+        for module in re.findall(r"\b((?:engine|scenematch)(?:\.\w+)+)\.\w+\(", path.read_text(encoding="utf-8")):
+            assert module in public or ".".join(module.split(".")[:2]) in public, f"{path.name}: {module}"
 
 
 def test_the_reference_lists_every_public_name_and_module():
-    listed = re.findall(r"^::: engine\.(\w+(?:\.\w+)*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
-    assert sorted(listed) == sorted([*engine.__all__, *MODULES])
+    listed = re.findall(r"^::: (\w+(?:\.\w+)*)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert sorted(listed) == sorted([*(f"engine.{name}" for name in engine.__all__), *MODULES])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from engine import Camera, Fix, Frame, OrthoMap, Prior, SceneMatcher
-from engine.formats.flight import Flight, open_flight
-from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
 from engine.values import Truth
+from scenematch.files.flight import Flight, open_flight
+from scenematch.files.truth import interpolate_truth, read_truth
 
 WRONG_M = 10.0
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera, Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.formats.flight import open_flight
-from engine.formats.truth import read_truth
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
 from engine.values import Truth
+from scenematch.files.flight import open_flight
+from scenematch.files.truth import read_truth
 
 Array = NDArray[np.float64]
 MAP_SIGMA_M = 0.3  # of these worlds, so that the covariances are not the map's

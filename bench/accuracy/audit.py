@@ -26,12 +26,12 @@ from bench.accuracy.scores import vintages
 from bench.inputs.scenes import mosaic
 from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.align import view_of
-from engine.audit.availability import Audit, audit_site, regressors
-from engine.formats.truth import interpolate_truth
-from engine.sim import build_town
-from engine.threads import set_threads
+from engine.matching.align import view_of
+from engine.runtime.threads import set_threads
 from engine.values import Attitude, Truth, Window
+from scenematch.check.availability import Audit, audit_site, regressors
+from scenematch.files.truth import interpolate_truth
+from scenematch.simulator import build_town
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

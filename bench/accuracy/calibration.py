@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
 from engine import Fix, Navigator, Prior, SceneMatcher
-from engine.diagnosis import Finding, diagnose
-from engine.formats.truth import interpolate_truth
-from engine.telemetry_errors import Calibration
-from engine.threads import set_threads
+from engine.navigation.telemetry_errors import Calibration
+from engine.runtime.threads import set_threads
+from scenematch.check import Finding, diagnose
+from scenematch.files.truth import interpolate_truth
 
 Array = NDArray[np.float64]
 Measured = tuple[float, float]  # a value and its standard deviation

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera, Frame, OrthoMap
-from engine.align import GroundView, shrink, to_gray, view_of
+from engine.matching.align import GroundView, shrink, to_gray, view_of
 from engine.values import Window
 
 Array = NDArray[np.float64]

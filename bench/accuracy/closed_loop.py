@@ -9,8 +9,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from engine.runs import ClosedLoopSettings, WorldSettings, fly_closed_loop
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch import ClosedLoopSettings, WorldSettings, fly_closed_loop
 
 FLIGHTS = (
     ("noon", "ncc", "none"),

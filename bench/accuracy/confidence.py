@@ -1,4 +1,4 @@
-"""Fit the probability that a fix is right: prints the constants of ``engine.confidence``.
+"""Fit the probability that a fix is right: prints the constants of ``engine.matching.confidence``.
 
     python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT|...]
 
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from bench.accuracy.judged import FIRST_LOOK, SECOND_LOOK, Bench, Row
 from bench.accuracy.trials import Trial, ground
 from bench.accuracy.year_pairs import matched as year_matched
-from engine.confidence import PeakModel, PoseModel
-from engine.methods.options import SiftOptions
-from engine.threads import set_threads
+from engine.matching.confidence import PeakModel, PoseModel
+from engine.options import SiftOptions
+from engine.runtime.threads import set_threads
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
 MODELS = {FIRST_LOOK: PeakModel, SECOND_LOOK: PeakModel, "SIFT": PoseModel}

@@ -3,7 +3,7 @@
     python -m bench.accuracy.field [--methods ncc sift ...] [--sets brighton ...] [--step N] [--weights FILE]
                                    [--docs DIR] [--save-before]
 
-Each flight goes through :func:`engine.runs.track`, as a user would run it. Writes docs/field.md; ``--save-before``
+Each flight goes through :func:`scenematch.track`, as a user would run it. Writes docs/field.md; ``--save-before``
 writes the figures that the page then compares with.
 """
 
@@ -26,16 +26,16 @@ from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
 from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.formats.track import TrackRow, read_track, track_row
-from engine.formats.truth import interpolate_truth
-from engine.navigator_options import ACCEPT_ALL
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
-from engine.runs import FlightFiles, TrackSettings, track
-from engine.runs.arguments import parse_position
-from engine.runs.inputs import FlightInputs, open_inputs
-from engine.runs.settings import with_weights
-from engine.threads import set_threads
+from engine.options import ACCEPT_ALL
+from engine.runtime.threads import set_threads
 from engine.values import Window
+from scenematch import FlightFiles, TrackSettings, track
+from scenematch.files.track import TrackRow, read_track, track_row
+from scenematch.files.truth import interpolate_truth
+from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
+from scenematch.runs.arguments import parse_position
+from scenematch.runs.inputs import FlightInputs, open_inputs
+from scenematch.runs.settings import with_weights
 
 Array = NDArray[np.float64]
 

@@ -25,18 +25,17 @@ from bench.pages import flights
 from bench.pages.flights import Run
 from bench.speed.peers import OpenCvFeatures
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.formats.flight import open_flight
-from engine.formats.telemetry import ground_amsl_m
-from engine.formats.track import TrackRow, track_row
-from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
-from engine.methods.options import SiftOptions
-from engine.navigator import Matcher
-from engine.navigator_options import ACCEPT_ALL
-from engine.report.metrics import Ground, errors_en_m, summarise
-from engine.sim import plan_flight
-from engine.threads import set_threads
+from engine.navigation.navigator import Matcher
+from engine.options import ACCEPT_ALL, SiftOptions
+from engine.runtime.threads import set_threads
 from engine.values import Attitude, Truth
+from scenematch.files.flight import open_flight
+from scenematch.files.telemetry import ground_amsl_m
+from scenematch.files.track import TrackRow, track_row
+from scenematch.files.truth import interpolate_truth, read_truth
+from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.simulator import plan_flight
 
 STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "nust": 2, "caliterra": 1}
 MIDDLE = ("nust",)  # whose truth is the ground in the middle of each frame, not below the camera

@@ -21,7 +21,7 @@ from bench import DOCS, ROOT, SHARED
 from bench.accuracy.judged import METHODS, Bench, Row
 from bench.accuracy.trials import ground
 from bench.pages import integrity
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
 
 TOWNS = (95, 96, 97, 98)  # on which nothing was fitted
 DRAW = 6  # of the frames and of what is done to them: raised when a rule was changed, for none is fitted to these

@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 from bench.accuracy.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.confidence import regressors
-from engine.methods.feature_pose import PoseCandidate
-from engine.methods.ncc import Ncc
-from engine.methods.options import NccOptions, SiftOptions
-from engine.methods.peak_evidence import PeakCandidate
-from engine.methods.query import Query
-from engine.methods.sift import Sift
+from engine.matching.confidence import regressors
+from engine.matching.feature_pose import PoseCandidate
+from engine.matching.ncc import Ncc
+from engine.matching.peak_evidence import PeakCandidate
+from engine.matching.query import Query
+from engine.matching.sift import Sift
 from engine.ncc_fft import surface
-from engine.pose import PoseOptions
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M
+from engine.options import NccOptions, PoseOptions, SiftOptions
 from engine.window import level_crop
+from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
 Array = NDArray[np.float64]
 M = TypeVar("M", Ncc, Sift)

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from bench import SHARED
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher, set_threads
-from engine.formats.flight import open_flight
-from engine.formats.truth import interpolate_truth, read_truth
-from engine.methods.options import NccOptions
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M
-from engine.sim import Motion, SensorNoise, build_town, plan_flight
-from engine.sim.vehicle import simulate_telemetry
+from engine.options import NccOptions
+from scenematch.files.flight import open_flight
+from scenematch.files.truth import interpolate_truth, read_truth
+from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
+from scenematch.simulator import Motion, SensorNoise, build_town, plan_flight
+from scenematch.simulator.vehicle import simulate_telemetry
 
 Array = NDArray[np.float64]
 

@@ -21,12 +21,12 @@ from bench import SHARED
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.inputs.views import FRAMES
 from engine import Camera, Fix, MatcherOptions, OrthoMap, Prior, SceneMatcher
-from engine.formats.flight import Flight, FlightFrame, open_flight
-from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import chi_square
-from engine.methods import METHODS
-from engine.methods.options import LearnedOptions
-from engine.threads import set_threads
+from engine.matching import METHODS
+from engine.options import LearnedOptions
+from engine.runtime.threads import set_threads
+from scenematch.files.flight import Flight, FlightFrame, open_flight
+from scenematch.files.truth import interpolate_truth, read_truth
 
 FLIGHTS = ("brighton", "seneca", "caliterra", "nust:10")
 SIGMA_M = 15.0

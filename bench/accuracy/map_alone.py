@@ -17,8 +17,8 @@ from bench import SHARED
 from bench.accuracy.flights import recorded
 from bench.accuracy.nees import RECORDED, Flight, Sample, flight_of, samples
 from bench.pages.text import table
-from engine.report.metrics import FALSE_SIGMAS
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.report.metrics import FALSE_SIGMAS
 
 STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "caliterra": 1}
 GAZEBO_MAP_M = 0.1

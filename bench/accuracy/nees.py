@@ -22,13 +22,12 @@ from bench import DOCS, SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
 from bench.pages.text import paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
-from engine.covariance import AssumedErrors
-from engine.formats.truth import interpolate_truth
-from engine.methods.options import NccOptions, SiftOptions
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M
-from engine.sim import plan_flight
-from engine.sim.town import EXACT
-from engine.threads import set_threads
+from engine.options import AssumedErrors, NccOptions, SiftOptions
+from engine.runtime.threads import set_threads
+from scenematch.files.truth import interpolate_truth
+from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
+from scenematch.simulator import plan_flight
+from scenematch.simulator.town import EXACT
 
 Array = NDArray[np.float64]
 

@@ -34,14 +34,14 @@ from engine import (
     SceneMatcher,
     features,
 )
-from engine.align import to_gray
-from engine.covariance import map_sigma_of
-from engine.formats.truth import interpolate_truth
-from engine.motion import GroundMotion
-from engine.odometry import NoMotion, VisualOdometry
-from engine.report.metrics import Ground
-from engine.sim import plan_flight
-from engine.threads import set_threads
+from engine.matching.align import to_gray
+from engine.matching.covariance import map_sigma_of
+from engine.navigation.motion import GroundMotion
+from engine.navigation.odometry import NoMotion, VisualOdometry
+from engine.runtime.threads import set_threads
+from scenematch.files.truth import interpolate_truth
+from scenematch.report.metrics import Ground
+from scenematch.simulator import plan_flight
 
 Array = NDArray[np.float64]
 

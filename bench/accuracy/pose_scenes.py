@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera
-from engine.pose import AttitudePrior
+from engine.matching.pose import AttitudePrior
 
 Array = NDArray[np.float64]
 Matches = tuple[Array, Array]  # (N, 3) metres, (N, 2) pixels

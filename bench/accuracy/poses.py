@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from bench.accuracy.pose_scenes import CAMERA, GROUNDS, WRONG, attitude, measured, scene
-from engine.pose import solve_pose
+from engine.matching.pose import solve_pose
 
 CHI2_3_SIGMA = 14.156  # three degrees of freedom, 99.73 %
 

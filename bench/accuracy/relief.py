@@ -21,10 +21,10 @@ from bench import DOCS
 from bench.accuracy.simulated import RATE_HZ, START_SIGMA_M, matchers
 from bench.pages.text import machine, table
 from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.formats.track import track_row
-from engine.report.metrics import Ground, summarise
-from engine.sim import FlightPlan, plan_flight
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.files.track import track_row
+from scenematch.report.metrics import Ground, summarise
+from scenematch.simulator import FlightPlan, plan_flight
 
 SEEDS = (1, 2, 31, 32, 71)
 """The ground below was worked out on the towns 21 to 26."""

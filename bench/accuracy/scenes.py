@@ -24,15 +24,15 @@ from bench import DOCS
 from bench.accuracy.field import figures
 from bench.pages import scenes as page
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.formats.track import TrackRow, track_row
 from engine.geo import enu_from_body
-from engine.report.metrics import errors_en_m
-from engine.sim import FlightStyle, Town, build_town, plan_flight, render_frame
-from engine.sim.flight import paper_camera
-from engine.sim.render import grid_from_enu
-from engine.sim.town import MAP_SENSOR
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
 from engine.values import Attitude, Truth
+from scenematch.files.track import TrackRow, track_row
+from scenematch.report.metrics import errors_en_m
+from scenematch.simulator import FlightStyle, Town, build_town, plan_flight, render_frame
+from scenematch.simulator.flight import paper_camera
+from scenematch.simulator.render import grid_from_enu
+from scenematch.simulator.town import MAP_SENSOR
 
 Array = NDArray[np.float64]
 

@@ -21,23 +21,23 @@ from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
 from engine import Camera, Frame, OrthoMap, Prior
-from engine.acceptance import judge_peak
-from engine.align import to_gray
 from engine.budget import Budget, Deadline
-from engine.confidence import PriorAgreement, peak_features
-from engine.covariance import score_sigma
-from engine.formats.flight import open_flight
-from engine.formats.truth import interpolate_truth, read_truth
-from engine.indexes.prepared import PreparedMap
-from engine.methods.correlation import Aligned, Correlator
-from engine.methods.options import NccOptions
-from engine.methods.query import Query
-from engine.methods.scheduler import Scheduler
+from engine.kernels.scores import SCORES, enhance
+from engine.maps.prepared import PreparedMap
+from engine.matching.acceptance import judge_peak
+from engine.matching.align import to_gray
+from engine.matching.confidence import PriorAgreement, peak_features
+from engine.matching.correlation import Aligned, Correlator
+from engine.matching.covariance import score_sigma
+from engine.matching.query import Query
 from engine.ncc_fft import match_template, prepare
-from engine.scores import SCORES, enhance
-from engine.sim import plan_flight
-from engine.threads import set_threads
+from engine.options import NccOptions
+from engine.runtime.scheduler import Scheduler
+from engine.runtime.threads import set_threads
 from engine.window import level_for
+from scenematch.files.flight import open_flight
+from scenematch.files.truth import interpolate_truth, read_truth
+from scenematch.simulator import plan_flight
 
 Gray = NDArray[np.uint8]
 
@@ -134,7 +134,7 @@ def fly(flight: Flight, score: str, site: OrthoMap | None = None) -> list[Trial]
 
 
 def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDArray[np.float64]) -> Trial:
-    """The steps of engine/methods/ncc.py, keeping the rival of the peak also where it is refused."""
+    """The steps of engine/matching/ncc.py, keeping the rival of the peak also where it is refused."""
     refused = Trial(np.inf, 0.0, False)
     site, height_m = query.site, query.frame.height_agl_m
     assert height_m is not None
@@ -240,8 +240,9 @@ def measure(data: Path) -> list[list[str]]:
 
 PAGE = f"""# Scores: what is correlated
 
-`NccOptions.score` selects the input of the zero-mean NCC. `engine.scores.enhance` computes it from the grey
-levels, in the same way for the map and for each frame; matching itself does not change, and nodata is left out.
+`NccOptions.score` selects the input of the zero-mean NCC. `engine.kernels.scores.enhance` computes it from the
+grey levels, in the same way for the map and for each frame; matching itself does not change, and nodata is left
+out.
 
 | score | what it is | when |
 |---|---|---|

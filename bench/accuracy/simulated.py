@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 from bench import DOCS
 from bench.pages.text import machine, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.formats.track import track_row
 from engine.geo import LocalFrame
-from engine.navigator_options import ACCEPT_ALL
-from engine.report.metrics import Ground, summarise
-from engine.sim import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
-from engine.sim.render import transformer
-from engine.threads import set_threads
+from engine.options import ACCEPT_ALL
+from engine.runtime.threads import set_threads
 from engine.values import Attitude
+from scenematch.files.track import track_row
+from scenematch.report.metrics import Ground, summarise
+from scenematch.simulator import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
+from scenematch.simulator.render import transformer
 
 SEEDS = (71, 72, 73, 74, 75)
 """No threshold was fitted on these towns."""

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from bench import SHARED
 from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
 from engine import Camera, Fix, Frame, OrthoMap, Prior
-from engine.formats.truth import interpolate_truth
 from engine.geo import enu_from_body
-from engine.sim import plan_flight
 from engine.values import Window
+from scenematch.files.truth import interpolate_truth
+from scenematch.simulator import plan_flight
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -24,7 +24,7 @@ from bench.accuracy.years import HALVES, SETS, YearPair, pairs, trial
 from bench.pages.integrity import calibration_error
 from bench.pages.text import table
 from engine import NoFix
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
 from engine.window import level_crop
 
 WITHIN_M = 6.0  # nearer than this a rival is the peak itself; a year's measured shift is good to a metre or two

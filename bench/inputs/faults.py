@@ -13,9 +13,9 @@ import rasterio
 from numpy.typing import NDArray
 
 from engine import Camera, Frame, OrthoMap
-from engine.formats.flight import open_flight
-from engine.formats.truth import read_truth
 from engine.values import Truth
+from scenematch.files.flight import open_flight
+from scenematch.files.truth import read_truth
 
 Array = NDArray[Any]
 Angles = Callable[[Array], Array]

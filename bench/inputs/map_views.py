@@ -17,12 +17,12 @@ from bench.accuracy.quality import Array, Gray, ViewPair
 from bench.inputs.scenes import flight
 from bench.inputs.views import Size, by_homography, open_shared
 from engine import Camera, Frame, OrthoMap
-from engine.align import to_gray, view_of
-from engine.formats.telemetry import ground_amsl_m
-from engine.formats.truth import interpolate_truth, read_truth
 from engine.geo import enu_from_body
+from engine.matching.align import to_gray, view_of
 from engine.values import Attitude, Truth, Window
 from engine.window import level_for
+from scenematch.files.telemetry import ground_amsl_m
+from scenematch.files.truth import interpolate_truth, read_truth
 
 ALIGNED = 0.75  # least correlation at which a photograph counts as aligned with its map
 _PHOTOGRAPHS = "caliterra"

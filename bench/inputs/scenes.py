@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera, Frame, OrthoMap, Prior
-from engine.sim import build_town, plan_flight
 from engine.values import Truth
+from scenematch.simulator import build_town, plan_flight
 
 Image = NDArray[np.float32]
 
@@ -45,7 +45,7 @@ def mosaic(side: int, shown: int | None = None) -> NDArray[np.uint8]:
 @cache
 def pair(window_px: int, template_px: int) -> tuple[Image, Image]:
     """A window of map, enhanced, and a noisy cut of it as template."""
-    from engine.scores import enhance
+    from engine.kernels.scores import enhance
 
     gray = mosaic(max(window_px, 1000), window_px)
     window = enhance(gray)

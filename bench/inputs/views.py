@@ -16,8 +16,8 @@ from bench import SHARED
 from bench.accuracy.quality import Array, Gray, ViewPair
 from bench.inputs.scenes import mosaic
 from engine import Frame
-from engine.align import to_gray
-from engine.formats.flight import Flight, open_flight
+from engine.matching.align import to_gray
+from scenematch.files.flight import Flight, open_flight
 
 Size = tuple[int, int]
 

@@ -21,13 +21,13 @@ from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_por
 from bench.live.bridge_minutes import minutes_real
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import machine, paragraph, table
-from engine.adapters.links import Connection
-from engine.adapters.mavlink import MavlinkBridge
-from engine.adapters.mavlink_out import MavlinkOptions
-from engine.adapters.mavlink_status import MIN_RATE_HZ
-from engine.adapters.vehicle import NedOrigin
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
+from scenematch.bridges.links import Connection
+from scenematch.bridges.mavlink import MavlinkBridge
+from scenematch.bridges.mavlink_out import MavlinkOptions
+from scenematch.bridges.mavlink_status import MIN_RATE_HZ
+from scenematch.bridges.vehicle import NedOrigin
 
 PAGE = DOCS / "mavlink-measured.md"
 BEGIN, END = "<!-- written by bench.live.bridge_hour -->", "<!-- end of what bench.live.bridge_hour writes -->"

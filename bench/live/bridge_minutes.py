@@ -13,9 +13,9 @@ from bench.live.bridge_counts import Growth, Received, free_port, place_off_m
 from bench.live.endless import Course, draw, there_and_back, warm
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
 from engine import Navigator
-from engine.adapters.links import Connection
-from engine.adapters.mavlink import MavlinkBridge
-from engine.adapters.mavlink_out import MavlinkOptions
+from scenematch.bridges.links import Connection
+from scenematch.bridges.mavlink import MavlinkBridge
+from scenematch.bridges.mavlink_out import MavlinkOptions
 
 
 def minutes_real(minutes: float, method: str) -> dict[str, Any]:

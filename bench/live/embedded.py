@@ -18,9 +18,9 @@ from bench import SHARED
 from bench.live.burden import hogs
 from bench.live.endless import GRACE_MS, PERCENTILES
 from engine import Budget, Camera, Fix, Frame, OrthoMap, Prior, SceneMatcher, set_realtime
-from engine.formats.flight import open_flight
-from engine.formats.truth import read_truth
-from engine.report.metrics import WRONG_M
+from scenematch.files.flight import open_flight
+from scenematch.files.truth import read_truth
+from scenematch.report.metrics import WRONG_M
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

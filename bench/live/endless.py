@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Budget, Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.navigator_options import ACCEPT_ALL
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M
-from engine.sim import plan_flight
+from engine.options import ACCEPT_ALL
+from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
+from scenematch.simulator import plan_flight
 
 Array = NDArray[np.float64]
 

@@ -24,10 +24,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
 from engine.errors import EngineError, TelemetryError
-from engine.formats.flight import open_flight
-from engine.formats.telemetry import TelemetryRow, read_telemetry
-from engine.formats.truth import Truth, read_truth
 from engine.geo import LocalFrame
+from scenematch.files.flight import open_flight
+from scenematch.files.telemetry import TelemetryRow, read_telemetry
+from scenematch.files.truth import Truth, read_truth
 
 FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 _REPORT_S = 5.0

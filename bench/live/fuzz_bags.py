@@ -49,8 +49,8 @@ def damaged(source: Path, target: Path, rng: np.random.Generator) -> None:
 
 def small_bag(path: Path, kind: str) -> None:
     from engine.camera import Camera
-    from engine.formats.ros.bag_writer import write_bag
     from engine.values import Frame, Prior
+    from scenematch.files.ros.bag_writer import write_bag
 
     rng = np.random.default_rng(1)
     frames = [
@@ -64,8 +64,8 @@ def small_bag(path: Path, kind: str) -> None:
 def read_all(path: Path) -> str:
     """What became of a bag: "flight", or "refused"; anything that is not one clear line is raised."""
     from engine.errors import EngineError
-    from engine.formats.flight import open_flight
-    from engine.formats.ros.bags import read_bag_camera
+    from scenematch.files.flight import open_flight
+    from scenematch.files.ros.bags import read_bag_camera
 
     said = ""
     try:
@@ -92,7 +92,7 @@ def _worker(tasks: multiprocessing.Queue, answers: multiprocessing.Queue) -> Non
 
 def fuzz(count: int, seed: int) -> tuple[Counter[str], float, list[float]]:
     """So many damaged bags, read in a process that is ended where it hangs; outcomes, and processor times."""
-    from engine.formats.ros.bag_writer import BAG_KINDS
+    from scenematch.files.ros.bag_writer import BAG_KINDS
 
     context = multiprocessing.get_context("spawn")
     rng, outcomes, times = np.random.default_rng(seed), Counter[str](), []

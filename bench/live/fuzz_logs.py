@@ -20,14 +20,14 @@ import numpy as np
 
 from bench.inputs.log_files import S, dataflash_flight, ulog_flight
 from engine.errors import EngineError
-from engine.formats.export import WRITERS, pose_rows
-from engine.formats.flight import _frame
-from engine.formats.logs.readers import open_log
-from engine.formats.resampling import UTC_FROM_NS, telemetry_at, truth_from_log
-from engine.formats.route import read_route
-from engine.formats.telemetry import TelemetryRow, ground_amsl_m, read_telemetry, write_telemetry
-from engine.formats.track import read_track
-from engine.formats.truth import interpolate_truth, read_truth
+from scenematch.files.export import WRITERS, pose_rows
+from scenematch.files.flight import _frame
+from scenematch.files.logs.readers import open_log
+from scenematch.files.resampling import UTC_FROM_NS, telemetry_at, truth_from_log
+from scenematch.files.route import read_route
+from scenematch.files.telemetry import TelemetryRow, ground_amsl_m, read_telemetry, write_telemetry
+from scenematch.files.track import read_track
+from scenematch.files.truth import interpolate_truth, read_truth
 
 LIMIT_S = 2.0
 """A file that takes longer is a hang."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.mavlink_in import HANDLED_MESSAGES, MavlinkTelemetry
-from engine.adapters.packets import PacketDecoder
 from engine.errors import EngineError
+from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, MavlinkTelemetry
+from scenematch.bridges.packets import PacketDecoder
 
 IMAGE = np.zeros((4, 4), np.uint8)
 

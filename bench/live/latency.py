@@ -27,7 +27,7 @@ from bench.live.soak import Growth, queue, soak
 from bench.live.startup import entries, startup
 from bench.live.tradeoff import tradeoff
 from bench.pages import latency
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
 
 JSON = ROOT / ".benchmarks" / "latency.json"
 BUDGETS_MS = (5.0, 10.0, 40.0, 121.0)

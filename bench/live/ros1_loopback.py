@@ -21,8 +21,8 @@ POSE, DIAGNOSTICS = "/scenematch/pose", "/diagnostics"
 
 def write_world(folder, frames, rate_hz, seed):
     """The flight's folder, and its frames in memory."""
-    from engine.formats.flight import write_flight_folder
-    from engine.sim import plan_flight
+    from scenematch.files.flight import write_flight_folder
+    from scenematch.simulator import plan_flight
 
     plan = plan_flight(seed, frames=frames, rate_hz=rate_hz)
     drawn = list(plan.iter_frames())
@@ -85,9 +85,9 @@ def play(plan, frames, rate_hz):
     import genpy
     import rospy
 
-    from engine.adapters.ros import find_class
-    from engine.formats.ros import bags
-    from engine.formats.ros.messages import MessageFactory
+    from scenematch.bridges.ros import find_class
+    from scenematch.files.ros import bags
+    from scenematch.files.ros.messages import MessageFactory
 
     rospy.init_node("player", disable_signals=True)
     listener = Listener(rospy)
@@ -141,7 +141,7 @@ def main():
         folder = Path(name)
         plan, frames = write_world(folder, wanted.frames, wanted.rate_hz, wanted.seed)
         row = plan.truth_rows()[0]
-        node = (sys.executable, "-m", "engine.cli", "bridge", "ros", "--map", str(folder / "map.tif"),
+        node = (sys.executable, "-m", "scenematch.cli", "bridge", "ros", "--map", str(folder / "map.tif"),
                 "--surface", str(folder / "dsm.tif"), "--method", wanted.method, "--json",
                 "--start", f"{row.lat_deg},{row.lon_deg},15", "--deadline-ms", "250")  # fmt: skip
         with process("rosmaster", "--core", "-p", str(PORT)):

@@ -33,8 +33,7 @@ from engine import (
     SceneMatcher,
     set_threads,
 )
-from engine.methods.options import SiftOptions
-from engine.pose import PoseOptions
+from engine.options import PoseOptions, SiftOptions
 
 SIDE_PX, MAP_PX, GSD_M = 64, 192, 0.5
 HEIGHT_M = GSD_M * SIDE_PX / (2.0 * math.tan(math.radians(30.0)))  # a pixel of the frame is one of the map

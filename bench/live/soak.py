@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bench.live.endless import START_NS, Course, fly, summary, warm
 from engine import Fix, Frame, Navigator, SceneMatcher
-from engine.live import Answer, Live, LiveOptions
+from engine.navigation.live import Answer, Live, LiveOptions
 
 Row = dict[str, Any]
 FACTORS = (2, 5, 10)

@@ -17,8 +17,8 @@ from unittest import mock
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.adapters.links import Connection, PeerAddress
 from engine.geo import LocalFrame
+from scenematch.bridges.links import Connection, PeerAddress
 
 S, MS = 1_000_000_000, 1_000_000
 TICK_NS = 20 * MS

@@ -22,8 +22,8 @@ from bench.resident import peak_mb
 Row = dict[str, Any]
 PARTS = ("Python", "import engine", "open map and flight", "warm-up", "first frame")
 ENTRIES = {
-    "scenematch --help": ("-m", "engine.cli", "--help"),
-    "scenematch track --help": ("-m", "engine.cli", "track", "--help"),
+    "scenematch --help": ("-m", "scenematch.cli", "--help"),
+    "scenematch track --help": ("-m", "scenematch.cli", "track", "--help"),
     "import engine": ("-c", "import engine"),
     "from engine import Camera, Frame, OrthoMap": ("-c", "from engine import Camera, Frame, OrthoMap"),
     "from engine import SceneMatcher": ("-c", "from engine import SceneMatcher"),
@@ -69,8 +69,8 @@ def _measured_entry(arguments: list[str]) -> list[float]:
 
 def startup(methods: tuple[str, ...] = ("ncc", "sift", "auto"), rounds: int = 1) -> list[Row]:
     """Every method with everything kept from an earlier start, and the last one with less."""
-    from engine.runs.simulation import write_flight
-    from engine.sim import plan_flight
+    from scenematch.runs.simulation import write_flight
+    from scenematch.simulator import plan_flight
 
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
@@ -111,8 +111,8 @@ def measured() -> Row:
     """This process, part by part."""
     marks = [float(sys.argv[3]), time.time()]
     from engine import Camera, Fix, OrthoMap, SceneMatcher
-    from engine.formats.flight import open_flight
-    from engine.threads import set_threads
+    from engine.runtime.threads import set_threads
+    from scenematch.files.flight import open_flight
 
     set_threads(1)
     marks.append(time.time())

@@ -6,8 +6,8 @@ from typing import Any
 
 from bench.live.endless import Course, draw, fly, summary, warm
 from engine import MatcherOptions
-from engine.runs.demo import PAPER_TABLE
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.runs.demo import PAPER_TABLE
 
 Row = dict[str, Any]
 BUDGETS_MS = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 80.0, 121.0)

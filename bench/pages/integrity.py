@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bench.accuracy.judged import METHODS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
 from bench.pages.text import paragraph, table
-from engine.report.metrics import FALSE_SIGMAS, WRONG_M
+from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -21,8 +21,8 @@ from bench import DOCS
 from bench.pages import sift
 from bench.pages.text import machine, table
 from bench.speed import growth, stages, whole_map
-from engine.report.figures import plain_log_ticks
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.report.figures import plain_log_ticks
 
 STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

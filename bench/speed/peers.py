@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from bench.accuracy.quality import Array, Gray, Keypoints, matches
 from engine import Budget, Camera, Fix, Frame, NoFix, OrthoMap, Prior
-from engine.align import to_gray, view_of
 from engine.budget import Deadline
 from engine.geo import attitude_from_rotation, enu_from_body
-from engine.methods.options import SiftOptions
-from engine.methods.query import Query
-from engine.methods.scheduler import Scheduler
-from engine.pose import AttitudePrior, PoseStats, solve_pose
+from engine.matching.align import to_gray, view_of
+from engine.matching.pose import AttitudePrior, PoseStats, solve_pose
+from engine.matching.query import Query
+from engine.options import SiftOptions
+from engine.runtime.scheduler import Scheduler
 from engine.values import Attitude, GridPose, Reason, Window
 from engine.window import level_crop, level_for
 

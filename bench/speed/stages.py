@@ -26,8 +26,8 @@ from bench.inputs.faults import load
 from bench.live.endless import draw
 from bench.speed.peers import OpenCvStep
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.formats.truth import interpolate_truth
-from engine.threads import set_threads
+from engine.runtime.threads import set_threads
+from scenematch.files.truth import interpolate_truth
 
 Array = NDArray[np.float64]
 FRAMES, BLOCK, SKIPPED = 160, 20, 4  # in all, in turns, and at the start of a block whose caches are the peer's

@@ -14,7 +14,7 @@ from bench.speed import peers
 from bench.speed.conftest import peak_memory_mb
 from engine import Fix, MatcherOptions, SceneMatcher, ncc_fft
 from engine.kernels import reference  # the float64 truth that errors are counted from
-from engine.methods.options import NccOptions
+from engine.options import NccOptions
 
 SIZES = [
     (96, 64),
@@ -132,8 +132,8 @@ def test_hypotheses(benchmark: Any, peer: str, threads: int) -> None:
     """36 headings x 5 scales over the paper's whole map: which place, which heading?"""
     from dataclasses import replace
 
-    from engine.align import rectify, view_of
-    from engine.scores import enhance
+    from engine.kernels.scores import enhance
+    from engine.matching.align import rectify, view_of
     from engine.values import Attitude, Window
 
     scene = flight()

@@ -19,7 +19,7 @@ from bench.inputs.views import Size, warped_pairs
 from bench.speed import peers
 from bench.speed.detectors import detectors
 from engine import Fix, MatcherOptions, SceneMatcher, set_threads
-from engine.methods.options import NccOptions, SiftOptions
+from engine.options import NccOptions, SiftOptions
 
 SIZES: list[Size] = [(150, 150), (300, 300), (640, 480)]
 BATCH = 16

@@ -19,9 +19,9 @@ import numpy as np
 from bench.inputs.scenes import flight, mosaic, town_gray
 from bench.resident import peak_mb
 from engine import Fix, MatcherOptions, OrthoMap, SceneMatcher, set_threads
-from engine.formats.geotiff import write_geotiff
-from engine.methods.options import NccOptions
-from engine.sim import build_town
+from engine.options import NccOptions
+from scenematch.files.geotiff import write_geotiff
+from scenematch.simulator import build_town
 
 
 def _write_map(path: Path, side: int) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import DTypeLike, NDArray
 from engine.errors import OptionError
 from engine.kernels import surface_loops
 from engine.kernels.transform_sizes import FLOAT32_NORM_RATIO, fast_length
-from engine.threads import in_parallel
+from engine.runtime.threads import in_parallel
 
 FloatImage = NDArray[np.float32]
 

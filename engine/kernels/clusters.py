@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 _MAX_SIDE = 2048  # cells along a side of the histogram
 _ROUNDS = 4  # of the mean shift from the fullest cells to the middle of the points

@@ -1,13 +1,13 @@
 """The loops of dense refinement over a few thousand samples, compiled by numba.
 
-Arrays of samples are (3, N), (2, N) or (N,) float64 as in :mod:`engine.dense`.
+Arrays of samples are (3, N), (2, N) or (N,) float64 as in :mod:`engine.kernels.dense`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 _BIWEIGHT = 4.685  # standard deviations at which the weight of Tukey's biweight reaches 0
 _MAD = 1.4826  # standard deviation of normal noise over its median absolute value

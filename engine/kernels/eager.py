@@ -11,7 +11,7 @@ import math
 from engine.errors import OptionError
 from engine.kernels import sums
 from engine.kernels.transform_sizes import FLOAT32_NORM_RATIO, fast_length
-from engine.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor, torch
 
 # A patch is flat where its sum of squares is below this share of the window's, which is rounding.
 _FLAT_SHARE = 1e-12

@@ -1,7 +1,7 @@
 """Gauss-Newton over the pose of dense refinement in one compiled loop, and the sums that its covariance needs.
 
 Arrays of samples are (3, N), (2, N) or (N,) float64, and the order of the eight parameters is that of
-:mod:`engine.dense`.
+:mod:`engine.kernels.dense`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from engine.kernels.dense_loops import compare_levels, project
-from engine.kernels.jit import compiled
 from engine.kernels.small_matrices import mirror, solve, turn, turn_between
+from engine.runtime.jit import compiled
 
 _PARAMETERS = 8
 

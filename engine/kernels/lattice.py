@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 _SEEN = 0.999  # of the weights of nodes that the frame can show, below which one of them is hidden
 

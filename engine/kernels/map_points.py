@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled
+from engine.runtime.jit import compiled
 
 
 @compiled("(f8[:, ::1], f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1])")

@@ -8,7 +8,7 @@ their differences cancel, so all of it is in float64.
 from __future__ import annotations
 
 from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
-from engine.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor, torch
 
 
 def ncc_surface(

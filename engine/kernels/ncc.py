@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from engine.device import Picture
 from engine.kernels import sums
 from engine.kernels.local import LocalScores
 from engine.kernels.sums import counts
+from engine.runtime.device import Picture
 
 if TYPE_CHECKING:
-    from engine.tensors import Tensor
+    from engine.runtime.tensors import Tensor
 
 __all__ = [
     "LocalScores",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 FORBIDDEN = -1e30
 """In place of the cosine of a pair that is not allowed."""

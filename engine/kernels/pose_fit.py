@@ -1,6 +1,6 @@
 """Gauss-Newton over the six parameters of a pose by matched points, in one compiled loop.
 
-Arrays of matches are (3, N), (2, N) or (N,) float64, and names are those of :mod:`engine.pnp`.
+Arrays of matches are (3, N), (2, N) or (N,) float64, and names are those of :mod:`engine.matching.pnp`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
 from engine.kernels.small_matrices import mirror, solve, turn, turn_between
+from engine.runtime.jit import compiled, inlined
 
 _SIX = 6
 _FAR_PX = 1e9  # assigned coordinates of points behind the camera

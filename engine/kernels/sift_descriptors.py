@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 _BOUND = 0.2  # of an entry before the last normalisation
 _LEAST = 1e-24  # which keeps an empty descriptor zero

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 TAPS = 4
 """Taps of a filter that one pass over a strip applies; filters are padded with zeros to a multiple of it."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import eager, ncc
-from engine.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor, torch
 
 Array = NDArray[np.float64]
 Group: TypeAlias = Sequence[tuple[Tensor, Tensor, Tensor]]

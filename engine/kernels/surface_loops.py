@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.jit import compiled, inlined
+from engine.runtime.jit import compiled, inlined
 
 # A patch is flat where its sum of squares is below this share of the window's, which is rounding.
 _FLAT_SHARE = 1e-12

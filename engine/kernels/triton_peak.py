@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from engine.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor, torch
 
 _BLOCK = 2048
 # Sizes, strides and offsets of views change with the window; specialising on them would compile in flight.

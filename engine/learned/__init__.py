@@ -6,7 +6,7 @@ tensors what a file holds. A weights file is opened as tensors only: a pickle th
 
 from typing import TYPE_CHECKING
 
-from engine.lazy_names import imported_on_use
+from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from engine.learned.keypoints import Extractor, Keypoints

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from engine.learned import superpoint
-from engine.tensors import Tensor, functional, nn, torch
+from engine.runtime.tensors import Tensor, functional, nn, torch
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from engine import device as devices
 from engine.errors import OptionError, require
 from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
 from engine.learned.matchers import KeypointMatcher, Loftr
 from engine.learned.superpoint import SuperPoint
 from engine.learned.weights import KINDS, Weights, fill, read_weights
-from engine.tensors import nn, torch
+from engine.runtime import device as devices
+from engine.runtime.tensors import nn, torch
 
 _EXTRACTORS = ("DISK", "ALIKED", "SuperPoint")
 _EXPECTED = "LoFTR, or LightGlue with DISK, ALIKED or SuperPoint"

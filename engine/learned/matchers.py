@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from engine.errors import DtypeError, ShapeError
 from engine.learned.keypoints import Extractor, Keypoints
-from engine.tensors import Tensor, functional, nn, torch
+from engine.runtime.tensors import Tensor, functional, nn, torch
 
 
 @dataclass(frozen=True, slots=True, eq=False)

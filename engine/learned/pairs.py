@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from engine.tensors import Tensor
+    from engine.runtime.tensors import Tensor
 
 
 class PairMatcher(Protocol):

@@ -7,7 +7,7 @@ References:
 
 from __future__ import annotations
 
-from engine.tensors import Tensor, functional, nn, torch
+from engine.runtime.tensors import Tensor, functional, nn, torch
 
 CELL_PX = 8
 """Side of the cell of pixels that shares one descriptor, and in which the detector chooses at most one place."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import OptionError
-from engine.tensors import Tensor, nn, torch
+from engine.runtime.tensors import Tensor, nn, torch
 
 KINDS = {
     "DISK": ("unet.path_down.0.1.3.weight",),

@@ -1,1 +1,1 @@
-"""Raster files as maps: grids, tiles, pyramids, surface models, and copies on a metric grid."""
+"""Raster files as maps: grids, tiles, pyramids, surface models, and what a method has prepared of a map, once."""

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from engine.cache_folder import cache_folder
 from engine.errors import MapError
 from engine.maps.grids import Grid, Warp, apply_affine, wgs84
 from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
 from engine.maps.xyz_tiles import TileCache
+from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
 MAX_SIDE_PX = 1_000_000

@@ -11,9 +11,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.runtime.tensors import Tensor, torch
 from engine.sift.keypoints import Points
 from engine.sift.scale_space import ScaleSpacePlan
-from engine.tensors import Tensor, torch
 
 Floats = NDArray[np.float32]
 

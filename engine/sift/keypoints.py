@@ -8,8 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from engine.runtime.tensors import Tensor, torch
 from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, ScaleSpacePlan
-from engine.tensors import Tensor, torch
 
 BORDER = 4  # octave pixels along the edge without keypoints
 EDGE_RATIO = 10.0

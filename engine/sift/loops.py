@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine import threads
 from engine.kernels.sift_descriptors import angles, descriptors
 from engine.kernels.sift_extrema import TAPS, find_extrema
 from engine.kernels.sift_refinement import refine_extrema
 from engine.kernels.sift_selection import spread_out
+from engine.runtime import threads
 from engine.sift.descriptors import CELL_SAMPLES, CELL_SIGMAS, ORIENT_STEP, orientation_weights, tents
 from engine.sift.keypoints import BORDER, EARLY, EDGE_RATIO, MAX_SHIFT, MOVES
 from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px

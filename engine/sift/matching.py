@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.runtime.tensors import Tensor, torch
 from engine.sift.values import Features, Matches
-from engine.tensors import Tensor, torch
 
 Floats = NDArray[np.float32]
 AnyArray = NDArray[Any]

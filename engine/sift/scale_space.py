@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from engine.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor, torch
 
 SCALES = 3  # DoG levels searched per octave, Lowe's s
 _LEVELS = SCALES + 3  # Gaussian levels per octave

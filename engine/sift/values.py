@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from engine.errors import require
-from engine.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor, torch
 
 
 @dataclass(frozen=True, slots=True)

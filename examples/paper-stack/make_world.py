@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from engine import EngineError, OrthoMap
-from engine.adapters.vehicle import NedOrigin, north_east_m
+from scenematch.bridges.vehicle import NedOrigin, north_east_m
 
 MODEL = """<?xml version="1.0"?>
 <sdf version="{sdf}">

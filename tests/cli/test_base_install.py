@@ -7,9 +7,9 @@ import tomllib
 
 import pytest
 
-from engine.cli.app import run
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from scenematch.cli.app import run
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
 
@@ -19,9 +19,9 @@ PROGRAM = """
 import json, sys
 for name in {absent}:
     sys.modules[name] = None
-import engine.runs.mavlink_bridge
-engine.runs.mavlink_bridge._AUTOPILOT_TIMEOUT_S = 0.1  # there is none
-from engine.cli.app import run
+import scenematch.runs.mavlink_bridge
+scenematch.runs.mavlink_bridge._AUTOPILOT_TIMEOUT_S = 0.1  # there is none
+from scenematch.cli.app import run
 print("CODES", json.dumps([run(line) for line in {lines}]))
 """
 

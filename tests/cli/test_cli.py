@@ -18,13 +18,13 @@ import rasterio
 import torch
 from PIL import Image
 
-from engine.cli import console
-from engine.cli.app import run
 from engine.errors import OptionError
-from engine.formats.geotiff import write_geotiff
-from engine.runs import tracking as track_module
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from scenematch.cli import console
+from scenematch.cli.app import run
+from scenematch.files.geotiff import write_geotiff
+from scenematch.runs import tracking as track_module
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.towns import drawn_town
 
 COLUMNS = (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from engine.cli.app import app, run
-from engine.formats.geotiff import write_geotiff
+from scenematch.cli.app import app, run
+from scenematch.files.geotiff import write_geotiff
 from tests.support.paths import ROOT
 
 HEAVY = ("torch", "numba", "numpy", "cv2", "rasterio", "pyproj", "matplotlib", "kornia", "PIL", "rich")
@@ -30,7 +30,7 @@ COMMANDS = list(commands(get_command(app)))
 def loaded_after(lines):
     """What a new interpreter printed by these commands, and the packages that it has loaded by then."""
     program = (
-        "import json, sys; from engine.cli.app import run; "
+        "import json, sys; from scenematch.cli.app import run; "
         f"codes = [run(line) for line in {lines}]; assert not any(codes), codes; "
         "print('LOADED', json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
     )
@@ -58,7 +58,7 @@ def test_completion_loads_nothing_that_only_work_needs():
     program = (
         "import atexit, sys; atexit.register(lambda: print('HEAVY', "
         f"[name for name in {HEAVY} if name in sys.modules])); "
-        "sys.argv[0] = 'scenematch'; from engine.cli import main; main()"
+        "sys.argv[0] = 'scenematch'; from scenematch.cli import main; main()"
     )
     asked = {"_SCENEMATCH_COMPLETE": "complete_bash", "COMP_WORDS": "scenematch bridge mavl", "COMP_CWORD": "2"}
     done = subprocess.run(

@@ -5,7 +5,7 @@ import json
 import pytest
 from typer.main import get_command
 
-from engine.cli.app import app, run
+from scenematch.cli.app import app, run
 
 
 def leaves(command, path=()):

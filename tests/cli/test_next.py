@@ -8,9 +8,9 @@ import shlex
 import pytest
 from typer.main import get_command
 
-from engine.cli import console
-from engine.cli.app import app, run
-from engine.report.campaign import CampaignRow
+from scenematch.cli import console
+from scenematch.cli.app import app, run
+from scenematch.report.campaign import CampaignRow
 from tests.cli.test_json import LEAVES
 
 pytestmark = pytest.mark.usefixtures("bare_runs")
@@ -95,8 +95,8 @@ def test_campaign_names_runs_that_it_finished(tmp_path, capsys, monkeypatch):
         CampaignRow("group", "bad", "ncc", None, None, "its camera does not fit"),
         *(CampaignRow("group", "good", name, None, None, None) for name in ("ncc", "sift", "auto")),
     ]
-    monkeypatch.setattr("engine.runs.campaign.run_campaign", lambda *_, **__: lines)
-    monkeypatch.setattr("engine.report.campaign.pool_runs", lambda _: [])
+    monkeypatch.setattr("scenematch.runs.campaign.run_campaign", lambda *_, **__: lines)
+    monkeypatch.setattr("scenematch.report.campaign.pool_runs", lambda _: [])
     words = next_of(capsys, ["campaign", "c.toml", f"--out={tmp_path / 'o'}"], code=1)
     assert words == ["report", *(str(tmp_path / "o" / "runs" / "good" / name) for name in ("ncc", "sift"))]
     del lines[1:]
@@ -105,7 +105,9 @@ def test_campaign_names_runs_that_it_finished(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize(("availability", "command"), [(0.9, "export"), (0.0, "check")])
 def test_a_closed_loop_without_a_fix_is_not_exported(tmp_path, capsys, monkeypatch, availability, command):
-    monkeypatch.setattr("engine.runs.closed_loop.fly_closed_loop", lambda *_, **__: {"availability": availability})
+    monkeypatch.setattr(
+        "scenematch.runs.closed_loop.fly_closed_loop", lambda *_, **__: {"availability": availability}
+    )
     words = next_of(capsys, ["simulate", f"--out={tmp_path / 'o'}", "--closed-loop"])
     assert parsed(words) == command
     assert (str(tmp_path / "o" / "telemetry.csv") in words) == (command == "check")

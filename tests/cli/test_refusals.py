@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from engine.cli.app import run
-from engine.covariance import AssumedErrors
 from engine.errors import OptionError, TelemetryError
-from engine.formats.geotiff import write_geotiff
-from engine.formats.telemetry import read_telemetry
+from engine.options import AssumedErrors
+from scenematch.cli.app import run
+from scenematch.files.geotiff import write_geotiff
+from scenematch.files.telemetry import read_telemetry
 
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
 PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]
@@ -89,7 +89,7 @@ def test_a_topic_is_of_a_bag(capsys):
 
 @pytest.mark.parametrize("source", ["9" * 20, "9" * 5000, "7", "²", "no-such-file.mp4"])
 def test_a_camera_that_does_not_open_is_told(source):
-    from engine.adapters.pictures import capture
+    from scenematch.bridges.pictures import capture
 
     with pytest.raises(TelemetryError, match=r"^camera_source: expected a camera or stream that opens, got "):
         next(capture(source))
@@ -97,7 +97,7 @@ def test_a_camera_that_does_not_open_is_told(source):
 
 @pytest.mark.parametrize("link", ["udpout:192.168..1:14550", f"udpout:{'x' * 300}:5", "tcp:a..b:5"])
 def test_a_host_that_cannot_be_one_is_told(link):
-    from engine.adapters.links import parse_connection
+    from scenematch.bridges.links import parse_connection
 
     with pytest.raises(OSError, match="is not a valid host name"):
         parse_connection(link).open()

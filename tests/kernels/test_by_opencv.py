@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import threads as chosen
 from engine.kernels import by_opencv, eager, reference
 from engine.ncc_fft import Search, ncc, prepare, surface
+from engine.runtime import threads as chosen
 
 
 def scores_of(search, templates, zero_mean=True):

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from engine.features import sift
-from engine.kernels import jit, sift_descriptors
+from engine.kernels import sift_descriptors
+from engine.runtime import jit
+from engine.runtime.threads import count, set_threads
 from engine.sift import descriptors, keypoints, loops, scale_space
-from engine.threads import count, set_threads
 
 CPU = torch.device("cpu")
 

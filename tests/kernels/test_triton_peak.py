@@ -19,8 +19,8 @@ import torch
 from engine.errors import ShapeError
 from engine.kernels import eager
 from engine.kernels import ncc as kernels
+from engine.kernels.peaks import find_peak
 from engine.ncc_fft import Search, match_template, match_templates, prepare, surface
-from engine.peaks import find_peak
 
 SHAPES = [
     (1, 1, 1),

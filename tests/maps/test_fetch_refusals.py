@@ -11,13 +11,13 @@ import pytest
 from pyproj import CRS
 
 from engine.errors import MapError, OptionError
-from engine.maps.fetching import client
-from engine.maps.fetching.client import Client, check_url, shown
-from engine.maps.fetching.heights import files_for, read_part
-from engine.maps.fetching.mosaic import Place, Wanted
-from engine.maps.fetching.services import chosen_crs
-from engine.maps.fetching.wmts import plan_wmts
-from engine.runs.map_fetch import FetchSettings, fetch_map
+from scenematch.fetch import client
+from scenematch.fetch.client import Client, check_url, shown
+from scenematch.fetch.heights import files_for, read_part
+from scenematch.fetch.mosaic import Place, Wanted
+from scenematch.fetch.services import chosen_crs
+from scenematch.fetch.wmts import plan_wmts
+from scenematch.runs.map_fetch import FetchSettings, fetch_map
 
 TILES = "http://127.0.0.1:9/{z}/{x}/{y}.png"  # nobody listens there
 

@@ -16,15 +16,15 @@ from rasterio.transform import Affine
 
 from engine import Fix, OrthoMap
 from engine.errors import MapError, OptionError
-from engine.maps.fetching import client
-from engine.maps.fetching.client import shown
-from engine.maps.fetching.heights import files_for
-from engine.maps.fetching.xyz import tile_url
-from engine.runs.map_fetch import FetchSettings, fetch_map
-from engine.runs.simulation import write_flight
-from engine.runs.single_image import locate_image
-from engine.sim import plan_flight
 from engine.values import Window
+from scenematch.fetch import client
+from scenematch.fetch.client import shown
+from scenematch.fetch.heights import files_for
+from scenematch.fetch.xyz import tile_url
+from scenematch.runs.map_fetch import FetchSettings, fetch_map
+from scenematch.runs.simulation import write_flight
+from scenematch.runs.single_image import locate_image
+from scenematch.simulator import plan_flight
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
 from tests.support.towns import drawn_town
@@ -509,7 +509,7 @@ def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
 
 
 def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
-    from engine.cli.app import run
+    from scenematch.cli.app import run
 
     out = tmp_path / "map.tif"
     given = [

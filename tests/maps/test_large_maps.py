@@ -13,12 +13,12 @@ from rasterio.windows import Window as RasterWindow
 from rich.console import Console
 
 from engine import Fix, MatcherOptions, NccOptions, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
-from engine.cli import console
-from engine.cli.app import run
 from engine.maps import metric_copy
 from engine.maps.rasters import GrayReader
-from engine.runs.checks import check_start
 from engine.values import Window
+from scenematch.cli import console
+from scenematch.cli.app import run
+from scenematch.runs.checks import check_start
 
 SIDE = 17_000
 CORNER = (12_288, 6_656)  # of the town on the large map: on its cells, so that the same landmarks are chosen
@@ -150,7 +150,7 @@ def test_a_vague_place_is_searched_coarse_to_fine_and_too_vague_a_one_refused(la
     assert isinstance(found, Fix)
     assert np.hypot(*(np.array(found.map_xy_px) - truth)) < 4.0
     assert found.window.area_px > 16e6
-    monkeypatch.setattr("engine.methods.ncc.MAX_WINDOW_PX", 100_000)
+    monkeypatch.setattr("engine.matching.ncc.MAX_WINDOW_PX", 100_000)
     refused = matcher.locate(frame, prior)
     assert isinstance(refused, NoFix)
     assert refused.reason is Reason.MAP_TOO_LARGE

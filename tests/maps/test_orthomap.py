@@ -14,10 +14,10 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.warp import calculate_default_transform, reproject
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
-from engine.formats.geotiff import write_geotiff
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
+from scenematch.files.geotiff import write_geotiff
 from tests.support.paths import SHARED
 
 UTM = "EPSG:32636"

@@ -8,16 +8,16 @@ import pytest
 from PIL import Image
 
 from engine import OptionError
-from engine.cli.app import run
-from engine.formats.logs.readers import LogClock
-from engine.formats.track import read_track
-from engine.report.comparison import draw_comparison
-from engine.runs.comparison import DEFAULT_RUNS, parse_runs
-from engine.runs.inputs import FlightFiles
-from engine.runs.settings import TrackSettings
-from engine.runs.simulation import write_flight
-from engine.runs.tracking import track
-from engine.sim import plan_flight
+from scenematch.cli.app import run
+from scenematch.files.logs.readers import LogClock
+from scenematch.files.track import read_track
+from scenematch.report.comparison import draw_comparison
+from scenematch.runs.comparison import DEFAULT_RUNS, parse_runs
+from scenematch.runs.inputs import FlightFiles
+from scenematch.runs.settings import TrackSettings
+from scenematch.runs.simulation import write_flight
+from scenematch.runs.tracking import track
+from scenematch.simulator import plan_flight
 from tests.support.towns import drawn_town
 
 
@@ -96,8 +96,8 @@ def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp
 
 def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_path, monkeypatch):
     compared = []
-    monkeypatch.setattr("engine.runs.comparison.compare", lambda files, *_, **__: compared.append(files) or {})
-    monkeypatch.setattr("engine.cli.tables.print_comparison", lambda *_: None)
+    monkeypatch.setattr("scenematch.runs.comparison.compare", lambda files, *_, **__: compared.append(files) or {})
+    monkeypatch.setattr("scenematch.cli.tables.print_comparison", lambda *_: None)
     log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
     options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}", f"--frame-stamps={stamps}"]
     assert run(command(flight, tmp_path, *options, "--log-offset-s=-1.5", "--image-topic=/down")) == 0

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from engine.formats.telemetry import TelemetryRow
-from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
-from engine.report.consistency import motion_consistency
-from engine.report.metrics import summarise
+from scenematch.files.telemetry import TelemetryRow
+from scenematch.files.track import TrackRow
+from scenematch.report.consistency import motion_consistency
+from scenematch.report.metrics import summarise
 
 FRAME = LocalFrame(48.2, 16.3)
 STEP_S = 0.5

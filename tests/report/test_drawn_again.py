@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from engine.cli.app import run
-from engine.runs.inputs import FlightFiles
-from engine.runs.settings import TrackSettings
-from engine.runs.simulation import write_flight
-from engine.runs.tracking import track
-from engine.sim import plan_flight
+from scenematch.cli.app import run
+from scenematch.runs.inputs import FlightFiles
+from scenematch.runs.settings import TrackSettings
+from scenematch.runs.simulation import write_flight
+from scenematch.runs.tracking import track
+from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
@@ -83,7 +83,7 @@ def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_dra
     finished, tmp_path, monkeypatch, capsys
 ):
     other = shutil.copytree(finished / "out", tmp_path / "other")
-    monkeypatch.setattr("engine.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
+    monkeypatch.setattr("scenematch.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
     page = tmp_path / "nofolder" / "x.html"
     assert run(["report", str(finished / "out"), str(other), f"--out={page}"]) == 2
     assert f"--out: expected a file in a folder that exists, got {page}" in capsys.readouterr().err

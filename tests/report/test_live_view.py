@@ -13,18 +13,18 @@ import pytest
 
 from bench.pages import browser
 from engine import Frame, Navigator, NoFix, Prior, Reason, SceneMatcher
-from engine.adapters.ros import RosBridge
-from engine.adapters.ros_out import RosOptions
-from engine.cli.app import run
-from engine.formats.ros.messages import MessageFactory
-from engine.formats.track import read_track
-from engine.live import Answer
-from engine.navigator import NavigatorState
-from engine.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
-from engine.runs.settings import TrackSettings
-from engine.runs.simulation import write_flight
-from engine.runs.tracking import track
-from engine.sim import plan_flight
+from engine.navigation.live import Answer
+from engine.navigation.navigator import NavigatorState
+from scenematch.bridges.ros import RosBridge
+from scenematch.bridges.ros_out import RosOptions
+from scenematch.cli.app import run
+from scenematch.files.ros.messages import MessageFactory
+from scenematch.files.track import read_track
+from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
+from scenematch.runs.settings import TrackSettings
+from scenematch.runs.simulation import write_flight
+from scenematch.runs.tracking import track
+from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
@@ -33,8 +33,8 @@ from pyarrow import duration, timestamp
 from rerun.chunk import RrdReader
 from rosbags.typesys import Stores, get_typestore
 
-from engine.report import live_view
-from engine.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
+from scenematch.report import live_view
+from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 
 FRAMES = 8
 DARK = 5  # a frame that shows nothing
@@ -246,9 +246,9 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
     answer = Answer(Frame(np.zeros((3, 3), np.uint8), 1), NoFix(reason=Reason.NO_TEXTURE), 1.0)
     quiet = lambda prior: None  # noqa: E731
     if bridge == "mavlink":
-        mavlink = pytest.importorskip("engine.adapters.mavlink", reason="pymavlink is not installed")
-        from engine.adapters.links import Connection
-        from engine.adapters.mavlink_out import MavlinkOptions
+        mavlink = pytest.importorskip("scenematch.bridges.mavlink", reason="pymavlink is not installed")
+        from scenematch.bridges.links import Connection
+        from scenematch.bridges.mavlink_out import MavlinkOptions
 
         made = mavlink.MavlinkBridge(
             Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append

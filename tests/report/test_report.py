@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from engine.formats.frames import read_image
-from engine.formats.track import TrackRow
 from engine.geo import LocalFrame
-from engine.report.figures import draw_figures, plain_log_ticks
-from engine.report.metrics import Ground, errors_en_m, summarise
 from engine.values import Truth
+from scenematch.files.frames import read_image
+from scenematch.files.track import TrackRow
+from scenematch.report.figures import draw_figures, plain_log_ticks
+from scenematch.report.metrics import Ground, errors_en_m, summarise
 
 HERE = LocalFrame(32.79, 34.99)
 SECOND_NS = 1_000_000_000

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from bench.pages.browser import missing, open_browser
-from engine.formats.track import read_track
-from engine.formats.truth import read_truth
 from engine.geo import LocalFrame
-from engine.report.metrics import summarise
-from engine.report.verdict import metres
-from engine.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
-from engine.runs.inputs import FlightFiles
-from engine.runs.reporting import report
-from engine.runs.settings import TrackSettings
-from engine.runs.tracking import track
+from scenematch.files.track import read_track
+from scenematch.files.truth import read_truth
+from scenematch.report.metrics import summarise
+from scenematch.report.verdict import metres
+from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
+from scenematch.runs.inputs import FlightFiles
+from scenematch.runs.reporting import report
+from scenematch.runs.settings import TrackSettings
+from scenematch.runs.tracking import track
 from tests.support.contrast import SCRIPT
 from tests.support.runs import bare_runs
 

@@ -10,23 +10,22 @@ from PIL import Image
 
 from bench.pages.browser import missing, open_browser
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
-from engine.acceptance import PeakRule
-from engine.formats.notes import FrameNote, frame_note, read_notes, write_notes
-from engine.formats.settings import changed, nested, options_from_mapping
-from engine.formats.track import TrackRow, read_track
-from engine.methods.options import MatcherOptions, NccOptions, SiftOptions
-from engine.report.charts import ChartArea, ticks
-from engine.report.explain import choose_frames
-from engine.report.finished_track import FinishedTrack
-from engine.report.metrics import Ground, TrackErrors, summarise
-from engine.report.page import write_page
-from engine.report.verdict import MEANINGS, verdict_of
-from engine.runs.evaluation import evaluate
-from engine.runs.settings import TrackSettings
-from engine.runs.simulation import write_flight
-from engine.runs.tracking import track
-from engine.sim import plan_flight
+from engine.options import MatcherOptions, NccOptions, PeakRule, SiftOptions
 from engine.values import Reason, Window
+from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
+from scenematch.files.settings import changed, nested, options_from_mapping
+from scenematch.files.track import TrackRow, read_track
+from scenematch.report.charts import ChartArea, ticks
+from scenematch.report.explain import choose_frames
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.metrics import Ground, TrackErrors, summarise
+from scenematch.report.page import write_page
+from scenematch.report.verdict import MEANINGS, verdict_of
+from scenematch.runs.evaluation import evaluate
+from scenematch.runs.settings import TrackSettings
+from scenematch.runs.simulation import write_flight
+from scenematch.runs.tracking import track
+from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 

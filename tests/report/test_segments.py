@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from engine.formats.track import TrackRow
-from engine.report.metrics import TrackErrors
-from engine.report.segments import segment_ends, segment_errors
+from scenematch.files.track import TrackRow
+from scenematch.report.metrics import TrackErrors
+from scenematch.report.segments import segment_ends, segment_errors
 
 
 def flown(seed=3, count=400, rate_hz=5.0):

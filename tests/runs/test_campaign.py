@@ -16,18 +16,18 @@ from dataclasses import replace
 import pytest
 
 from engine import OptionError
-from engine.cli.app import run
 from engine.errors import TelemetryError
-from engine.formats.logs.readers import LogClock
-from engine.formats.settings import read_settings
-from engine.formats.track import read_track
-from engine.report.campaign import CampaignRow, pool_runs, write_tables
-from engine.runs.campaign import _prepare
-from engine.runs.campaign_plan import Campaign, _content_hash, plan_campaign
-from engine.runs.executors import in_processes
-from engine.runs.jobs import read_result
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from scenematch.cli.app import run
+from scenematch.files.logs.readers import LogClock
+from scenematch.files.settings import read_settings
+from scenematch.files.track import read_track
+from scenematch.report.campaign import CampaignRow, pool_runs, write_tables
+from scenematch.runs.campaign import _prepare
+from scenematch.runs.campaign_plan import Campaign, _content_hash, plan_campaign
+from scenematch.runs.executors import in_processes
+from scenematch.runs.jobs import read_result
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
@@ -62,7 +62,15 @@ def place(tmp_path_factory):
 
 
 def command(place, out, *more):
-    return [sys.executable, "-m", "engine.cli", "campaign", str(place / "campaign.toml"), f"--out={out}", *more]
+    return [
+        sys.executable,
+        "-m",
+        "scenematch.cli",
+        "campaign",
+        str(place / "campaign.toml"),
+        f"--out={out}",
+        *more,
+    ]
 
 
 @contextlib.contextmanager
@@ -75,7 +83,7 @@ def in_this_process(*_):
 def whole(place):
     """The campaign in this process, from its begin to its end."""
     with pytest.MonkeyPatch.context() as patch, bare_runs():
-        patch.setattr("engine.runs.campaign._executor", in_this_process)
+        patch.setattr("scenematch.runs.campaign._executor", in_this_process)
         code = run(["campaign", str(place / "campaign.toml"), f"--out={place / 'whole'}"])
     assert code == 1  # the flight that cannot be followed
     return place / "whole"
@@ -156,7 +164,7 @@ def test_a_run_that_failed_is_tried_again_and_no_flight_is_drawn_for_nothing(
     out = tmp_path / "again"
     shutil.copytree(whole, out)
     shutil.rmtree(out / "flights")
-    monkeypatch.setattr("engine.runs.campaign._executor", in_this_process)
+    monkeypatch.setattr("scenematch.runs.campaign._executor", in_this_process)
     assert run(["campaign", str(place / "campaign.toml"), f"--out={out}", "--workers=1"]) == 1
     stated = capsys.readouterr().err
     assert "3 runs, 2 of them finished before" in stated

@@ -2,9 +2,9 @@
 
 import pytest
 
-from engine.diagnosis import Finding
-from engine.diagnosis.causes import IN_CALIBRATION
-from engine.runs.checking import _that_can_be_set
+from scenematch.check import Finding
+from scenematch.check.causes import IN_CALIBRATION
+from scenematch.runs.checking import _that_can_be_set
 
 LINE = "mount: [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
 

@@ -10,16 +10,16 @@ import pytest
 from PIL import Image
 
 from engine.camera import Camera, mount_rotation
-from engine.cli.app import run
 from engine.errors import CalibrationError, MapError, OptionError, TelemetryError
-from engine.formats.corrections import Corrections
-from engine.formats.flight import camera_info
-from engine.formats.geotiff import write_geotiff
-from engine.runs import BridgeFiles, FlightFiles
-from engine.runs.checks import check_pictures
-from engine.runs.evaluation import recorded_files
-from engine.runs.inputs import open_map
-from engine.runs.record import RunRecord
+from scenematch import BridgeFiles, FlightFiles
+from scenematch.cli.app import run
+from scenematch.files.corrections import Corrections
+from scenematch.files.flight import camera_info
+from scenematch.files.geotiff import write_geotiff
+from scenematch.runs.checks import check_pictures
+from scenematch.runs.evaluation import recorded_files
+from scenematch.runs.inputs import open_map
+from scenematch.runs.record import RunRecord
 from tests.support.photos import gimbal, photograph
 from tests.support.videos import write_video
 
@@ -205,7 +205,7 @@ def test_a_live_camera_by_its_field_of_view_has_the_size_of_its_first_picture(tm
 
 
 def test_a_live_camera_that_gives_no_picture_is_not_waited_for_without_end(monkeypatch):
-    monkeypatch.setattr("engine.adapters.pictures._FIRST_PICTURE_S", 0.1)
+    monkeypatch.setattr("scenematch.bridges.pictures._FIRST_PICTURE_S", 0.1)
     files = BridgeFiles(map="m.tif", camera_source="exec:sleep 60", hfov_deg=90.0)
     with pytest.raises(TelemetryError, match=r"camera_source: expected a picture within 0\.1 s, got none"):
         files.load_camera()

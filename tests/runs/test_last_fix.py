@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from engine.runs import last_fix
-from engine.runs.last_fix import LastFix, last_fix_file
+from scenematch.runs import last_fix
+from scenematch.runs.last_fix import LastFix, last_fix_file
 from tests.support.paths import ROOT
 
 FIX = SimpleNamespace(lat_deg=48.2, lon_deg=16.37, sigma_m=0.5)
@@ -19,7 +19,7 @@ SCRIPT = """
 import os, signal, sys
 from types import SimpleNamespace
 from pathlib import Path
-from engine.runs.last_fix import LastFix
+from scenematch.runs.last_fix import LastFix
 memory = LastFix(Path(sys.argv[1]))
 memory.keep(SimpleNamespace(lat_deg=48.2, lon_deg=16.37, sigma_m=0.5))
 os.kill(os.getpid(), signal.SIGKILL)

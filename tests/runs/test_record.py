@@ -6,8 +6,8 @@ from dataclasses import fields
 import pytest
 
 from engine.errors import OptionError, TelemetryError
-from engine.formats.settings import nested
-from engine.runs.record import RunRecord, read_record
+from scenematch.files.settings import nested
+from scenematch.runs.record import RunRecord, read_record
 
 RECORD = RunRecord(
     map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,

@@ -8,17 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-import engine.runs
+import scenematch.runs
 from engine import OptionError, TelemetryError
-from engine.cli.tables import print_summary
-from engine.diagnosis import Diagnosis, Finding
-from engine.diagnosis.findings import Contradiction
 from engine.errors import BackendError, MissingExtraError, require
 from engine.features import sift
-from engine.formats.ros.bags import import_rosbags
-from engine.formats.track import read_track
-from engine.formats.truth import read_truth
-from engine.runs import (
+from scenematch import (
     BridgeFiles,
     BridgeSettings,
     FlightFiles,
@@ -37,8 +31,14 @@ from engine.runs import (
     track,
     write_parameter_file,
 )
-from engine.runs.executors import on_ray
-from engine.runs.inputs import FOLDER_LAYOUT
+from scenematch.check import Diagnosis, Finding
+from scenematch.check.findings import Contradiction
+from scenematch.cli.tables import print_summary
+from scenematch.files.ros.bags import import_rosbags
+from scenematch.files.track import read_track
+from scenematch.files.truth import read_truth
+from scenematch.runs.executors import on_ray
+from scenematch.runs.inputs import FOLDER_LAYOUT
 
 FRAMES = 3
 pytestmark = pytest.mark.usefixtures("bare_runs")
@@ -182,19 +182,21 @@ def test_what_is_no_picture_is_not_located(flight, tmp_path):
 
 
 def test_the_public_names_are_sorted_and_there():
-    assert engine.runs.__all__ == sorted(engine.runs.__all__)
-    assert set(engine.runs.__all__) == set(" ".join(engine.runs._NAMES.values()).split())
-    for name in engine.runs.__all__:
-        assert getattr(engine.runs, name).__doc__
+    assert scenematch.__all__ == sorted(scenematch.__all__)
+    assert set(scenematch.__all__) == set(" ".join(scenematch._NAMES.values()).split())
+    for name in scenematch.__all__:
+        assert getattr(scenematch, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        engine.runs.nothing  # noqa: B018
+        scenematch.nothing  # noqa: B018
 
 
 @pytest.mark.slow
 def test_the_library_imports_nothing_optional_and_no_command_line():
-    loaded = "print(*[name for name in sys.modules if name.partition('.')[0] in wanted or 'engine.cli' in name])"
+    loaded = (
+        "print(*[name for name in sys.modules if name.partition('.')[0] in wanted or 'scenematch.cli' in name])"
+    )
     script = (
-        "import sys; from engine.runs import *; wanted = "
+        "import sys; from scenematch import *; wanted = "
         "{'rerun', 'ray', 'pymavlink', 'serial', 'rospy', 'rclpy', 'rosbags', 'pyulog', 'rich', 'typer'}; "
     )
     done = subprocess.run([sys.executable, "-c", script + loaded], capture_output=True, text=True, check=True)
@@ -205,7 +207,7 @@ def test_the_library_imports_nothing_optional_and_no_command_line():
 
 
 def serial_link():
-    from engine.adapters.links import parse_connection
+    from scenematch.bridges.links import parse_connection
 
     parse_connection("serial:/dev/null:57600").open()
 
@@ -216,7 +218,7 @@ def bridge():
 
 
 def ulog():
-    from engine.formats.logs.ulog import read_ulog
+    from scenematch.files.logs.ulog import read_ulog
 
     with tempfile.NamedTemporaryFile(suffix=".ulg") as file:
         Path(file.name).write_bytes(b"ULog\x01\x12\x35\x01" + bytes(64))
@@ -271,7 +273,7 @@ def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, 
     telemetry.write_text("\n".join([*lines[:-1], ",".join(last)]), encoding="utf-8")
     findings = [Finding("radians", "the heading is in radians", "--angles radians")] if is_wrong else []
     found = Diagnosis(findings, 16, 16, ("attitude",), (Contradiction("heading", 6 * is_wrong, 16),))
-    monkeypatch.setattr("engine.runs.tracking.diagnose_flight", lambda *_, **__: found)
+    monkeypatch.setattr("scenematch.runs.tracking.diagnose_flight", lambda *_, **__: found)
     given = {name: flight / file for name, file in FOLDER_LAYOUT.items() if name != "telemetry"}
     files = FlightFiles(**given, telemetry=telemetry)
     summary = track(files, tmp_path / "out", TrackSettings(method="ncc"), report=False)

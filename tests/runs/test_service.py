@@ -17,28 +17,28 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from engine.adapters.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS
-from engine.adapters.ros import RosStatus, RosTopics
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.formats.ros.messages import MessageFactory
-from engine.live import Counts
-from engine.realtime import _FIFO_CURE, _MEMORY_CURE
-from engine.runs import mavlink_bridge, service
-from engine.runs.bridge_files import BridgeFiles
-from engine.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
-from engine.runs.progress import Progress
-from engine.runs.ros_bridge import RosSettings, run_ros_bridge
-from engine.runs.service import _BEATS, running_service, status_reporter
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from engine.navigation.live import Counts
+from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
+from scenematch.bridges.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS
+from scenematch.bridges.ros import RosStatus, RosTopics
+from scenematch.files.ros.messages import MessageFactory
+from scenematch.runs import mavlink_bridge, service
+from scenematch.runs.bridge_files import BridgeFiles
+from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
+from scenematch.runs.progress import Progress
+from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
+from scenematch.runs.service import _BEATS, running_service, status_reporter
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
 
 UNIT = ROOT / "deploy" / "scenematch-bridge.service"
 HANGING = """
 import time
-from engine.runs.service import running_service
+from scenematch.runs.service import running_service
 with running_service() as beat:
     until = time.monotonic() + 0.5
     while time.monotonic() < until:
@@ -244,7 +244,7 @@ def test_a_process_that_want_of_memory_ends_is_replaced_by_the_bridge_and_its_ma
 
 
 def test_the_units_command_is_one_of_the_command_line(unit):
-    from engine.cli.app import run
+    from scenematch.cli.app import run
 
     program, *words = unit["ExecStart"].split()
     assert program.endswith("/scenematch")

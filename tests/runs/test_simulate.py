@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from engine.camera import Camera
-from engine.cli.app import run
-from engine.formats.flight import open_flight
-from engine.formats.track import read_track
-from engine.formats.truth import interpolate_truth, read_truth
 from engine.orthomap import OrthoMap
-from engine.sim import build_town
+from scenematch.cli.app import run
+from scenematch.files.flight import open_flight
+from scenematch.files.track import read_track
+from scenematch.files.truth import interpolate_truth, read_truth
+from scenematch.simulator import build_town
 from tests.support.runs import bare_runs
 
 FOLDER = {"frames", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif"}
@@ -73,7 +73,7 @@ def test_track_finds_the_way_through_it(folder, tmp_path):
 
 @pytest.mark.slow
 def test_one_seed_gives_the_same_bytes(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("engine.runs.simulation.build_town", build_town)  # drawn again, not taken again
+    monkeypatch.setattr("scenematch.runs.simulation.build_town", build_town)  # drawn again, not taken again
     again = tmp_path / "again"
     assert run(["simulate", "--out", str(again), "--frames", "2", "--seed", "1"]) == 0
     for name in ("map.tif", "dsm.tif", "camera.yaml", "frames/000000.jpg", "frames/000001.jpg"):

@@ -14,14 +14,14 @@ from types import SimpleNamespace
 import pytest
 
 from engine.errors import OptionError
-from engine.runs.supervisor import check_supervision
+from scenematch.runs.supervisor import check_supervision
 from tests.support.paths import ROOT
 
 SCRIPT = """
 import os, sys, time
 from types import SimpleNamespace
-from engine.runs.last_fix import LastFix
-from engine.runs.supervisor import become_worker, end_on_sigterm
+from scenematch.runs.last_fix import LastFix
+from scenematch.runs.supervisor import become_worker, end_on_sigterm
 shared = LastFix()
 become_worker()
 end_on_sigterm()

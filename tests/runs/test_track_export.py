@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from engine.formats.notes import read_notes
-from engine.formats.track import read_track
-from engine.runs import TrackSettings, export_track, track
-from engine.runs.simulation import write_flight
-from engine.sim import plan_flight
+from scenematch import TrackSettings, export_track, track
+from scenematch.files.notes import read_notes
+from scenematch.files.track import read_track
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from engine.formats.ros.messages import quaternion_xyzw
+from scenematch.files.ros.messages import quaternion_xyzw
 
 
 def odometry_message(maker, time_ns, angles_deg, enu_mps, *, yaw_deg=0.0, child="base_link", variances=None):

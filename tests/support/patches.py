@@ -6,9 +6,9 @@ import numpy as np
 
 from engine.camera import Camera
 from engine.geo import LocalFrame, enu_from_body
-from engine.sim import World
-from engine.sim.render import transformer
 from engine.values import Attitude
+from scenematch.simulator import World
+from scenematch.simulator.render import transformer
 
 EPSG = 32633
 GSD = 0.25

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from engine import OrthoMap, SceneMatcher
-from engine.report import figures
+from scenematch.report import figures
 
 BLANK = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
 

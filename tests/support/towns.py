@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 
 from engine import OrthoMap
-from engine.sim import Town, build_town
+from scenematch.simulator import Town, build_town
 
 kept_in: Path | None = None
 """The folder that the workers of a run share."""

@@ -3,9 +3,9 @@
 import sys
 
 from engine import EngineError, OptionError, set_threads
-from engine.adapters.ros import RosTopics
-from engine.adapters.ros2 import Node
-from engine.runs import BridgeSettings, RosSettings, run_ros_bridge
+from scenematch import BridgeSettings, RosSettings, run_ros_bridge
+from scenematch.bridges.ros import RosTopics
+from scenematch.bridges.ros2 import Node
 
 FILES = ("map", "surface", "camera", "start", "origin", "mount")
 """Parameters of text; an empty one is not given."""

@@ -1,6 +1,0 @@
-"""``python -m engine.cli`` is ``scenematch``."""
-
-from engine.cli import main
-
-if __name__ == "__main__":  # a process that is spawned imports this file under another name
-    main()

@@ -1,0 +1,341 @@
+"""The peak of one template coarse to fine: all positions at reduced resolution, the best few at full resolution.
+
+The error of the coarse scores is bounded by twice the largest error at the refined positions, and by at least what
+a match between coarse pixels loses. Where that bound does not exclude every other position, all of them have to be
+scored at full resolution; unless the window is wide and a :class:`QuickLook` settles what becomes of the frame.
+
+On a coarse level nodata is 0 in a picture about its mean, and costs positions that are mostly on the map little:
+their scores are divided by the share that is on the map, which makes up for that and more, where the template's
+contrast is spread evenly. At full resolution nodata is left out of all sums.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.kernels import ncc as kernels
+from engine.kernels.peaks import FAR, NEAR, best_positions, fit_summit
+from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MAX_HALVINGS, Search
+from engine.values import Peak
+
+FloatImage = NDArray[np.float32]
+
+WIDE_PX = 2_000_000
+"""Windows of more pixels are wide: every position at full resolution takes a tenth of a second and more."""
+_MIN_HALVED_PX = 128 * 128
+_CANDIDATES, _CANDIDATES_WIDE = 6, 64
+_SEPARATION_PX = 2  # of candidates, on the coarsest level
+_UPHILL_STEPS = 4  # within the reach of one LocalScores
+_MAX_LOSS = 0.5  # of a perfect match between the pixels of the coarsest level that serves a quick look
+
+
+@dataclass(frozen=True, slots=True)
+class QuickLook:
+    """Which peaks of a wide window are kept although not every position was scored at full resolution.
+
+    Attributes:
+        is_clear: whether a peak stands whose rival is taken to be as high as the coarse scores allow elsewhere.
+        is_hopeless: whether a peak is of no use even if nothing elsewhere is higher than the refined rivals.
+    """
+
+    is_clear: Callable[[Peak], bool]
+    is_hopeless: Callable[[Peak], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class _Refined:
+    """Candidates at full resolution.
+
+    Attributes:
+        found: each refined position with its candidate (x, y, score) of the coarsest level.
+        is_certain: whether they exclude every other position.
+        unresolved: the best coarse score of those that lie at the window's edge, and were not refined.
+    """
+
+    found: list[tuple[Peak, tuple[int, int, float]]]
+    is_certain: bool
+    unresolved: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Levels:
+    """A window and a template on its levels, the finest first.
+
+    Attributes:
+        parts: the window.
+        models: the template, of zero mean.
+        min_overlap: positions with a smaller share of the template on valid pixels do not count.
+    """
+
+    parts: list[Search]
+    models: list[FloatImage]
+    min_overlap: float
+
+    @property
+    def loss(self) -> float:
+        """What a perfect match loses at most between the coarsest level's pixels."""
+        return _phase_loss(self.models[-2], self.models[-1])
+
+    @property
+    def scale(self) -> int:
+        """Pixels of the finest level per pixel of the coarsest."""
+        return 1 << (len(self.parts) - 1)
+
+
+def is_wide(search: Search) -> bool:
+    """Whether a window has more than :data:`WIDE_PX` pixels."""
+    return int(np.prod(search.image.shape)) > WIDE_PX
+
+
+def peak(
+    search: Search,
+    template: FloatImage,
+    exclusion_px: float,
+    *,
+    min_overlap: float = 0.0,
+    quick: QuickLook | None = None,
+) -> Peak | None:
+    """The peak by way of the half-resolution levels.
+
+    Args:
+        search: (H, W) arrays.
+        template: (h, w) float32.
+        exclusion_px: radius about the peak within which no rival is counted.
+        min_overlap: positions where a smaller share of the template lies on valid pixels do not count.
+        quick: what is kept in a wide window beyond what is certain.
+
+    Returns:
+        Peak | None: as :func:`engine.kernels.peaks.find_peak`, the second score being that of a coarse level where
+        that is higher than the refined rivals; None where positions elsewhere are not excluded.
+    """
+    wide = quick is not None and is_wide(search)
+    levels = _levels(search, template, min_overlap, _MAX_LOSS if wide else 1.0)
+    if levels is None:
+        return None  # nothing to gain
+    scores = _coarse_scores(levels)
+    count = _CANDIDATES_WIDE if wide else _CANDIDATES
+    candidates = best_positions(scores, _SEPARATION_PX, count + 1)
+    refinement = _refined_candidates(levels, scores, candidates, count, stops=not wide)
+    if not refinement.found:
+        return None
+    best, origin = max(refinement.found, key=lambda pair: pair[0].score)
+    rivals = [
+        (refined, candidate)
+        for refined, candidate in refinement.found
+        if math.hypot(refined.x - best.x, refined.y - best.y) > exclusion_px
+    ]
+    second = max((refined.score for refined, _ in rivals), default=-1.0)
+    rest = _coarse_rest(scores, [candidate for _, candidate in rivals], levels.scale, best, exclusion_px)
+    by_coarse_scores = replace(best, second_score=max(rest, second))
+    if refinement.is_certain:
+        return by_coarse_scores
+    if quick is None or not wide or refinement.unresolved >= origin[2]:
+        return None
+    # A place between coarse pixels has more at full resolution than the coarse score shows.
+    pessimistic = replace(best, second_score=max(min(rest / (1.0 - levels.loss), 1.0), second))
+    if quick.is_clear(pessimistic):
+        return pessimistic
+    return by_coarse_scores if quick.is_hopeless(replace(best, second_score=second)) else None
+
+
+def best_places(
+    search: Search, template: FloatImage, separation_px: float, count: int, *, min_overlap: float = 0.0
+) -> list[tuple[int, int, float]] | None:
+    """The highest positions of a wide window among those that are highest at reduced resolution.
+
+    Args:
+        search: (H, W) arrays.
+        template: (h, w) float32.
+        separation_px: positions are more than this apart in x or in y.
+        count: upper bound on their number.
+        min_overlap: see :func:`peak`.
+
+    Returns:
+        (x, y, score) in falling order of the score; None where there is no coarser level.
+    """
+    levels = _levels(search, template, min_overlap, _MAX_LOSS)
+    if levels is None:
+        return None
+    scores = _coarse_scores(levels)
+    candidates = best_positions(scores, _SEPARATION_PX, _CANDIDATES_WIDE)
+    found = [refined for x, y, _ in candidates if (refined := _refined(levels, scores, x, y)[0]) is not None]
+    kept: list[tuple[int, int, float]] = []
+    for each in sorted(found, key=lambda refined: -refined.score):
+        x, y = round(each.x), round(each.y)
+        if all(max(abs(x - u), abs(y - v)) > separation_px for u, v, _ in kept):
+            kept.append((x, y, each.score))
+    return kept[:count]
+
+
+def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
+    """The levels on which there is something to gain, or None where the finest is the only one.
+
+    Args:
+        search: the window.
+        template: (h, w) float32.
+        min_overlap: see :func:`peak`.
+        max_loss: of a perfect match between pixels, beyond which a level is too coarse.
+    """
+    parts, models = [search], [template - template.mean()]
+    while True:
+        part, model = parts[-1], models[-1]
+        (H, W), (h, w) = part.image.shape, model.shape
+        if len(parts) > MAX_HALVINGS or part.half is None or min(h, w) < 2 * COARSE_TEMPLATE_PX:
+            break
+        if H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
+            break
+        coarser = kernels.halved(model)
+        if max_loss < 1.0 and _phase_loss(model, coarser) > max_loss:
+            break
+        parts.append(part.half)
+        models.append(coarser)
+    return _Levels(parts, models, min_overlap) if len(parts) > 1 else None
+
+
+def surfaces_over_nodata(
+    search: Search, templates: FloatImage, *, min_overlap: float, group: int
+) -> Iterator[FloatImage]:
+    """Scores of many templates with nodata taken as 0, which are about those that leave it out.
+
+    Args:
+        search: (H, W) arrays with ``counts``, about 0.
+        templates: (T, h, w) float32.
+        min_overlap: positions where a smaller share of a template lies on valid pixels score -1.
+        group: number of templates at a time, which bounds the memory.
+
+    Returns:
+        Yields T surfaces (H-h+1, W-w+1).
+    """
+    assert search.counts is not None
+    model = (templates.shape[1], templates.shape[2])
+    inverse_norms = kernels.inverse_norm(search.image, search.sums, *model)
+    share = _share_on_map(search.counts, model, 1, inverse_norms.shape)
+    for first in range(0, len(templates), group):
+        part = templates[first : first + group]
+        part = part - part.mean((-2, -1), keepdims=True)
+        yield from _scores_by_share(search, part, inverse_norms, share, min_overlap)
+
+
+def _coarse_scores(levels: _Levels) -> FloatImage:
+    """Scores on the coarsest level, of what lies partly on nodata about as at full resolution."""
+    coarse, model = levels.parts[-1], levels.models[-1]
+    inverse_norms = kernels.inverse_norm(coarse.image, coarse.sums, *model.shape)
+    counts, (h, w), step = levels.parts[0].counts, levels.models[0].shape, levels.scale
+    if counts is None:
+        return np.asarray(kernels.prepared_surface(coarse.image, inverse_norms, model[None])[0])
+    share = _share_on_map(counts, (h, w), step, inverse_norms.shape)
+    # A position between those of the level has this much more of the template on the map at most.
+    least = levels.min_overlap - step * (1.0 / h + 1.0 / w)
+    return np.asarray(_scores_by_share(coarse, model[None], inverse_norms, share, least)[0])
+
+
+def _scores_by_share(
+    part: Search, models: FloatImage, inverse_norms: FloatImage, share: FloatImage, least: float
+) -> FloatImage:
+    """Scores (T, H', W') divided by the share that is on the map; -1 where that is less than ``least``."""
+    is_off = share < max(least, 1e-3)
+    inverse_norms[is_off] = 0.0
+    scores: FloatImage = kernels.prepared_surface(part.image, inverse_norms, models)
+    np.divide(scores, share, out=scores, where=(share < 1.0) & (scores > 0.0))
+    scores[:, is_off] = -1.0
+    return np.asarray(np.minimum(scores, np.float32(1.0), out=scores))
+
+
+def _share_on_map(
+    counts: NDArray[np.int32], model: tuple[int, int], step: int, shape: tuple[int, ...]
+) -> FloatImage:
+    """Share of a template's pixels (h, w) that are valid, at every ``step``-th position of the finest level."""
+    (h, w), (rows, columns) = model, counts.shape
+    y = np.minimum(np.arange(shape[0]) * step, rows - 1 - h)
+    x = np.minimum(np.arange(shape[1]) * step, columns - 1 - w)
+    inside = counts[np.ix_(y + h, x + w)] - counts[np.ix_(y, x + w)]
+    inside += counts[np.ix_(y, x)] - counts[np.ix_(y + h, x)]
+    return np.asarray(inside / np.float32(h * w), np.float32)
+
+
+def _refined_candidates(
+    levels: _Levels, scores: FloatImage, candidates: list[tuple[int, int, float]], count: int, *, stops: bool
+) -> _Refined:
+    """Refine candidates until they exclude every other position.
+
+    Args:
+        levels: of window and template.
+        scores: on the coarsest level.
+        candidates: in falling order, one more than ``count`` where there are as many.
+        count: upper bound on what is refined.
+        stops: return nothing as soon as it is known that they do not exclude every other position.
+    """
+    loss = levels.loss
+    found: list[tuple[Peak, tuple[int, int, float]]] = []
+    best, error, unresolved, is_certain = -math.inf, 0.0, -1.0, True
+    for index, candidate in enumerate(candidates):
+        if found and is_certain and candidate[2] + error < best:
+            break  # candidates are in falling order: none of the rest can win
+        refined, is_summit = _refined(levels, scores, *candidate[:2]) if index < count else (None, False)
+        is_certain = is_certain and is_summit
+        if stops and not is_certain:
+            return _Refined([], False, unresolved)
+        if refined is None:
+            unresolved = max(unresolved, candidate[2]) if index < count else unresolved
+            continue
+        found.append((refined, candidate))
+        best = max(best, refined.score)
+        error = max(error, 2.0 * abs(refined.score - candidate[2]) + 0.01, loss * best + 0.01)
+    return _Refined(found, is_certain, unresolved)
+
+
+def _phase_loss(fine: FloatImage, coarse: FloatImage) -> float:
+    """What a perfect match loses on the coarser of two levels where it is between that level's pixels."""
+    between = kernels.halved(fine[1:, 1:]).ravel()
+    model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
+    norm = math.sqrt(float(np.dot(between, between)) * float(np.dot(model, model)))
+    return 1.0 - float(np.dot(between, model)) / norm if norm > 0.0 else 1.0
+
+
+def _coarse_rest(
+    scores: FloatImage, rivals: list[tuple[int, int, float]], scale: int, best: Peak, exclusion_px: float
+) -> float:
+    """The best coarse score outside the peak's exclusion zone and away from the refined rivals."""
+    remaining, r = scores.copy(), _SEPARATION_PX
+    for x, y, _ in rivals:
+        remaining[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
+    down, across = (
+        np.square(np.arange(n) * scale - at) for n, at in zip(remaining.shape, (best.y, best.x), strict=True)
+    )
+    remaining[down[:, None] + across <= exclusion_px**2] = -1.0
+    return float(remaining.max())
+
+
+def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak | None, bool]:
+    """A coarse position at full resolution, and whether it is a summit there and not at the edge of anything.
+
+    None where it is on the border of the coarse level, or too much of it on nodata.
+    """
+    if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
+        return None, False
+    part, model, scale = levels.parts[0], levels.models[0], levels.scale
+    dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
+    y, x = round(scale * (y + dy)), round(scale * (x + dx))
+    scorer = kernels.LocalScores(part.image, model, (y, x), part.counts, levels.min_overlap)
+    for uphill in range(_UPHILL_STEPS + 1):
+        if not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
+            return None, False
+        around = scorer.at(y + NEAR[0], x + NEAR[1]).reshape(3, 3)
+        if around.max() <= -1.0:
+            return None, False
+        if uphill == _UPHILL_STEPS:
+            return Peak(x, y, float(around[1, 1]), -1.0, np.zeros((2, 2))), False
+        best = int(around.argmax())
+        if best == 4:
+            break
+        y, x = y + best // 3 - 1, x + best % 3 - 1
+    wide = np.zeros((5, 5))
+    wide[1:4, 1:4] = around
+    wide[FAR[0] + 2, FAR[1] + 2] = scorer.at(y + FAR[0], x + FAR[1])
+    dx, dy, curvature = fit_summit(wide)
+    return Peak(x + dx, y + dy, float(around[1, 1]), -1.0, curvature), True

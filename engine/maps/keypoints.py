@@ -1,0 +1,111 @@
+"""The map's keypoints by a network, described once tile by tile as the flight reaches them, looked up by window.
+
+A tile is described with the neighbourhood beyond its edges. A network that normalises over the whole picture, as
+DISK does, still describes a tile a little differently than the level in one piece.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from engine.learned import KeypointMatcher, Keypoints
+from engine.maps.landmarks import as_picture
+from engine.maps.recently_used import RecentlyUsed
+from engine.runtime.tensors import torch
+from engine.values import Window
+
+if TYPE_CHECKING:  # a map is built on what lies here
+    from engine.orthomap import OrthoMap
+
+TILE_PX = 512
+"""Tiles begin on multiples of this in every level."""
+HALO_PX = 64
+"""Margin around a tile that is read for description."""
+PX_PER_KEYPOINT = 64
+"""A tile has at most one keypoint for so many pixels."""
+MAX_KEYPOINTS = 1 << 18
+"""Keypoints kept in memory, besides those of the last window; one takes up to 520 bytes."""
+_NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
+
+_Key = tuple[int, int, int]  # level, row and column of the tile
+
+
+class KeypointMap:
+    """Cache of the keypoints of one map.
+
+    Args:
+        site: the map.
+        matcher: whose extractor describes it.
+    """
+
+    def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
+        self._site, self._matcher = site, matcher
+        self._tiles: RecentlyUsed[_Key, Keypoints] = RecentlyUsed()
+
+    @property
+    def created(self) -> int:
+        """Tiles described so far."""
+        return self._tiles.created
+
+    def find(self, window: Window, level: int, count: int) -> Keypoints:
+        """The strongest keypoints of a window.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: of the map's pyramid.
+            count: upper bound on the keypoints; where there are more, every tile keeps the same share of its own.
+
+        Returns:
+            Keypoints: in pixels of the window.
+        """
+        corner = np.array([window.x0, window.y0], np.float32)
+        size = np.array([window.width_px, window.height_px], np.float32)
+        keys = _keys(window, level)
+        parts = []
+        for tile in [self._tiles.get(key, partial(self._describe, *key)) for key in keys]:
+            xy = tile.xy_px - tile.xy_px.new_tensor(corner)
+            inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
+            parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
+        self._tiles.evict(len, MAX_KEYPOINTS, keep=len(keys))
+        share = min(1.0, count / max(1, sum(map(len, parts))))
+        parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
+        return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
+
+    def _describe(self, level: int, row: int, column: int) -> Keypoints:
+        """The keypoints of a tile, in pixels of the level."""
+        rows, columns = self._site.level_shape(level)
+        x0, y0 = column * TILE_PX, row * TILE_PX
+        x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
+        left, top = max(0, x0 - HALO_PX), max(0, y0 - HALO_PX)
+        wide = Window(left, top, min(columns, x1 + HALO_PX) - left, min(rows, y1 + HALO_PX) - top)
+        picture = as_picture(self._site.gray(wide, level), torch.device("cpu"))
+        found = self._matcher.extract(picture, math.ceil(wide.area_px / PX_PER_KEYPOINT))
+        xy = found.xy_px + found.xy_px.new_tensor([left, top])
+        own = ((xy >= xy.new_tensor([x0, y0]) - 0.5) & (xy < xy.new_tensor([x1, y1]) - 0.5)).all(dim=1)
+        if not self._site.fully_valid:
+            own &= self._on_data(found, wide, level)
+        return Keypoints(xy, found.strength, found.descriptors).only(own)
+
+    def _on_data(self, found: Keypoints, wide: Window, level: int) -> torch.Tensor:
+        """Which keypoints (N,) of a window lie on the map's data and not at its edge."""
+        valid = torch.from_numpy(self._site.valid(wide, level))[None, None].float()
+        side = 2 * _NODATA_PX + 1
+        holes = torch.nn.functional.max_pool2d(1.0 - valid, side, stride=1, padding=_NODATA_PX)[0, 0]
+        x, y = found.xy_px.round().long().cpu().T
+        last_y, last_x = (n - 1 for n in holes.shape)
+        return (holes[y.clamp(0, last_y), x.clamp(0, last_x)] == 0).to(found.xy_px.device)
+
+
+def _fields(points: Keypoints) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return points.xy_px, points.strength, points.descriptors
+
+
+def _keys(window: Window, level: int) -> list[_Key]:
+    """The tiles that a window of a level touches."""
+    rows = range(window.y0 // TILE_PX, (window.y0 + window.height_px - 1) // TILE_PX + 1)
+    columns = range(window.x0 // TILE_PX, (window.x0 + window.width_px - 1) // TILE_PX + 1)
+    return [(level, row, column) for row in rows for column in columns]

@@ -1,0 +1,252 @@
+"""The map's features, detected once: 3D points with their descriptors, looked up by window.
+
+A level of the map is described tile by tile as the flight reaches it, or all at once before the flight
+(:meth:`LandmarkMap.prepare`), and then cached in a file. A tile is described with the neighbourhood beyond its
+edges, so that the tiles together equal the level described in one piece.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.features import Features, sift
+from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
+from engine.maps.recently_used import RecentlyUsed
+from engine.runtime.tensors import download, torch, upload
+from engine.values import Window
+
+if TYPE_CHECKING:  # a map is built on what lies here
+    from engine.orthomap import OrthoMap
+
+Array = NDArray[np.float64]
+
+DETECTOR_VERSION = 3
+"""Part of the key of cached landmarks; to be raised with every change of detector or descriptor."""
+MIN_CONTRAST = 0.005
+"""Lowe's contrast threshold: bare ground has little, and where there is more the strongest are taken."""
+TILE_PX = 256
+"""Tiles begin on multiples of this in every level."""
+HALO_PX = 64
+"""Margin around a tile that is read for detection; the descriptor of nearly every keypoint ends within it."""
+CELL_PX = 64
+"""Landmarks are ranked by strength within square cells of the level."""
+MAX_PER_CELL = 96
+PREPARED_PX = 16 << 20
+"""Largest number of pixels of the levels that are prepared at once, and of a level that is searched as a whole."""
+MAX_LANDMARKS = 1 << 19
+"""Landmarks cached in memory, besides those of the last window; one takes 300 bytes.
+
+Where more were prepared before the flight the limit is raised to their number, up to 236 MB.
+"""
+_SLOTS = 8192  # more than the detector finds in a tile
+_STORED: Kinds = {
+    "xy_px": (np.float32, (2,)),  # in pixels of the level
+    "scale_px": (np.float32, ()),
+    "angle_deg": (np.float32, ()),
+    "rank": (np.uint8, ()),  # by strength within its cell
+    "descriptors": (np.float16, (128,)),  # half the memory, and the same matches
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """Features of a part of the map.
+
+    Attributes:
+        features: batch of one, N slots, in pixels of the level, on the device.
+        xy_px: (N, 2) their positions once more, where no device must be asked.
+        points_m: (N, 3) east, north and height of the surface.
+    """
+
+    features: Features
+    xy_px: NDArray[np.float32]
+    points_m: Array
+
+
+_Key = tuple[int, bool, int, int]  # level, upright, row and column of the tile
+
+
+class LandmarkMap:
+    """Cache of the landmarks of one map.
+
+    Args:
+        site: the map.
+        device: of detection and of the returned features; the cache is in the CPU's memory.
+    """
+
+    def __init__(self, site: OrthoMap, device: str | torch.device) -> None:
+        self._site, self._device = site, device
+        self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
+        self._max_landmarks = MAX_LANDMARKS
+
+    @property
+    def created(self) -> int:
+        """Tiles described so far."""
+        return self._tiles.created
+
+    def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
+        """The landmarks of a window.
+
+        Args:
+            window: in pixels of the level, inside it.
+            level: of the map's pyramid.
+            upright: every angle is 0, along the map's x axis, instead of the dominant gradient's.
+            per_px: upper bound on landmarks per pixel; each cell keeps its strongest.
+
+        Returns:
+            Landmarks: those whose keypoint is inside the window.
+        """
+        keys = _keys(window, level, upright)
+        tiles = [self._tile(key) for key in keys]
+        self._tiles.evict(_count, self._max_landmarks, keep=len(keys))
+        max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
+        return self._to_landmarks(_gathered(tiles, [_inside(tile, window, max_rank) for tile in tiles]))
+
+    def prepare(self, levels: Iterable[int] | None = None) -> None:
+        """Describe whole levels, upright and not, and cache them in a file where the map comes from one.
+
+        Args:
+            levels: in order of preference, up to :data:`PREPARED_PX` in all; None takes all, the coarsest first.
+        """
+        pixels = 0
+        for level in reversed(range(self._site.levels)) if levels is None else levels:
+            pixels += math.prod(self._site.level_shape(level))
+            if pixels > PREPARED_PX:
+                break
+            for upright in (True, False):
+                self._prepare(level, upright)
+        # No more than what is prepared now: a large map, of which little is prepared, keeps the usual limit.
+        self._max_landmarks = max(self._max_landmarks, sum(map(_count, self._tiles.values())))
+
+    def _prepare(self, level: int, upright: bool) -> None:
+        rows, columns = self._site.level_shape(level)
+        whole = Window(0, 0, columns, rows)
+        keys = _keys(whole, level, upright)
+        if all(key in self._tiles for key in keys):
+            return
+        if not self._site.from_file:
+            for key in keys:
+                self._tile(key)
+            return
+        settings = (DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
+        name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
+        stored = load_arrays(name, _STORED)
+        if stored is None:
+            found = _concatenated([self._tile(key) for key in keys])
+            save_arrays(name, {field: found[field] for field in _STORED})
+            return
+        at = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX
+        for key in keys:
+            own = (at == (key[3], key[2])).all(axis=1)
+            self._tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
+
+    def _tile(self, key: _Key) -> NamedArrays:
+        """A tile, which becomes the most recently used."""
+        level = key[0]
+        return self._tiles.get(key, lambda: self._with_points(self._detect(*key), level))
+
+    def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
+        """Every keypoint on a tile, as it would be detected in the whole level."""
+        rows, columns = self._site.level_shape(level)
+        x0, y0 = column * TILE_PX, row * TILE_PX
+        x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
+        left, top = max(0, x0 - HALO_PX), max(0, y0 - HALO_PX)
+        wide = Window(left, top, min(columns, x1 + HALO_PX) - left, min(rows, y1 + HALO_PX) - top)
+        inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
+        mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
+        mask[inner] = True if self._site.fully_valid else self._site.valid(wide, level)[inner]
+        if not mask.any():
+            return {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
+        found = sift(
+            as_picture(self._site.gray(wide, level), self._device),
+            max_keypoints=_SLOTS,
+            upright=upright,
+            mask=torch.from_numpy(mask)[None, None].to(self._device),
+            contrast_threshold=MIN_CONTRAST,
+            spread=1,  # by strength alone; landmarks are spread by the cells of the level
+        )
+        fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
+        valid, *all_slots = download([values[0] for values in fields])
+        positions, scale, angle, descriptors = (values[valid] for values in all_slots)
+        xy = positions + np.array([left, top], np.float32)
+        rank = _rank_in_cells(xy)
+        kept = np.flatnonzero(rank < MAX_PER_CELL)
+        scale, angle, descriptors = scale[kept], angle[kept], descriptors[kept]
+        arrays = (xy[kept], scale, angle, rank[kept], descriptors)
+        return {name: a.astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
+
+    def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
+        map_px = self._site.full_from_level(tile["xy_px"], level)
+        return tile | {
+            "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
+        }
+
+    def _to_landmarks(self, found: NamedArrays) -> Landmarks:
+        columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
+        xy, scale, angle, descriptors = (column[None] for column in upload(columns, self._device))
+        valid = torch.ones(1, len(found["rank"]), dtype=torch.bool, device=self._device)
+        return Landmarks(Features(xy, scale, angle, descriptors.float(), valid), found["xy_px"], found["points_m"])
+
+
+def _count(tile: NamedArrays) -> int:
+    return len(tile["rank"])
+
+
+def as_picture(gray: NDArray[np.uint8], device: str | torch.device) -> torch.Tensor:
+    """Grey levels as a batch of one picture for :func:`engine.features.sift`.
+
+    Args:
+        gray: (H, W).
+        device: of the result.
+
+    Returns:
+        (1, 1, H, W) float32 in [0, 1].
+    """
+    return torch.from_numpy(np.ascontiguousarray(gray)).to(device)[None, None].float() / 255.0
+
+
+def _keys(window: Window, level: int, upright: bool) -> list[_Key]:
+    """The tiles that a window of a level touches."""
+    bottom, right = window.y0 + window.height_px - 1, window.x0 + window.width_px - 1
+    rows = range(window.y0 // TILE_PX, bottom // TILE_PX + 1)
+    columns = range(window.x0 // TILE_PX, right // TILE_PX + 1)
+    return [(level, upright, row, column) for row in rows for column in columns]
+
+
+def _inside(tile: NamedArrays, window: Window, max_rank: int) -> NDArray[np.intp]:
+    """Indices of a tile's landmarks in a window, those below a rank."""
+    x, y = tile["xy_px"].T
+    left, top = window.x0 - 0.5, window.y0 - 0.5
+    inside = (x >= left) & (x < left + window.width_px) & (y >= top) & (y < top + window.height_px)
+    return np.flatnonzero(inside & (tile["rank"] < max_rank))
+
+
+def _gathered(parts: list[NamedArrays], indices: list[NDArray[np.intp]]) -> NamedArrays:
+    """Chosen rows of all parts one after the other, copied once."""
+    ends = np.cumsum([len(index) for index in indices])
+    found = {name: np.empty((ends[-1], *like.shape[1:]), like.dtype) for name, like in parts[0].items()}
+    for part, index, end in zip(parts, indices, ends, strict=True):
+        for name, values in part.items():
+            out = found[name][end - len(index) : end]
+            values.take(index, axis=0, out=out, mode="clip")  # "raise" would copy twice
+    return found
+
+
+def _concatenated(parts: list[NamedArrays]) -> NamedArrays:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _rank_in_cells(xy_px: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(N,) how many before each are in the same cell."""
+    column, row = (np.rint(xy_px).astype(np.int64) // CELL_PX).T
+    _, cell, counts = np.unique(np.stack([row, column]), axis=1, return_inverse=True, return_counts=True)
+    order = np.argsort(cell.ravel(), kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return rank

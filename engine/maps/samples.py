@@ -1,0 +1,121 @@
+"""Samples of the map for dense refinement: its steepest pixels with their 3D positions, taken once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.kernels.dense import Samples
+from engine.maps.prepared import WHOLE_LEVEL_PX, FloatImage
+from engine.maps.recently_used import RecentlyUsed
+from engine.values import Window
+
+if TYPE_CHECKING:  # a map is built on what lies here
+    from engine.orthomap import OrthoMap
+
+Enhanced = Callable[[Window, int], tuple[FloatImage, NDArray[np.bool_] | None]]
+
+BLOCK_PX = 4
+"""One sample is taken of every block of this side: the pixel with the steepest gradient."""
+CELL_PX = 256
+"""Of a large level samples are taken cell by cell, on the cells of the prepared map."""
+MAX_CELLS = 256
+MAX_SAMPLES = 2000
+_ROUGH_REACH_PX = 1.5  # pixels of the level from a sample at which roughness is measured
+
+
+class SampleMap:
+    """Cache of samples of one map for dense refinement.
+
+    Args:
+        site: the map.
+        enhanced: a window of a level of the same map, enhanced, and its mask; see
+            :func:`engine.maps.prepared.enhanced_part`.
+    """
+
+    def __init__(self, site: OrthoMap, enhanced: Enhanced) -> None:
+        self._site, self._enhanced = site, enhanced
+        self._cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
+
+    @property
+    def created(self) -> int:
+        """Cells sampled so far."""
+        return self._cells.created
+
+    def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
+        """Samples of a window.
+
+        Args:
+            window: in pixels of the level, inside it, at least :data:`BLOCK_PX` wide and high.
+            level: of the map's pyramid.
+            max_samples: about as many at most.
+
+        Returns:
+            Samples: in metres east, north and up.
+        """
+        from engine.kernels.map_points import every_nth  # numba takes a while to import
+
+        step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
+        for cell in self._cells_under(window, level):
+            samples, (rows, columns) = self._cell(cell, level)
+            x, y = window.x0 - cell.x0, window.y0 - cell.y0
+            last = (
+                min(rows, -(-(y + window.height_px) // BLOCK_PX)),
+                min(columns, -(-(x + window.width_px) // BLOCK_PX)),
+            )  # blocks; the remainder beyond a cell's last one has none
+            first = (min(max(0, y // BLOCK_PX), last[0]), min(max(0, x // BLOCK_PX), last[1]))
+            arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
+            parts.append(every_nth(arrays, first, last, columns, step))
+        if len(parts) == 1:
+            return Samples(*parts[0])
+        return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def _cells_under(self, window: Window, level: int) -> list[Window]:
+        height, width = self._site.level_shape(level)
+        if width * height <= WHOLE_LEVEL_PX:
+            return [Window(0, 0, width, height)]
+        cells = [
+            Window(x, y, min(CELL_PX, width - x), min(CELL_PX, height - y))
+            for y in range(window.y0 // CELL_PX * CELL_PX, window.y0 + window.height_px, CELL_PX)
+            for x in range(window.x0 // CELL_PX * CELL_PX, window.x0 + window.width_px, CELL_PX)
+        ]
+        # The remainder beyond a level's last whole cell may be narrower than a block: no sample is taken there.
+        return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
+
+    def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
+        """Samples of a cell, row by row, and the number of their rows and columns."""
+        found = self._cells.get((level, cell), partial(self._sampled, cell, level))
+        self._cells.evict(lambda _: 1, MAX_CELLS, keep=0)
+        return found
+
+    def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
+        picture, mask = self._enhanced(cell, level)
+        across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
+        shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
+        rows, columns = _steepest(cv2.magnitude(across, down), shape)
+        xy_px = self._site.full_from_level(np.stack([columns + cell.x0, rows + cell.y0], axis=-1), level)
+        weights = np.ones(len(rows))
+        if mask is not None:
+            weights = mask[rows, columns].astype(np.float64)
+        height_m = self._site.surface_at(xy_px)
+        weights *= self._site.roughness_weight_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
+        points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
+        per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
+        metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # nearly constant over a cell
+        gradients = per_px @ np.linalg.inv(metres_per_px)
+        return Samples(points, picture[rows, columns].astype(np.float64), gradients, weights), shape
+
+
+def _steepest(size: NDArray[np.float32], shape: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the largest value in each block, block row by block row."""
+    blocks = size[: shape[0] * BLOCK_PX, : shape[1] * BLOCK_PX].reshape(shape[0], BLOCK_PX, shape[1], BLOCK_PX)
+    best = blocks.transpose(0, 2, 1, 3).reshape(shape[0], shape[1], -1).argmax(axis=-1)
+    rows = np.arange(shape[0])[:, None] * BLOCK_PX + best // BLOCK_PX
+    columns = np.arange(shape[1])[None] * BLOCK_PX + best % BLOCK_PX
+    return rows.ravel(), columns.ravel()

@@ -1,0 +1,41 @@
+"""How a frame is matched: one file a method, and the steps that the methods share.
+
+A method is a class derived from :class:`engine.matching.method.Method`. A new one is a file and a line in
+:data:`BY_PROFILE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from engine.errors import OptionError
+
+if TYPE_CHECKING:
+    from engine.matching.method import Method
+
+BY_PROFILE: Mapping[str, Mapping[str, str]] = {
+    "engine": {"ncc": "ncc.Ncc", "sift": "sift.Sift", "auto": "auto.Auto", "learned": "learned.Learned"},
+    "paper": {"ncc": "paper.PaperNcc", "sift": "paper.PaperSift"},
+}
+"""The class of each method, in its module. It is imported when a matcher is made: options need no torch."""
+METHODS = tuple(BY_PROFILE["engine"])
+CLASSICAL = tuple(name for name in METHODS if name != "learned")
+"""Those that need no file of weights."""
+
+
+def method_type(name: str, profile: str) -> type[Method]:
+    """The class of a method.
+
+    Raises:
+        OptionError: there is none of this name, or not in this profile.
+    """
+    if name not in METHODS:
+        raise OptionError(f"method: expected one of {', '.join(METHODS)}, got {name!r}")
+    methods = BY_PROFILE[profile]
+    if name not in methods:
+        raise OptionError(f"method: the {profile}'s profile has {' and '.join(methods)}, got {name!r}")
+    module, _, of_module = methods[name].partition(".")
+    found: type[Method] = getattr(import_module(f"engine.matching.{module}"), of_module)
+    return found

@@ -1,0 +1,129 @@
+"""The auto method: NCC and SIFT, each a second opinion of the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.matching.acceptance import agree_in_height, agree_in_place, offset_between_m
+from engine.matching.explanation import Explanation
+from engine.matching.method import Method
+from engine.matching.ncc import Ncc
+from engine.matching.query import Query
+from engine.matching.sift import Sift
+from engine.options import MatcherOptions
+from engine.orthomap import OrthoMap
+from engine.runtime.device import Device
+from engine.runtime.scheduler import OutOfTime
+from engine.values import Fix, NoFix, Reason, Result, Window
+
+
+class Auto(Method):
+    """NCC where height and heading are known, then SIFT where there is time; two fixes must agree.
+
+    Args:
+        site: the map.
+        device: where tensors live.
+        options: settings of both.
+    """
+
+    loops = tuple(dict.fromkeys(Ncc.loops + Sift.loops))
+
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
+        self.ncc = Ncc(site, device, options)
+        self.sift = Sift(site, device, options, self.ncc.samples)
+
+    @property
+    def parts(self) -> Mapping[str, Method]:
+        """Both, by name."""
+        return {"ncc": self.ncc, "sift": self.sift}
+
+    @property
+    def cache_counters(self) -> dict[str, int]:
+        """How many entries of each cache were created so far."""
+        return self.ncc.cache_counters | self.sift.cache_counters
+
+    def prepare(self) -> None:
+        """Prepare both methods' indexes of the map."""
+        for part in self.parts.values():
+            part.prepare()
+
+    def warmup(self, query: Query) -> None:
+        """Run every variant of every step of both methods."""
+        self.ncc.warmup(query)
+        self.sift.warmup(query)
+
+    def warmup_search(self, query: Query) -> None:
+        """Search the whole map by both, or headings and heights about the prior by NCC."""
+        if query.prior is None:
+            self.locate(query)
+        else:
+            self.ncc.warmup_search(query)
+
+    def locate(self, query: Query) -> Result:
+        """The more accurate of two fixes that agree, or the only one.
+
+        The second method makes a fix more certain. It comes last, so that for lack of time nothing is lost to it.
+        """
+        if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
+            return self.sift.locate(query)
+        first = self.ncc.begin(query, try_turns=False)  # SIFT finds the heading by itself
+        # A wrong attitude displaces the peak; refinement, which measures it, leads back.
+        refined = self.ncc.refine(query, first)
+        if isinstance(refined, Fix) and refined.stage == "refined":
+            first = refined
+        second = self._second(query, first if isinstance(refined, Fix) else refined)
+        if isinstance(first, NoFix):
+            if isinstance(second, Fix):
+                return second
+            both = first.candidates + second.candidates
+            return replace(first if second.reason is Reason.LATE else second, candidates=both)
+        if isinstance(second, NoFix):
+            return refined
+        offset_m = offset_between_m(first, second)
+        if not agree_in_place(first, second):
+            if float(np.hypot(*offset_m)) < self.ncc.options.rule.exclusion_m:
+                return _vaguer(second, offset_m)
+            detail = f"NCC and SIFT are {float(np.hypot(*offset_m)):.1f} m apart"
+            return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
+        if not agree_in_height(first, second):
+            return _vaguer(second, offset_m)
+        fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
+        # Both compare one picture with one map under one prior, so their odds are not multiplied.
+        stated = [fix.confidence for fix in fixes if fix.confidence is not None]
+        best = min(fixes, key=lambda fix: fix.sigma_m)
+        return replace(best, stage="verified", confidence=max(stated, default=None))
+
+    def _second(self, query: Query, first: Result) -> Result:
+        try:
+            if not isinstance(first, Fix):
+                return self.sift.locate(query)
+            with query.scheduler.with_fix():
+                if first.stage == "coarse":  # no pose that is refined yet: SIFT's will be
+                    return self.sift.locate(query)
+                return self.sift.confirm(query, partial(_agree, first))
+        except OutOfTime:
+            return query.refuse(Reason.LATE, "the budget was spent before there was a second fix", "sift")
+
+    def explain(self, query: Query, window: Window) -> Explanation:
+        """As NCC does."""
+        return self.ncc.explain(query, window)
+
+
+def _agree(first: Fix, second: Fix) -> bool:
+    return agree_in_place(first, second) and agree_in_height(first, second)
+
+
+def _vaguer(second: Fix, offset_m: NDArray[np.float64]) -> Fix:
+    """The fix of SIFT where NCC found the same place, but not as nearly as both state.
+
+    No other place lies so near. Telemetry in error moves the patch that NCC looks for; the pose rests less on it.
+    Which one is off is unknown: the covariance covers both.
+    """
+    covariance_m2 = second.covariance_m2.copy()
+    covariance_m2[:2, :2] += offset_m[:, None] * offset_m
+    return replace(second, covariance_m2=covariance_m2)

@@ -1,0 +1,325 @@
+"""Correlation of one hypothesis: the frame aligned with the map by a height and a heading, and its peak."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.kernels import coarse_to_fine
+from engine.kernels.coarse_to_fine import QuickLook
+from engine.kernels.peaks import best_positions, find_peak
+from engine.kernels.scores import enhance
+from engine.maps.prepared import PreparedMap, Region
+from engine.matching.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
+from engine.matching.oblique import is_oblique, oblique_patch
+from engine.matching.query import Query
+from engine.ncc_fft import match_template, ncc
+from engine.options import NccOptions
+from engine.runtime.device import Picture, placed
+from engine.runtime.scheduler import OutOfTime
+from engine.values import GridPose, NoFix, Peak, Reason, Window
+from engine.window import SPREAD_SIGMAS, level_crop
+
+Array = NDArray[np.float64]
+
+METHOD = "ncc"
+_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
+_MIN_SIDE_PX = 24  # of what is correlated there
+_EVERY_PLACE = "every place of a wide window"  # a step
+_GROUND_SHARE = 0.3  # of the height: within this distance of a frame's middle its ground is taken for a plane
+_SPREAD_SIGMAS = 2.0  # and within so many sigmas of the prior, where the position is less certain
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """A frame in the pixels of one level of the map's pyramid.
+
+    Attributes:
+        pose: the height and heading by which it was aligned.
+        level: of the pyramid.
+        jacobian: (2, 2) metres per pixel of the level.
+        view: how the ground is seen.
+        patch: the rectified frame.
+        template: (h, w) the patch, enhanced.
+    """
+
+    pose: GridPose
+    level: int
+    jacobian: Array
+    view: GroundView
+    patch: Patch
+    template: NDArray[np.float32]
+
+    def work_px(self, window: Window) -> float:
+        """Pixels of a window on this level."""
+        return float(window.area_px >> 2 * self.level)
+
+
+@dataclass(frozen=True, slots=True)
+class Correlator:
+    """One frame with the map that it is correlated with.
+
+    Attributes:
+        query: the frame.
+        prepared: the map.
+        options: settings.
+    """
+
+    query: Query
+    prepared: PreparedMap
+    options: NccOptions
+
+    def align(self, pose: GridPose, level: int, nadir_px: Array | None = None) -> Aligned | NoFix:
+        """Equations 2 and 3: the frame in the pixels of one map level.
+
+        Args:
+            pose: the height and heading to align it by.
+            level: of the pyramid.
+            nadir_px: (2,) where its ground is looked up; None takes the prior's place, or level ground.
+        """
+        query, options = self.query, self.options
+        attitude, height = pose.grid_attitude, pose.height_agl_m
+        assert attitude is not None  # a hypothesis has both
+        assert height is not None
+        jacobian = query.jacobian * 2.0**level
+        if is_oblique(query, attitude):
+            return self._align_oblique(pose, level, nadir_px)
+        view = view_of(query.camera, attitude, height, jacobian)
+        if view is not None:
+            slope = self._slope(view, height, level, nadir_px)
+            if slope.any():
+                view = view_of(query.camera, attitude, height, jacobian, slope) or view
+        if view is None:
+            return query.refuse_tilted(attitude, METHOD)
+        rows, columns = query.site.level_shape(level)
+        if (MIN_SHRINK * options.fraction) ** 2 * view.area_px > rows * columns:
+            return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
+        patch = rectify(query.gray, query.camera, view, fraction=options.fraction)
+        if patch is None:
+            detail = "the frame covers fewer than 8 x 8 pixels of the map"
+            return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
+        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        return Aligned(pose, level, jacobian, view, patch, enhanced)
+
+    def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
+        """The patches of the null hypothesis, as large as the frame's: upside down, and mirrored.
+
+        They show no place on Earth. Where the compass is wrong by half a turn, or the camera's picture comes
+        mirrored, one of them shows the true one.
+        """
+        query, own, attitude = self.query, aligned.patch.gray, aligned.pose.grid_attitude
+        turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
+        if attitude is not None and not is_oblique(query, attitude):
+            mirrored = np.ascontiguousarray(query.gray[:, ::-1])
+            patch = rectify(mirrored, query.camera, aligned.view, fraction=self.options.fraction)
+        return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
+
+    def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
+        """An oblique frame drawn over the ground's relief; its view is that of the part which is correlated."""
+        query, options = self.query, self.options
+        attitude, height = pose.grid_attitude, pose.height_agl_m
+        assert attitude is not None
+        assert height is not None
+        place = query.prior_px if nadir_px is None else nadir_px
+        patch = oblique_patch(query, attitude, height, level, place)
+        if patch is None:
+            return query.refuse_tilted(attitude, METHOD)
+        size = np.array(patch.gray.shape[::-1], np.float64)
+        extent = (float(size[0]), float(size[1]))
+        view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
+        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
+
+    def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
+        """Rise (2,) of the ground per pixel of the level, about a wider area the vaguer the prior is."""
+        query = self.query
+        reach_m, place = _GROUND_SHARE * height_m, nadir_px
+        if place is None and query.prior is not None:
+            reach_m, place = max(reach_m, _SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
+        if place is None:
+            return np.zeros(2)
+        return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
+
+    def window(self, aligned: Aligned) -> Window | None:
+        """The adaptive window in full-resolution map pixels; the whole map where there is no prior."""
+        query = self.query
+        nadir = query.prior_px
+        if nadir is None:
+            return Window(0, 0, query.site.width_px, query.site.height_px)
+        scale = 2.0**aligned.level
+        height, width = aligned.template.shape
+        footprint = (aligned.view.footprint_px[0] * scale, aligned.view.footprint_px[1] * scale)
+        center = nadir + aligned.view.center_px * scale
+        min_px = ((width + 4) * scale, (height + 4) * scale)
+        return query.window(center, footprint, min_px, margin=self.options.margin)
+
+    def near(self, aligned: Aligned, nadir_px: Array, slack_px: int) -> Window:
+        """The window that holds the template about a nadir, and so many full-resolution pixels to each side."""
+        site, scale = self.query.site, 2**aligned.level
+        height, width = aligned.template.shape
+        x0, y0 = (int(v) - slack_px for v in np.round(nadir_px + aligned.patch.offset_px * scale))
+        x1 = min(site.width_px, x0 + width * scale + 2 * slack_px)
+        y1 = min(site.height_px, y0 + height * scale + 2 * slack_px)
+        x0, y0 = max(0, x0), max(0, y0)
+        return Window(x0, y0, max(1, x1 - x0), max(1, y1 - y0))
+
+    def cut(self, window: Window, level: int) -> Region:
+        """The prepared map under a window of full-resolution pixels."""
+        return self.prepared.cut(level_crop(self.query.site, window, level), level)
+
+    def search(self, aligned: Aligned, window: Window, quick: QuickLook | None = None) -> Peak | None:
+        """The peak in a window, in pixels of the aligned level; None where the template is nowhere on the map.
+
+        Args:
+            aligned: the hypothesis.
+            window: in full-resolution map pixels.
+            quick: what is kept in a wide window although not every place was scored.
+        """
+        query, options = self.query, self.options
+        height, width = aligned.template.shape
+        with query.scheduler.stage("map"):
+            region = self.cut(window, aligned.level)
+        if region.window.width_px < width or region.window.height_px < height:
+            return None
+        exclusion_px = options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+        quick = None if quick is None else _about(quick, region.window)
+        peak = self._peak(region, aligned.template, exclusion_px, quick)
+        return None if peak.score <= -1.0 and region.valid is not None else _moved(peak, region.window)
+
+    def _peak(
+        self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
+    ) -> Peak:
+        """The peak coarse to fine where that suffices, else of every place, if there is time for it."""
+        scheduler, search = self.query.scheduler, region.search
+        with scheduler.stage("match"):
+            found = self._coarse_to_fine(region, template, exclusion_px, quick)
+            if found is not None:
+                return found
+            if not (coarse_to_fine.is_wide(search) and self._has_coarse_levels(region)):
+                return self._of_every_place(region, template, exclusion_px)
+        work_px = float(math.prod(search.image.shape))
+        if not scheduler.can_afford({_EVERY_PLACE: work_px}):
+            scheduler.costs.note_refusal(_EVERY_PLACE)
+            raise OutOfTime
+        with scheduler.costed(_EVERY_PLACE, work_px), scheduler.stage("match"):
+            return self._of_every_place(region, template, exclusion_px)
+
+    def _coarse_to_fine(
+        self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
+    ) -> Peak | None:
+        if not self._has_coarse_levels(region):
+            return None
+        least = self.options.min_valid_share
+        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=least, quick=quick)
+
+    def _has_coarse_levels(self, region: Region) -> bool:
+        """Whether places are scored at half resolution: on the CPU, and where pixels are about 0, as nodata is."""
+        on_cpu = isinstance(region.search.image, np.ndarray)
+        return on_cpu and not self.options.exhaustive and (region.valid is None or self.is_centred)
+
+    def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
+        if region.valid is not None:
+            return find_peak(self.masked_scores(region, template[None])[0], exclusion_px=exclusion_px)
+        own = placed(template, self.query.device)
+        return match_template(region.search, own, exclusion_px=exclusion_px, exhaustive=True)
+
+    @property
+    def is_centred(self) -> bool:
+        """Whether enhanced pixels lie about 0, which nodata is on a coarse level."""
+        return self.options.score != "grey" and self.options.enhance_radius_px > 0
+
+    def best_places(
+        self, aligned: Aligned, window: Window, separation_px: int, count: int
+    ) -> tuple[list[tuple[int, int, float]], Array] | None:
+        """The highest places of a window that are apart from each other.
+
+        Args:
+            aligned: the hypothesis.
+            window: in full-resolution map pixels; of a wide one on the CPU coarse to fine.
+            separation_px: places are more than this apart in x or in y.
+            count: upper bound on their number.
+
+        Returns:
+            Places (x, y, score) in falling order of the score, and the place (2,) that they count from, as
+            :meth:`surface`.
+        """
+        region, (height, width) = self.cut(window, aligned.level), aligned.template.shape
+        if region.window.width_px < width or region.window.height_px < height:
+            return None
+        if coarse_to_fine.is_wide(region.search) and self._has_coarse_levels(region):
+            places = coarse_to_fine.best_places(
+                region.search, aligned.template, separation_px, count, min_overlap=self.options.min_valid_share
+            )
+            if places is not None:
+                return places, np.array([region.window.x0, region.window.y0], np.float64)
+        surface = self.surface(aligned, window)
+        return None if surface is None else (best_positions(surface[0], separation_px, count), surface[1])
+
+    def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
+        """The whole surface that :meth:`search` finds its peak on, for reports.
+
+        Returns:
+            Scores (H', W') of the template's top-left pixel, and that place (2,) of the first in pixels of the
+            level; None where the template does not fit the window.
+        """
+        height, width = aligned.template.shape
+        region = self.cut(window, aligned.level)
+        if region.window.width_px < width or region.window.height_px < height:
+            return None
+        template = aligned.template[None]
+        if region.valid is None:
+            scores = ncc(region.search.image[None], placed(template[None], self.query.device))[0, 0]
+        else:
+            scores = self.masked_scores(region, template)[0]
+        return scores, np.array([region.window.x0, region.window.y0], np.float64)
+
+    def masked_scores(self, region: Region, templates: NDArray[np.float32]) -> Picture:
+        """Scores (T, H', W') where the region has nodata; -1 where too little of a template lies on map."""
+        assert region.valid is not None
+        scores = ncc(
+            region.search.image[None],
+            placed(templates[None], self.query.device),
+            search_valid=region.valid[None],
+            min_overlap=self.options.min_valid_share,
+        )
+        return scores[0]
+
+    def nadir_px(self, peak: Peak, aligned: Aligned) -> Array:
+        """The camera's nadir (2,) in map pixels, from where its patch was found."""
+        place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
+        return self.query.site.full_from_level(place, aligned.level)
+
+
+def _moved(peak: Peak, window: Window) -> Peak:
+    """A peak of a window's surface, in pixels of the level."""
+    return replace(peak, x=peak.x + window.x0, y=peak.y + window.y0)
+
+
+def _about(quick: QuickLook, window: Window) -> QuickLook:
+    """A quick look at peaks of a window's surface, by one at peaks in pixels of the level."""
+    return QuickLook(
+        is_clear=lambda peak: quick.is_clear(_moved(peak, window)),
+        is_hopeless=lambda peak: quick.is_hopeless(_moved(peak, window)),
+    )
+
+
+def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
+    """Expected pixels of the window, by levels above the frame's own; the cost is proportional to them."""
+    site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
+    assert height_m is not None  # asked for before
+    assert query.prior is not None
+    own = query.level_of(height_m)
+    out = {}
+    for coarser in _COARSER:
+        gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
+        per_px = height_m / (camera.focal_px * gsd_m)
+        side_px = options.fraction * min(camera.width_px, camera.height_px) * per_px
+        if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
+            slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
+            width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
+            rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
+            out[coarser] = min(width, columns) * min(height, rows)
+    return out

@@ -1,0 +1,207 @@
+"""Covariance of a fix by correlation: of its peak, and of what is assumed of telemetry, map and ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.geo import transport_covariance
+from engine.options import AssumedErrors, MatcherOptions
+from engine.orthomap import OrthoMap
+from engine.values import Frame, GridPose, Peak
+
+Array = NDArray[np.float64]
+
+
+def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
+    """Covariance of an unknown tilt.
+
+    Args:
+        cam_from_map: (3, 3) rotation of the camera.
+        sigma_rad: standard deviation of the tilt about east and about north.
+
+    Returns:
+        (3, 3) in rad^2, of a small turn about the camera's axes.
+    """
+    horizontal = cam_from_map[:, :2]
+    return np.asarray(sigma_rad**2 * horizontal @ horizontal.T)
+
+
+def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
+    """The errors with the accuracy that the map states in place of the one assumed of any map."""
+    return replace(
+        errors,
+        map_m=errors.map_m if site.georeference_sigma_m is None else site.georeference_sigma_m,
+        surface_slope_deg=errors.surface_slope_deg if site.slope_sigma_deg is None else site.slope_sigma_deg,
+    )
+
+
+def options_on_map(options: MatcherOptions, site: OrthoMap) -> MatcherOptions:
+    """The settings with the accuracy that a map states in place of the one assumed of any map."""
+    ncc, sift = options.ncc, options.sift
+    return replace(
+        options,
+        ncc=replace(ncc, errors=with_map_accuracy(site, ncc.errors)),
+        sift=replace(sift, errors=with_map_accuracy(site, sift.errors)),
+    )
+
+
+def map_sigma_of(site: OrthoMap) -> float:
+    """Georeferencing accuracy of a map per axis: its own, or that of any map."""
+    return AssumedErrors().map_m if site.georeference_sigma_m is None else site.georeference_sigma_m
+
+
+def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
+    """The errors with what the frame states in place of what is assumed of any telemetry, and with its lag."""
+    sigmas = (frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
+    return _with_accuracy(errors, *sigmas, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0)
+
+
+@lru_cache(maxsize=16)  # a frame asks several times
+def _with_accuracy(
+    errors: AssumedErrors,
+    heading_sigma_deg: float | None,
+    tilt_sigma_deg: float | None,
+    height_sigma_m: float | None,
+    tilt_lag_deg: float,
+    heading_lag_deg: float,
+) -> AssumedErrors:
+    stated = {"heading_deg": heading_sigma_deg, "tilt_deg": tilt_sigma_deg}
+    if height_sigma_m is not None:
+        stated |= {"height_m": height_sigma_m, "height_share": _NO_SHARE}
+    known = {name: value for name, value in stated.items() if value is not None}
+    for name, lag_deg in (("tilt_deg", tilt_lag_deg), ("heading_deg", heading_lag_deg)):
+        if lag_deg:
+            known[name] = math.hypot(known.get(name, getattr(errors, name)), lag_deg)
+    return replace(errors, **known) if known else errors
+
+
+_NO_SHARE = 1e-6  # of a height whose standard deviation is stated as a whole
+# Neighbouring pixels share their noise: so many of them, squared, count as one.
+_CORRELATION_PX = 5.0
+
+
+def score_sigma(pixels: int) -> float:
+    """One standard deviation of the NCC of a patch with ground that it does not show.
+
+    The correlation coefficient of N independent samples about zero has the variance 1/N.
+    """
+    return 1.0 / math.sqrt(max(1.0, pixels / _CORRELATION_PX**2))
+
+
+def peak_covariance_px(peak: Peak, pixels: int) -> Array:
+    """Covariance of a correlation peak (Cramer-Rao).
+
+    For a picture that is the map plus Gaussian noise, the log-likelihood of a shift is N/2 log(1 - rho^2), whose
+    second derivative at the peak is N rho rho'' / (1 - rho^2); its inverse is the covariance. N is that of
+    :func:`score_sigma`.
+
+    Args:
+        peak: the peak.
+        pixels: of the template.
+
+    Returns:
+        (2, 2) in square pixels, x before y.
+    """
+    independent = 1.0 / score_sigma(pixels) ** 2
+    rho = min(max(peak.score, 0.05), 0.999)
+    information = -peak.curvature * independent * rho / (1.0 - rho * rho)
+    # A ridge has no curvature along it: the peak is then known to a few pixels there, not infinitely badly.
+    values, vectors = np.linalg.eigh(information)
+    variances = np.clip(1.0 / np.maximum(values, 1e-9), 0.05**2, 5.0**2)
+    return np.asarray((vectors * variances) @ vectors.T, dtype=np.float64)
+
+
+def misalignment_covariance_px2(
+    peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors
+) -> Array:
+    """Covariance of a peak whose template is turned or scaled against the map.
+
+    An error of heading or height moves every part of the patch by an amount of its own. Where the parts stay
+    within the width of the peak, it lies at their mean, and nothing is lost; where they do not, it follows the
+    part with the strongest texture, which may be anywhere. The share between the two is u^2 / (u^2 + width^2).
+
+    Args:
+        peak: of the patch.
+        shape: (rows, columns) of the patch.
+        height_m: above the ground.
+        errors: what is assumed of height and heading.
+
+    Returns:
+        (2, 2) in square pixels.
+    """
+    share = math.hypot(errors.height_share, errors.height_m / height_m, math.radians(errors.heading_deg))
+    apart = share**2 * (shape[0] ** 2 + shape[1] ** 2) / 24.0  # mean over the patch of one axis
+    bend = -float(np.trace(peak.curvature)) / 2.0
+    width = max(peak.score, 0.05) / max(bend, 1e-9)
+    return np.asarray(apart * apart / (apart + width) * np.eye(2), dtype=np.float64)
+
+
+def ncc_covariance_m2(
+    peak_px2: Array, pose: GridPose, camera: Camera, enu_jacobian: Array, errors: AssumedErrors
+) -> Array:
+    """Covariance of a fix by correlation.
+
+    The nadir is the position of the template less an offset by height and attitude, so their errors move the fix:
+    half a degree of tilt is 1.3 m at 150 m.
+
+    Args:
+        peak_px2: (2, 2) covariance of the peak in square pixels.
+        pose: height and attitude by which the frame was aligned.
+        camera: its mount gives the direction of the optical axis.
+        enu_jacobian: (2, 2) metres east and north per pixel.
+        errors: of the telemetry and the map.
+
+    Returns:
+        (3, 3) east, north, up in square metres.
+
+    Raises:
+        OptionError: the pose lacks its height or its heading.
+    """
+    attitude, height = pose.grid_attitude, pose.height_agl_m
+    if attitude is None or height is None:
+        raise OptionError("pose: expected a height and a heading for a fix by correlation")
+    values = (height, attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
+    height_sigma = errors.height_sigma_m(height)
+    sigmas = (height_sigma, *errors.tilts_deg(pose), errors.heading_deg)
+    spread = np.empty((2, 4))  # each column is already scaled by its sigma
+    axis = camera.mount[:, 2].tolist()
+    for column, sigma in enumerate(sigmas):
+        more, less = list(values), list(values)
+        more[column] += sigma
+        less[column] -= sigma
+        (east, north), (other_east, other_north) = _aim_m(axis, *more), _aim_m(axis, *less)
+        spread[:, column] = 0.5 * (east - other_east), 0.5 * (north - other_north)
+    horizontal = spread @ spread.T + transport_covariance(enu_jacobian, peak_px2) + errors.map_m**2 * np.eye(2)
+    covariance = np.diag([0.0, 0.0, height_sigma**2])
+    covariance[:2, :2] = horizontal
+    return covariance
+
+
+def _aim_m(
+    axis: list[float], height_m: float, roll_deg: float, pitch_deg: float, heading_deg: float
+) -> tuple[float, float]:
+    """Where the optical axis meets the ground, in metres east and north of the nadir.
+
+    Args:
+        axis: forward, right and down in the body.
+        height_m: above the ground.
+        roll_deg: of the body.
+        pitch_deg: likewise.
+        heading_deg: likewise.
+    """
+    forward, right, down = axis
+    roll, pitch, heading = math.radians(roll_deg), math.radians(pitch_deg), math.radians(heading_deg)
+    sr, sp, sh = math.sin(roll), math.sin(pitch), math.sin(heading)
+    cr, cp, ch = math.cos(roll), math.cos(pitch), math.cos(heading)
+    ahead = cp * forward + sp * (sr * right + cr * down)  # along the heading, see engine.geo.enu_from_body
+    aside = cr * right - sr * down
+    below = -sp * forward + cp * (sr * right + cr * down)
+    reach_m = height_m / max(below, 1e-3)
+    return (sh * ahead + ch * aside) * reach_m, (ch * ahead - sh * aside) * reach_m

@@ -1,0 +1,296 @@
+"""Points of the frame found again on the map: by features of the orthophoto, or of the reduced frame.
+
+Where height and heading are known the whole frame is drawn in the map's pixels by them
+(:func:`engine.matching.align.orthorectify`): its features are upright and of the map's scale, and what they match
+votes for one translation. Where they are not, the features of the frame itself are matched at any angle or scale,
+and RANSAC finds what agrees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.features import Features, Matches, match, sift
+from engine.geo import wrap_heading_deg
+from engine.maps.landmarks import LandmarkMap, Landmarks, as_picture
+from engine.matching.align import Orthophoto, orthorectify
+from engine.matching.point_finding import PointFinder
+from engine.matching.pose import PoseStart
+from engine.matching.query import Query
+from engine.matching.relief import ground_relief
+from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel, slant_m
+from engine.matching.votes import Vote, similarity, vote
+from engine.options import SiftOptions
+from engine.orthomap import OrthoMap
+from engine.runtime.tensors import download, torch, upload
+from engine.values import Attitude
+
+Array = NDArray[np.float64]
+
+NOMINAL_SCALE = 0.5
+"""To which the pose's tolerance refers; features of a coarser picture are less accurate."""
+_ROUGHNESS_REACH_PX = 1.5  # pixels of the map about a landmark within which its surface's roughness counts
+_BLUNT_PX = 1.6  # scale at which a keypoint's position has twice the variance of a small one's
+MAX_KEYPOINTS = 1000
+"""Of the largest orthophoto."""
+_MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
+_UPSAMPLED_PX = 100_000  # an orthophoto that shows more has keypoints enough without its smallest ones
+
+
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """Points of the frame found again in a view.
+
+    Attributes:
+        view: where.
+        points_px: (M, 2) pixels of the frame.
+        points_m: (M, 3) metres on the ground.
+        weights: (M,) relative inverse variances of the pixels.
+        tolerance_px: reprojection distance in the frame up to which a match agrees with a pose.
+        start: the pose that most voted for; None where there was no vote.
+        vote: what was voted for; None where there was no vote.
+    """
+
+    view: MapView
+    points_px: Array
+    points_m: Array
+    weights: Array
+    tolerance_px: float
+    start: PoseStart | None = None
+    vote: Vote | None = None
+
+
+def match_views(
+    query: Query,
+    landmarks: LandmarkMap | None,
+    options: SiftOptions,
+    views: list[MapView],
+    hypothesis: TelemetryHypothesis,
+    finder: PointFinder | None = None,
+) -> list[Matched]:
+    """What of the frame is found again in each view.
+
+    Args:
+        query: the frame.
+        landmarks: of the map; None where a finder takes their place.
+        options: settings.
+        views: where to look.
+        hypothesis: what is assumed of the telemetry.
+        finder: finds the points in place of features; None takes ``options.matcher`` where there is one.
+    """
+    if finder is None and options.matcher is not None:
+        finder = PointFinder(options.matcher)
+    source = finder or landmarks
+    assert source is not None  # only a finder does without landmarks
+    height_m, attitude = hypothesis.height_m, query.telemetry.grid_attitude
+    if height_m is not None and hypothesis.x_axis_deg is not None and attitude is not None and options.upright:
+        found = [_by_orthophoto(query, source, options, view, attitude, height_m) for view in views]
+        if None not in found:
+            return [matched for matched in found if matched is not None]
+    if isinstance(source, PointFinder):
+        return _by_reduced(query, source, options, views)
+    return _by_frame(query, source, options, views, hypothesis)
+
+
+# ----------------------------------------------------------------------------------- by the orthophoto
+
+
+def _by_orthophoto(
+    query: Query,
+    source: LandmarkMap | PointFinder,
+    options: SiftOptions,
+    view: MapView,
+    attitude: Attitude,
+    height_m: float,
+) -> Matched | None:
+    """The whole frame drawn on a view's level, its features matched, and what they vote for."""
+    with query.scheduler.stage("rectify"):
+        jacobian = query.jacobian * 2.0**view.level
+        relief = ground_relief(query.site, query.prior_px, view.level)
+        photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
+    if photo is None:
+        return None
+    if isinstance(source, PointFinder):
+        photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
+        scale_px = np.zeros(len(photo_px))
+    else:
+        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
+    ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
+    weights = _weights(query.site, ground_m, scale_px)
+    per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # pixels of the frame that are one of the level
+    matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
+    with query.scheduler.stage("vote"):
+        return _voted(query, options, matched, photo, photo_px, map_px, attitude, height_m)
+
+
+def _feature_pairs(
+    query: Query, landmarks: LandmarkMap, photo: Orthophoto, view: MapView, options: SiftOptions
+) -> tuple[Array, Array, Array]:
+    """Matched features: (M, 2) pixels of the orthophoto, (M, 2) of the level, and (M,) their scales."""
+    with query.scheduler.stage("frame features"):
+        shown_px = int(np.count_nonzero(photo.valid))
+        keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
+        gray, valid = upload([photo.gray, photo.valid], query.device)
+        features = sift(
+            gray[None, None].float() / 255.0,
+            max_keypoints=keypoints,
+            upright=True,
+            mask=valid[None, None],
+            upsample=options.upsample if shown_px <= _UPSAMPLED_PX else 1,
+            contrast_threshold=options.contrast_threshold,
+        )
+    with query.scheduler.stage("map features"):
+        per_px = _MAP_DENSITY * keypoints / max(shown_px, 1)
+        known = landmarks.find(view.crop, view.level, upright=True, per_px=per_px)
+    with query.scheduler.stage("match"):
+        found = match(
+            features, known.features, ratio=options.vote_ratio, max_scale_factor=options.max_scale_factor
+        )
+        photo_px, scale_px, index = _matched(features, found)
+        return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64), scale_px
+
+
+def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
+    """Accepted pairs: (M, 2) pixels of the features, (M,) their scales, (M,) indices on the map; in one copy."""
+    columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
+    xy_px, scale_px, valid, index = download(columns)
+    return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
+
+
+def _voted(
+    query: Query,
+    options: SiftOptions,
+    matched: Matched,
+    photo: Orthophoto,
+    photo_px: Array,
+    map_px: Array,
+    attitude: Attitude,
+    height_m: float,
+) -> Matched:
+    """The matches with the pose that most of them vote for."""
+    site, level = query.site, matched.view.level
+    share_px = options.vote_share * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
+    radius_px = max(share_px, 2.0 * options.tolerance_px)
+    middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
+    found = vote(photo_px - middle, map_px, radius_px)
+    if found is None:
+        return matched
+    nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px
+    nadir_px = site.full_from_level(nadir, level)
+    turned = replace(attitude, heading_deg=wrap_heading_deg(attitude.heading_deg + found.turn_deg))
+    up_m = site.ground_at(nadir_px) + height_m * found.scale
+    start = PoseStart(
+        query.camera.enu_from_camera(turned).T,
+        np.array([*site.enu_from_pixel(nadir_px), up_m]),
+        radius_px / options.tolerance_px * matched.tolerance_px,
+    )
+    return replace(matched, start=start, vote=found)
+
+
+# ------------------------------------------------------------------------------------- by the frame itself
+
+
+@dataclass(frozen=True, slots=True)
+class _Reduced:
+    """The frame reduced as the paper does, (1, 1, H, W) in [0, 1], and the scale (x, y) that reduced it."""
+
+    picture: torch.Tensor
+    scale: Array
+
+    def full(self, xy_px: Array | NDArray[np.float32]) -> Array:
+        """Places in the frame: edges lie on edges, centres on centres."""
+        return np.asarray((xy_px + 0.5) / self.scale - 0.5, dtype=np.float64)
+
+
+def _by_frame(
+    query: Query,
+    landmarks: LandmarkMap,
+    options: SiftOptions,
+    views: list[MapView],
+    hypothesis: TelemetryHypothesis,
+) -> list[Matched]:
+    """Features of the reduced frame among those of the map, view by view."""
+    turn = hypothesis.x_axis_deg
+    upright = options.upright and turn is not None
+    with query.scheduler.stage("frame features"):
+        reduced = _reduce(query, options.scale)
+        features = sift(reduced.picture, max_keypoints=options.max_keypoints, upright=upright, up_deg=turn or 0.0)
+    matched = []
+    for view in views:
+        with query.scheduler.stage("map features"):
+            known = _map_features(query, landmarks, options, view, upright)
+        with query.scheduler.stage("match"):
+            found = match(
+                features,
+                known.features,
+                ratio=options.ratio,
+                rotation_deg=-(turn or 0.0),
+                max_angle_diff_deg=None if upright or turn is None else options.max_turn_deg,
+                scale=1.0 / view.pixel_ratio,
+                max_scale_factor=None if hypothesis.height_m is None else options.max_scale_factor,
+            )
+            xy_px, scale_px, index = _matched(features, found)
+            points_px, points_m = reduced.full(xy_px), known.points_m[index]
+            weights = _weights(query.site, points_m, scale_px)
+            matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
+    return matched
+
+
+def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: list[MapView]) -> list[Matched]:
+    """What a matcher of pictures finds with the reduced frame, view by view."""
+    reduced, matched = _reduce(query, options.scale), []
+    valid = np.ones(reduced.picture.shape[2:], np.bool_)
+    for view in views:
+        points_px, map_px = finder.find(query, reduced.picture, valid, view)
+        ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
+        weights = _weights(query.site, ground_m, np.zeros(len(ground_m)))
+        matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
+    return matched
+
+
+def _frame_tolerance_px(options: SiftOptions) -> float:
+    return options.pose.reprojection_px * max(1.0, NOMINAL_SCALE / options.scale)
+
+
+def _reduce(query: Query, scale: float) -> _Reduced:
+    height, width = query.gray.shape
+    size = (max(16, round(width * scale)), max(16, round(height * scale)))
+    picture = cv2.resize(query.gray, size, interpolation=cv2.INTER_AREA)
+    tensor = as_picture(np.asarray(picture, np.uint8), query.device)
+    return _Reduced(tensor, np.array(size) / [width, height])
+
+
+def _map_features(
+    query: Query, landmarks: LandmarkMap, options: SiftOptions, view: MapView, upright: bool
+) -> Landmarks:
+    """Landmarks of a view, as dense as the features of the reduced frame; denser where pixels are coarser."""
+    site, crop = query.site, view.crop
+    reduced_px = query.gray.size * options.scale**2
+    if options.map_features == "prepared":
+        per_px = options.max_keypoints / reduced_px * max(1.0, view.pixel_ratio) ** 2
+        return landmarks.find(crop, view.level, upright=upright, per_px=per_px)
+    count = np.clip(
+        options.max_keypoints * crop.area_px / reduced_px, options.max_keypoints, options.max_map_keypoints
+    )
+    mask = None
+    if not site.fully_valid:
+        mask = torch.from_numpy(site.valid(crop, view.level)).to(query.device)[None, None]
+    picture = as_picture(site.gray(crop, view.level), query.device)
+    features = sift(picture, max_keypoints=int(count), upright=upright, mask=mask)
+    xy_px = download([features.xy_px[0]])[0]
+    return Landmarks(features, xy_px, lifted(site, site.full_from_level(xy_px + view.corner_px, view.level)))
+
+
+def lifted(site: OrthoMap, map_px: Array) -> Array:
+    """(N, 3) east, north and the height of the surface at pixels (N, 2) of the map."""
+    return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
+
+
+def _weights(site: OrthoMap, points_m: Array, scale_px: Array) -> Array:
+    """Weights (N,) of matches: blunt keypoints are less accurate, and on a rough surface they may stand higher."""
+    roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGHNESS_REACH_PX)
+    return roughness / (1.0 + (scale_px / _BLUNT_PX) ** 2)

@@ -1,0 +1,268 @@
+"""One frame matched with the map by features: matches lifted to 3D, and the pose that they agree on by PnP."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import attitude_from_rotation
+from engine.maps.landmarks import LandmarkMap
+from engine.matching.acceptance import judge_pose
+from engine.matching.confidence import PoseFeatures, prior_agreement, probability
+from engine.matching.covariance import tilt_covariance
+from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
+from engine.matching.point_finding import PointFinder
+from engine.matching.pose import PoseStats, solve_pose
+from engine.matching.query import Query
+from engine.matching.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
+from engine.matching.votes import Vote
+from engine.options import MIN_HEIGHT_M, AssumedErrors, SiftOptions
+from engine.orthomap import OrthoMap
+from engine.values import Attitude, Fix, NoFix, Reason, Window
+
+Array = NDArray[np.float64]
+
+METHOD = "sift"
+MIN_VOTES = 4
+"""Fewest matches of a pose where they voted for it."""
+_MATCHED_HEADING_SIGMA_DEG = 30.0  # of a heading that only the matches gave: next to no information
+
+
+@dataclass(frozen=True, slots=True)
+class PoseCandidate:
+    """A pose that is not accepted yet.
+
+    Attributes:
+        fix: what it means, with its confidence.
+        features: of the confidence model.
+        null_log10_nfa: log10 of the false alarms of the null hypothesis, the same frame mirrored, which shows no
+            place on Earth; infinite where that gave no pose or was not asked.
+    """
+
+    fix: Fix
+    features: PoseFeatures
+    null_log10_nfa: float = math.inf
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the place is right."""
+        assert self.fix.confidence is not None  # each pose has one
+        return self.fix.confidence
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureMatcher:
+    """One frame with the landmarks that it is matched with.
+
+    Attributes:
+        query: the frame.
+        landmarks: of the map; None where a finder takes their place.
+        options: settings.
+        finder: finds the matched points in place of features.
+        method: what fixes and refusals name.
+    """
+
+    query: Query
+    landmarks: LandmarkMap | None
+    options: SiftOptions
+    finder: PointFinder | None = None
+    method: str = METHOD
+
+    def find(self) -> PoseCandidate | NoFix:
+        """The pose of the frame, or a refusal where there is none."""
+        query, options = self.query, self.options
+        flat = query.refuse_flat(self.method, options.min_deviation)
+        if flat is not None:
+            return flat
+        first: PoseCandidate | NoFix | None = None
+        deadline = query.scheduler.deadline
+        for matcher, hypothesis in self._attempts():
+            if first is not None and deadline.remaining_ms < deadline.elapsed_ms:
+                break
+            found = matcher._find_with(hypothesis)
+            if isinstance(found, PoseCandidate) and not self.is_doubtful(found):
+                return matcher._null_tested(found, hypothesis)
+            if isinstance(found, NoFix) and found.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
+                return first or found
+            first = first or found
+        assert first is not None  # the telemetry's own hypothesis is always tried
+        return first
+
+    def find_at_once(self) -> PoseCandidate | NoFix:
+        """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
+        refusal = self.query.refuse_flat(self.method, self.options.min_deviation)
+        return refusal or self._find_with(next(self._attempts())[1])
+
+    def judge(self, found: PoseCandidate) -> Fix | NoFix:
+        """The fix where its pose is accepted, else a refusal."""
+        fix, least = found.fix, self.options.min_confidence
+        refusal = judge_pose(found.features, found.confidence, least, found.null_log10_nfa)
+        if refusal is None:
+            return fix
+        return self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
+
+    def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
+        """The candidate, unless nearly certain with what its frame reaches mirrored, by the same telemetry."""
+        if found.confidence >= self.options.null_test_below:
+            return found
+        mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
+        null = replace(self, query=mirrored)._find_with(hypothesis)
+        return found if isinstance(null, NoFix) else replace(found, null_log10_nfa=null.features.log10_nfa)
+
+    def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
+        """What is tried in turn: the telemetry, the same at the frame's full resolution, and doubts of it."""
+        query, options = self.query, self.options
+        height_m, factor = query.telemetry.height_agl_m, options.height_factor
+        unknown = (MIN_HEIGHT_M, options.max_height_m)
+        known = TelemetryHypothesis(unknown if height_m is None else (height_m, height_m), x_axis_deg(query))
+        yield self, known
+        drawn = height_m is not None and known.x_axis_deg is not None and options.upright and self.finder is None
+        if drawn and level_at(query, known.heights_m[0], options.scale) > level_at(query, known.heights_m[0], 1.0):
+            yield replace(self, options=replace(options, scale=1.0)), known
+        wide = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
+        if options.second_look and wide != known:
+            yield self, wide
+
+    def is_doubtful(self, found: PoseCandidate) -> bool:
+        """Whether a pose is not probable enough."""
+        return found.confidence < self.options.min_confidence
+
+    def matches_in(self, window: Window) -> tuple[Array, Array, PoseStats | None]:
+        """What is matched in a window at the frame's own height and heading, and the pose of it: for reports.
+
+        Returns:
+            Points (M, 2) in pixels of the undistorted frame, their places (M, 3) on the ground in metres, and the
+            pose with its inliers, or None where there are too few or they do not determine one.
+        """
+        height_m = self.query.telemetry.height_agl_m
+        assert height_m is not None  # without one there is no single view
+        hypothesis = TelemetryHypothesis((height_m, height_m), x_axis_deg(self.query))
+        views = [view_in(self.query, window, height_m, self.options.scale)]
+        found = match_views(self.query, self.landmarks, self.options, views, hypothesis, self.finder)[0]
+        return found.points_px, found.points_m, self._pose(found, hypothesis)
+
+    def _find_with(self, hypothesis: TelemetryHypothesis) -> PoseCandidate | NoFix:
+        """Match, lift and solve, with what is assumed of the telemetry."""
+        query, options, scheduler = self.query, self.options, self.query.scheduler
+        with scheduler.stage("window"):
+            views = views_of(query, hypothesis, self.method, margin=options.margin, scale=options.scale)
+        if isinstance(views, NoFix):
+            return views
+        if self.finder is not None and any(map(self.finder.too_large, views)):
+            pixels = max(view.crop.area_px for view in views)
+            detail = f"a window of {pixels} pixels is more than is searched; a nearer position is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method, window=views[0].window)
+        matched = match_views(query, self.landmarks, options, views, hypothesis, self.finder)
+        matched.sort(key=lambda found: len(found.points_px), reverse=True)
+        count, window = len(matched[0].points_px), matched[0].view.window
+        if count < MIN_VOTES:
+            detail = f"{count} matches; {MIN_VOTES} are asked for"
+            return query.refuse(Reason.TOO_FEW_MATCHES, detail, self.method, window=window)
+        if scheduler.deadline.remaining_ms < 0:
+            return query.refuse(Reason.LATE, "the budget was spent before the pose", self.method, window=window)
+        for found in matched:
+            with scheduler.stage("pose"):
+                stats = self._pose(found, hypothesis)
+            if stats is not None:
+                fix = self._fix(stats, found.view.window)
+                return fix if isinstance(fix, NoFix) else self._with_confidence(fix, stats, found.vote, hypothesis)
+        detail = f"no pose explains enough of the {count} matches"
+        return query.refuse(Reason.BAD_POSE, detail, self.method, window=window)
+
+    # ------------------------------------------------------------------------------------------------ pose
+
+    def _pose(self, found: Matched, hypothesis: TelemetryHypothesis) -> PoseStats | None:
+        """The pose that the matches agree on and the attitude allows.
+
+        Few matches hardly separate a tilt from a displacement. What is known of the tilt counts also where the
+        heading is not: that is then taken from the matches themselves.
+        """
+        query, options = self.query, self.options
+        pose = replace(options.pose, reprojection_px=found.tolerance_px)
+        if found.vote is not None:  # by which the place is judged, not by the pose
+            pose = replace(pose, min_inliers=MIN_VOTES, max_log10_nfa=math.inf)
+        matrix = query.camera.matrix
+        solve = partial(
+            solve_pose, found.points_m, found.points_px, matrix, pose, weights=found.weights, start=found.start
+        )
+        if not options.use_attitude:
+            return solve()
+        errors = query.errors(options.errors)
+        heading_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
+        if heading_deg is None or hypothesis.x_axis_deg is None:
+            free = solve()
+            if free is None:
+                return None
+            heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
+            sigma_deg = _MATCHED_HEADING_SIGMA_DEG
+        return solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
+
+    def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
+        """The camera's centre as a fix; refused where a drone over this map cannot be there."""
+        query, site, options = self.query, self.query.site, self.options
+        up = float(stats.center_m[2])
+        nadir = site.pixel_from_enu(stats.center_m[:2])
+        share = float(stats.inliers.mean())
+        body_down = stats.rotation.T @ query.camera.mount.T[:, 2]
+        tilt = math.degrees(math.acos(float(np.clip(-body_down[2], -1.0, 1.0))))
+        if tilt > options.max_tilt_deg or up <= float(site.surface_at(nadir)):
+            detail = f"the pose is {tilt:.0f} degrees off level at a height of {up:.0f} m"
+            return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
+        covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
+        turns_rad2 = stats.covariance[3:, 3:] + tilt_covariance(stats.rotation, _slope_rad(site, options.errors))
+        if not query.telemetry.has_tilt:  # features of a coarse picture err together, as a tilt would
+            wider = max(1.0, NOMINAL_SCALE / options.scale) ** 2
+            covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
+        doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
+        above_m = up - float(site.surface_at(nadir))
+        return query.fix(
+            self.method,
+            nadir,
+            covariance + np.diag([doubt_m**2, doubt_m**2, 0.0]),
+            score=share,
+            window=window,
+            east_north_m=stats.center_m[:2],
+            up_m=up,
+            grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
+            turn_covariance_rad2=turns_rad2 + tilt_covariance(stats.rotation, doubt_m / above_m),
+            map_sigma_m=options.errors.map_m,
+        )
+
+    def _with_confidence(
+        self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis
+    ) -> PoseCandidate:
+        """The candidate of a fix; a height that is doubted in this hypothesis does not count."""
+        query, height_m = self.query, self.query.telemetry.height_agl_m
+        errors = query.errors(self.options.errors)
+        height_chi_square = None
+        if height_m is not None and hypothesis.height_m == height_m:
+            assert fix.up_m is not None
+            # Above ground both count: an error of the map moves the ground with the camera.
+            variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2]) - errors.map_m**2
+            ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
+            height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
+        prior_chi_square = None
+        if query.prior is not None and query.prior_px is not None:
+            prior_m = query.site.enu_from_pixel(query.prior_px)
+            prior_chi_square = prior_agreement(fix, prior_m, query.prior.sigma_m).prior_chi_square
+        log10_nfa, rival_share = stats.log10_nfa, None
+        if vote is not None:
+            log10_nfa, rival_share = vote.log10_nfa, vote.rival / vote.votes
+        features = PoseFeatures(log10_nfa, prior_chi_square, height_chi_square, rival_share)
+        return PoseCandidate(replace(fix, confidence=probability(features)), features)
+
+
+def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
+    """(3, 3) of the map: its georeferencing accuracy, and a slope of the ground that PnP takes for a tilt."""
+    horizontal = errors.map_m**2 + (height_m * _slope_rad(site, errors)) ** 2
+    return np.diag([horizontal, horizontal, errors.map_m**2])
+
+
+def _slope_rad(site: OrthoMap, errors: AssumedErrors) -> float:
+    """Standard deviation of the ground's slope against that of the map's heights."""
+    return math.radians(errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg)

@@ -1,0 +1,284 @@
+"""Multi-hypothesis search: NCC over headings, heights and whole maps; coarse for all of them, fine for the best.
+
+A hypothesis is a height and a heading of the frame. All are aligned on a coarse level of the map and scored
+against one spectrum. The best places are then matched level by level, and the winner's heading and height are
+refined below the step between hypotheses.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.kernels.coarse_to_fine import surfaces_over_nodata
+from engine.kernels.peaks import best_positions
+from engine.maps.prepared import Region
+from engine.matching.correlation import Aligned, Correlator
+from engine.ncc_fft import surfaces
+from engine.options import NccOptions
+from engine.runtime.device import Picture, placed
+from engine.values import GridPose, NoFix, Peak, Window
+
+Array = NDArray[np.float64]
+
+
+_MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
+_MAX_COARSE_PX = 4_000_000  # of the map, likewise
+_MIN_TEMPLATE_PX = 20
+_MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept where it is beyond doubt only
+_MIN_QUICK_SCORE, _MAX_QUICK_RIVAL = 0.5, 0.7  # at full resolution; the rival as a share of the score
+_CANDIDATES = 8
+_SEMIFINALISTS = 4
+_FINALISTS = 2
+_HOPEFUL = 0.5  # of the best score: a place below does not win by a better heading and height
+_MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces: memory's bound
+_SLACK_PX = 3  # by which a place that was found on a level may be wrong, in pixels of that level
+_EDGE_PX = 1.5  # by which the nearest hypothesis may be off at the corner of the patch
+_MIDDLE_ROUNDS = 2
+_FINE_ROUNDS = 2
+
+
+def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak | None, Aligned]:
+    """The best peak over all hypotheses in the window, at the level of ``first``, and whose it is."""
+    level, poses = _coarse_level(correlator, first, window)
+    if level == first.level and len(poses) == 1:
+        return correlator.search(first, window), first
+    quick = _quick_level(correlator, first, level)
+    if quick is not None:
+        best = _from_level(correlator, first, window, *quick)
+        if best is not None and _is_beyond_doubt(best[0]):
+            return best
+    return _from_level(correlator, first, window, level, poses) or (None, first)
+
+
+def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
+    """One level above, with its fewer hypotheses, which costs a sixteenth; None where too little is left there."""
+    above = level + 1
+    side_px, turns, shares = _grid_on(correlator, first, above)
+    if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:
+        return None
+    return above, _hypotheses(correlator.query.telemetry, turns, shares)
+
+
+def _is_beyond_doubt(peak: Peak) -> bool:
+    return peak.score >= _MIN_QUICK_SCORE and peak.second_score <= _MAX_QUICK_RIVAL * peak.score
+
+
+def _from_level(
+    correlator: Correlator, first: Aligned, window: Window, level: int, poses: list[GridPose]
+) -> tuple[Peak, Aligned] | None:
+    """The best peak over some hypotheses, all of which are scored on one level."""
+    found: list[tuple[Peak, Aligned]] = []
+    middle = max(first.level, level - 1)
+    for pose, nadir in _coarse(correlator, poses, window, level):
+        aligned = correlator.align(pose, middle, nadir)
+        peak = None if isinstance(aligned, NoFix) else _near(correlator, aligned, nadir, level)
+        if peak is not None and isinstance(aligned, Aligned):
+            found.append((peak, aligned))
+    found.sort(key=lambda pair: -pair[0].score)
+    several = len(poses) > 1
+    if several:
+        hopeful = [pair for pair in found[:_SEMIFINALISTS] if pair[0].score >= _HOPEFUL * found[0][0].score]
+        found = [_refined(correlator, *pair, _MIDDLE_ROUNDS) for pair in hopeful]
+        found.sort(key=lambda pair: -pair[0].score)
+    return _best_at_full_resolution(correlator, found, first.level, refine=several)
+
+
+def coarse_px(correlator: Correlator, first: Aligned, window: Window) -> int:
+    """Pixels of the map that :func:`search` looks at first, all at once."""
+    return window.area_px >> 2 * _coarse_level(correlator, first, window)[0]
+
+
+def _coarse_level(correlator: Correlator, first: Aligned, window: Window) -> tuple[int, list[GridPose]]:
+    """The level on which all hypotheses are scored, and the hypotheses, whose number falls with the resolution."""
+    level, levels = first.level, correlator.query.site.levels
+    while True:
+        side_px, turns, shares = _grid_on(correlator, first, level)
+        area_px = window.area_px / 4**level
+        few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= _MAX_COARSE_PLACES
+        if few or level + 1 == levels or side_px >> 1 < _MIN_TEMPLATE_PX:
+            return level, _hypotheses(correlator.query.telemetry, turns, shares)
+        level += 1
+
+
+def _grid_on(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[float], list[float]]:
+    """The template's shorter side on a level, in its pixels, with the turns and shares to be tried there."""
+    h, w = (n >> (level - first.level) for n in first.template.shape)
+    return min(h, w), *_grid(correlator.options, math.hypot(h, w) / 2.0)
+
+
+def _grid(options: NccOptions, reach_px: float) -> tuple[list[float], list[float]]:
+    """Turns in degrees and shares of the height that leave no corner of a patch off by more than :data:`_EDGE_PX`.
+
+    Args:
+        options: how far heading and height may be off.
+        reach_px: from the patch's middle to its corner, on the level where the hypotheses are scored.
+    """
+    step = 2.0 * _EDGE_PX / reach_px  # radians, or a share of the height: both move the corner by step * reach
+    turns = _steps(options.heading_search_deg, math.degrees(step))
+    if options.heading_search_deg == 180.0:
+        turns = turns[:-1]  # -180 and 180 are one heading
+    return turns, _steps(options.height_search_share, step)
+
+
+def _steps(reach: float, step: float) -> list[float]:
+    """Offsets from -reach to reach, no further apart than the step, 0 among them."""
+    count = math.ceil(reach / step)
+    return [reach * i / count for i in range(-count, count + 1)] if count else [0.0]
+
+
+def _hypotheses(pose: GridPose, turns: list[float], shares: list[float]) -> list[GridPose]:
+    """The pose with its heading turned by each of ``turns`` and its height changed by each of ``shares``."""
+    height, heading = pose.height_agl_m, pose.grid_heading_deg or 0.0
+    assert height is not None  # a frame without one was refused
+    return [
+        replace(pose, grid_heading_deg=(heading + turn) % 360.0, height_agl_m=height * (1.0 + share))
+        for turn, share in itertools.product(turns, shares)
+    ]
+
+
+def _coarse(
+    correlator: Correlator, poses: list[GridPose], window: Window, level: int
+) -> list[tuple[GridPose, Array]]:
+    """The best places of all hypotheses on a coarse level: (hypothesis, nadir in map pixels), falling scores."""
+    query = correlator.query
+    with query.scheduler.stage("map"):
+        region = correlator.cut(window, level)
+    with query.scheduler.stage("align"):
+        tried = [correlator.align(pose, level) for pose in poses]
+    fitting = [aligned for aligned in tried if isinstance(aligned, Aligned)]
+    if not fitting:
+        return []
+    templates, trims = _same_size(fitting)
+    if templates.shape[1] > region.window.height_px or templates.shape[2] > region.window.width_px:
+        return []
+    exclusion_m = correlator.options.rule.exclusion_m
+    separation = max(2, round(exclusion_m / (query.site.gsd_m_per_px * 2.0**level)))
+    found: list[tuple[float, GridPose, Array]] = []
+    with query.scheduler.stage("match"):
+        for aligned, trim, scores in zip(fitting, trims, _surfaces(correlator, region, templates), strict=True):
+            for x, y, score in best_positions(scores, separation, _CANDIDATES):
+                place = np.array([x + region.window.x0, y + region.window.y0], dtype=np.float64) - trim
+                nadir = query.site.full_from_level(place - aligned.patch.offset_px, level)
+                found.append((score, aligned.pose, nadir))
+    found.sort(key=lambda item: -item[0])
+    return _separated(found, separation * 2.0**level)
+
+
+def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.float32]) -> Iterator[Picture]:
+    """One surface (H', W') after the other, of which only a few are in memory."""
+    area_px = region.window.width_px * region.window.height_px
+    group = max(_MIN_GROUP, _MAX_GROUP_PX // area_px)
+    if region.valid is None:
+        own = placed(templates, correlator.query.device)
+        for several in surfaces(region.search, own, group=group):
+            yield from several
+    elif region.search.counts is not None and correlator.is_centred:
+        least = correlator.options.min_valid_share
+        yield from surfaces_over_nodata(region.search, templates, min_overlap=least, group=group)
+    else:
+        for first in range(0, len(templates), group):
+            yield from correlator.masked_scores(region, templates[first : first + group])
+
+
+def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]]:
+    """Templates (T, h, w) cut about their middles to the smallest, and what was cut off (x, y) at their corner."""
+    h = min(aligned.template.shape[0] for aligned in fitting)
+    w = min(aligned.template.shape[1] for aligned in fitting)
+    trims = [((a.template.shape[1] - w) // 2, (a.template.shape[0] - h) // 2) for a in fitting]
+    cut = [a.template[y : y + h, x : x + w] for a, (x, y) in zip(fitting, trims, strict=True)]
+    return np.stack(cut), [np.array(trim, dtype=np.float64) for trim in trims]
+
+
+def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -> list[tuple[GridPose, Array]]:
+    """The best few of places in falling order that are no neighbours of a better one."""
+    kept: list[tuple[GridPose, Array]] = []
+    for _, pose, nadir in found:
+        if all(np.hypot(*(nadir - other)) > distance_px for _, other in kept):
+            kept.append((pose, nadir))
+        if len(kept) == _CANDIDATES:
+            break
+    return kept
+
+
+def _near(correlator: Correlator, aligned: Aligned, nadir_px: Array, level: int) -> Peak | None:
+    """The peak near a nadir that was found on some level, within a few pixels of that level."""
+    return correlator.search(aligned, correlator.near(aligned, nadir_px, _SLACK_PX * 2**level))
+
+
+def _refined(correlator: Correlator, peak: Peak, aligned: Aligned, rounds: int) -> tuple[Peak, Aligned]:
+    """Heading and height between the hypotheses: parabolas through three scores, over ever smaller steps."""
+    step = 2.0 * _EDGE_PX / math.hypot(*aligned.template.shape)
+    best = (peak, aligned)
+    for _ in range(rounds):
+        for turn, share in ((step, 0.0), (0.0, step)):
+            sides = [_moved(correlator, best, sign * turn, sign * share) for sign in (-1.0, 1.0)]
+            if sides[0] is None or sides[1] is None:
+                continue
+            low, high = sides[0][0].score, sides[1][0].score
+            bend = low - 2.0 * best[0].score + high
+            summit = float(np.clip(0.5 * (low - high) / bend if bend < 0 else np.sign(high - low), -1.5, 1.5))
+            tried = _moved(correlator, best, summit * turn, summit * share)
+            best = max([best, *(s for s in (*sides, tried) if s is not None)], key=lambda pair: pair[0].score)
+        step /= 2.0
+    return best
+
+
+def _moved(
+    correlator: Correlator, best: tuple[Peak, Aligned], turn_rad: float, share: float
+) -> tuple[Peak, Aligned] | None:
+    """The peak near the last one, with the heading turned and the height changed by a share."""
+    peak, aligned = best
+    pose = aligned.pose
+    assert pose.grid_heading_deg is not None
+    assert pose.height_agl_m is not None
+    moved = replace(
+        pose,
+        grid_heading_deg=(pose.grid_heading_deg + math.degrees(turn_rad)) % 360.0,
+        height_agl_m=pose.height_agl_m * (1.0 + share),
+    )
+    nadir = correlator.nadir_px(peak, aligned)
+    other = correlator.align(moved, aligned.level, nadir)
+    if isinstance(other, NoFix):
+        return None
+    found = _near(correlator, other, nadir, aligned.level)
+    return None if found is None else (found, other)
+
+
+def _best_at_full_resolution(
+    correlator: Correlator, found: list[tuple[Peak, Aligned]], level: int, *, refine: bool
+) -> tuple[Peak, Aligned] | None:
+    """The best of a few places at full resolution; its rival is the best of the others."""
+    final: list[tuple[Peak, Aligned]] = []
+    for peak, aligned in found[:_FINALISTS]:
+        nadir = correlator.nadir_px(peak, aligned)
+        fine = correlator.align(aligned.pose, level, nadir)
+        if isinstance(fine, NoFix):
+            continue
+        better = _near(correlator, fine, nadir, aligned.level + 1)
+        if better is None:
+            continue
+        # Rivals get as good a heading and height as the winner, or the lead would be that of the refinement.
+        final.append(_refined(correlator, better, fine, _FINE_ROUNDS) if refine else (better, fine))
+    if not final:
+        return None
+    final.sort(key=lambda pair: -pair[0].score)
+    best, aligned = final[0]
+    return replace(best, second_score=max(_best_elsewhere(correlator, final), best.second_score)), aligned
+
+
+def _best_elsewhere(correlator: Correlator, found: list[tuple[Peak, Aligned]]) -> float:
+    """The best score at another place than the winner's."""
+    winner = correlator.nadir_px(*found[0])
+    distance_px = correlator.options.rule.exclusion_m / correlator.query.site.gsd_m_per_px
+    scores = [
+        peak.score
+        for peak, aligned in found[1:]
+        if np.hypot(*(correlator.nadir_px(peak, aligned) - winner)) > distance_px
+    ]
+    return max(scores, default=-1.0)

@@ -1,0 +1,83 @@
+"""The learned method: points matched by networks, then all that SIFT does with its matches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from engine.learned import KeypointMatcher, load_matcher
+from engine.maps.keypoints import KeypointMap
+from engine.matching.explanation import Explanation, explain_features
+from engine.matching.feature_pose import FeatureMatcher
+from engine.matching.method import Method
+from engine.matching.point_finding import PointFinder
+from engine.matching.query import Query
+from engine.matching.views import map_px_per_pixel
+from engine.options import MatcherOptions
+from engine.orthomap import OrthoMap
+from engine.runtime.device import Device
+from engine.values import Fix, NoFix, Result, Window
+
+METHOD = "learned"
+_REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
+
+
+class Learned(Method):
+    """A learned matcher in place of SIFT's features; window, pose, probability and covariance are SIFT's.
+
+    Args:
+        site: the map.
+        device: where the networks live.
+        options: settings; ``options.learned`` and, for what follows the matches, ``options.sift`` count.
+
+    Raises:
+        OptionError: there are no weights, or they make no matcher.
+    """
+
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
+        own = options.learned
+        matcher = load_matcher(own.weights, device=device, min_confidence=own.min_match_confidence)
+        self.keypoints = KeypointMap(site, matcher) if isinstance(matcher, KeypointMatcher) else None
+        self.finder = PointFinder(
+            matcher, self.keypoints, own.max_keypoints, own.max_map_keypoints, own.max_window_px
+        )
+        # The frame is turned upright for the network; without the heading a second look would see less.
+        self.options = replace(options.sift, second_look=False, tolerance_px=own.tolerance_px)
+        self.max_picture_px = own.max_picture_px
+
+    warmup_rounds = 1  # of seconds each where there is no GPU
+
+    @property
+    def cache_counters(self) -> dict[str, int]:
+        """How many entries of each cache were created so far."""
+        return {} if self.keypoints is None else {"keypoint tiles": self.keypoints.created}
+
+    def locate(self, query: Query) -> Result:
+        """A fix on the finest level of the map that there is time for."""
+        works = {share: query.gray.size * self._scale(query, share) ** 2 for share in _REDUCED}
+        share = query.scheduler.first_affordable(METHOD, works)
+        if share is None:
+            return query.refuse_late(METHOD, (METHOD, _REDUCED[-1]))
+        with query.scheduler.costed((METHOD, share), works[share]):
+            matcher = self._feature_matcher(query, share)
+            found = matcher.find()
+        result = found if isinstance(found, NoFix) else matcher.judge(found)
+        return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
+
+    def explain(self, query: Query, window: Window) -> Explanation:
+        """The matches in a window at the frame's own height and heading."""
+        return explain_features(self._feature_matcher(query, 1.0), window)
+
+    def _feature_matcher(self, query: Query, share: float) -> FeatureMatcher:
+        options = replace(self.options, scale=self._scale(query, share))
+        return FeatureMatcher(query, None, options, self.finder, METHOD)
+
+    def _scale(self, query: Query, share: float) -> float:
+        """The scale of the frame at which its pixels are those of the level that it is matched on."""
+        size, most = query.gray.size, self.max_picture_px * share**2
+        height_m = query.telemetry.height_agl_m
+        if height_m is None:
+            return min(1.0, math.sqrt(most / size))
+        per_px = map_px_per_pixel(query, height_m)
+        level = max(0, math.ceil(math.log2(per_px * math.sqrt(size / most))))
+        return min(1.0, per_px / 2.0**level)

@@ -1,0 +1,265 @@
+"""SceneMatcher: one frame, one prior, one budget in; a Fix or a NoFix out. Of a frame it keeps only its cost."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from engine.budget import Budget, Deadline
+from engine.camera import Camera
+from engine.errors import EngineError, OptionError
+from engine.matching import method_type
+from engine.matching.align import to_gray
+from engine.matching.covariance import options_on_map
+from engine.matching.explanation import Explanation
+from engine.matching.method import Method
+from engine.matching.query import Query
+from engine.options import MatcherOptions
+from engine.orthomap import OrthoMap
+from engine.runtime import device as devices
+from engine.runtime import threads
+from engine.runtime import workers as processes
+from engine.runtime.loops import loops_compiled, prepare_loops
+from engine.runtime.scheduler import Costs, OutOfTime, Scheduler
+from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
+from engine.window import level_crop, level_for
+
+if TYPE_CHECKING:
+    from engine.runtime.tensors import torch
+
+_WARMUP_SHARES = (0.25, 0.12)  # of the map's shorter side that a synthetic frame sees
+_WARMUP_SIDE_PX = 4096  # of a larger map it is a part of this side
+
+
+def _plans_created() -> int:
+    """Layouts of pictures that SIFT made so far; its module is not imported to say that there are none."""
+    features = sys.modules.get("engine.features")
+    return 0 if features is None else int(features.plans_created())
+
+
+def _give_back_memory() -> None:
+    """Give the system what was allocated for the warm-up alone: glibc keeps it otherwise."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)
+
+
+def _bounded(prior: Prior) -> Prior:
+    """The prior no vaguer, and moved no farther, than any map is wide."""
+    moved = (prior.moved_east_m, prior.moved_north_m)
+    if prior.sigma_m <= MAX_SIGMA_M and max(map(abs, moved)) <= MAX_SIGMA_M:
+        return prior
+    east, north = (min(max(v, -MAX_SIGMA_M), MAX_SIGMA_M) for v in moved)
+    return replace(prior, sigma_m=min(prior.sigma_m, MAX_SIGMA_M), moved_east_m=east, moved_north_m=north)
+
+
+class SceneMatcher:
+    """Matches single frames against one map with one camera.
+
+    Args:
+        site: the map.
+        camera: as calibrated, with its distortion; frames are undistorted by a lookup computed once.
+        method: "ncc" (needs height and heading), "sift" (needs neither), "auto": NCC where height and heading are
+            known, then SIFT where there is time; where both have a fix they must agree; or "learned": networks
+            with the weights of ``options.learned``.
+        device: "cpu", "cuda" or "auto".
+        options: settings; the defaults serve. The accuracy that the map states counts more than theirs.
+
+    Raises:
+        OptionError: the method is unknown.
+        DeviceError: the device was asked for by name and is missing.
+    """
+
+    def __init__(
+        self,
+        site: OrthoMap,
+        camera: Camera,
+        method: str = "ncc",
+        device: str | torch.device = "auto",
+        options: MatcherOptions | None = None,
+    ) -> None:
+        self.options = options_on_map(options or MatcherOptions(), site)
+        build = method_type(method, self.options.profile)
+        self.site = site
+        self.camera = camera
+        self.method = method
+        self.device = devices.resolve(device)
+        threads.default_threads()
+        self._method: Method = build(site, self.device, self.options)
+        self._costs = Costs()
+        # What an undistorted picture obeys; the mount stays.
+        self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
+
+    def warmup(self, report: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Do before take-off what is done once: compile, find the map's features, plan, and learn what steps cost.
+
+        Features are found on every level of at most :data:`engine.maps.landmarks.PREPARED_PX` pixels; those of
+        a map that comes from a file are kept for the next start. The frames that are matched are the map's own.
+
+        Args:
+            report: takes how many of how many loops are compiled, or loaded from the cache of an earlier start.
+        """
+        prepare_loops(self._method.loops, report)
+        self._method.prepare()
+        for share in _WARMUP_SHARES:
+            frame, prior = self._synthetic_frame(share)
+            for _ in range(self._method.warmup_rounds):
+                self.locate(frame, prior)
+                self._method.warmup(self._query(frame, prior, Deadline(Budget())))
+            self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
+        if self.site.is_searchable:
+            for _ in range(2):  # a step that ran once would be begun whatever it took
+                self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
+        _give_back_memory()
+        self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # takes again what a frame needs of it
+
+    def _synthetic_frame(self, share: float) -> tuple[Frame, Prior]:
+        """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""
+        site, camera = self.site, self.camera
+        side_px = share * min(site.width_px, site.height_px, _WARMUP_SIDE_PX)
+        per_px = side_px / max(camera.width_px, camera.height_px)
+        level = level_for(1.0, per_px, site.levels)
+        size = (round(camera.width_px * per_px), round(camera.height_px * per_px))
+        place = site.inner_px
+        last = (site.width_px - size[0], site.height_px - size[1])
+        x, y = (int(np.clip(v - (n - 1) / 2, 0, end)) for v, n, end in zip(place, size, last, strict=True))
+        crop = level_crop(site, Window(x, y, max(1, size[0]), max(1, size[1])), level)
+        image = cv2.resize(site.gray(crop, level), (camera.width_px, camera.height_px))
+        middle = site.enu_from_pixel(place)
+        height_m = per_px * camera.focal_px * site.gsd_m_per_px
+        prior = Prior(east_m=float(middle[0]), north_m=float(middle[1]), sigma_m=5.0)
+        return Frame(np.asarray(image, np.uint8), 0, height_m, 0.0, 0.0, 0.0), prior
+
+    @property
+    def cache_counters(self) -> dict[str, int]:
+        """How many entries of each cache were created so far; after :meth:`warmup` none rises on a small map."""
+        shared = {"feature plans": _plans_created(), "compiled loops": loops_compiled()}
+        return self._method.cache_counters | shared
+
+    def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
+        """Where the camera was when the frame was taken.
+
+        Args:
+            frame: of the camera's resolution.
+            prior: where the vehicle should be; None searches the whole map.
+            budget: how long the answer may take; None does not hurry. An answer that would come too late is
+                refused with ``Reason.LATE``.
+
+        Raises:
+            CalibrationError: the frame is not of the camera's resolution.
+        """
+        compiled = loops_compiled()
+        result = self._located(frame, prior, budget or Budget())
+        if isinstance(result, NoFix) and result.reason is Reason.LATE and loops_compiled() != compiled:
+            return replace(result, detail=f"{result.detail}; compiling: call warmup() before take-off")
+        return result
+
+    def _located(self, frame: Frame, prior: Prior | None, budget: Budget) -> Fix | NoFix:
+        deadline = Deadline(budget, searches=prior is None or frame.is_doubted)
+        query = self._query(frame, prior, deadline)
+        if query.prior_px is not None and not np.isfinite(query.prior_px).all():
+            return query.refuse_outside(self.method)  # nowhere in the map's coordinate system
+        if prior is None and not self.site.is_searchable:
+            detail = f"the map of {self.site.size_km} is not searched as a whole; a position to begin at is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
+        try:
+            result = self._method.locate(query)
+        except OutOfTime:
+            return query.refuse(Reason.LATE, "the budget was spent before there was a fix", self.method)
+        if isinstance(result, Fix) and not deadline.met:
+            detail = "the answer came after the budget"
+            return query.refuse(Reason.LATE, detail, result.method, window=result.window)
+        return replace(result, timings=query.timings)
+
+    def locate_many(
+        self,
+        frames: Sequence[Frame],
+        priors: Sequence[Prior | None],
+        budget: Budget | None = None,
+        *,
+        workers: int | None = None,
+    ) -> list[Fix | NoFix]:
+        """Where the camera was at each of many frames, by all cores: what :meth:`locate` says of each, in order.
+
+        The work is divided among copies of this process (Linux), which share the prepared map. What they cache and
+        learn ends with them: call :meth:`warmup` before. Frames are matched one by one in this process on a GPU,
+        with a map that is too large for memory, and where all are done in a moment.
+
+        Args:
+            frames: of the camera's resolution.
+            priors: one a frame; None searches the whole map.
+            budget: of each frame.
+            workers: as many processes at most. None is one a core, and 1 where other threads of Python run; a
+                number forks all the same, and no other thread may hold a lock then that matching needs.
+
+        Raises:
+            OptionError: frames and priors differ in number, or there can be no such number of workers.
+            CalibrationError: a frame, which is named by its index, is not of the camera's resolution.
+            BackendError: a worker ended.
+        """
+        if len(frames) != len(priors):
+            raise OptionError(f"priors: expected one a frame, {len(frames)}, got {len(priors)}")
+
+        def located(index: int) -> Fix | NoFix:
+            try:
+                return self.locate(frames[index], priors[index], budget)
+            except EngineError as error:
+                raise type(error)(f"frames[{index}]: {error}") from error
+            except Exception as error:
+                error.add_note(f"It is of frames[{index}].")
+                raise
+
+        return list(processes.in_order(located, len(frames), self._workers(workers)))
+
+    def _workers(self, asked: int | None) -> int:
+        """The number of processes that frames are divided among.
+
+        Raises:
+            OptionError: there can be no such number.
+        """
+        if asked is not None and asked < 1:
+            raise OptionError(f"workers: expected 1 or more, got {asked}")
+        alone = None
+        if self.device.type != "cpu":
+            alone = f"on {self.device}"
+        elif self.site.reads_files:
+            alone = f"with {self.site.name}, which is read from its file as it is needed"
+        elif not processes.can_fork():
+            alone = "here: only Linux forks, and daemonic processes may not"
+        if alone is not None and (asked or 1) > 1:
+            raise OptionError(f"workers: expected 1 {alone}, got {asked}")
+        if alone is not None:
+            return 1
+        return processes.safe_count() if asked is None else asked
+
+    def explain(self, frame: Frame, window: Window, method: str | None = None) -> Explanation:
+        """What the match of a frame in a window looks like: its surface or its matches, for reports.
+
+        Args:
+            frame: of the camera's resolution.
+            window: that was searched, in map pixels.
+            method: "ncc", "sift" or "learned"; None takes the matcher's own, and NCC of "auto".
+
+        Raises:
+            OptionError: the matcher has no such method.
+        """
+        if method not in (None, self.method, *self._method.parts):
+            known = ", ".join(self._method.parts or [self.method])
+            raise OptionError(f"method: expected one of this matcher's ({known}), got {method!r}")
+        middle_px = np.array([window.x0, window.y0]) + np.array([window.width_px - 1, window.height_px - 1]) / 2.0
+        east, north = self.site.enu_from_pixel(middle_px)
+        prior = Prior(east_m=float(east), north_m=float(north), sigma_m=0.0)
+        query = self._query(frame, prior, Deadline(Budget()))
+        return self._method.parts.get(method or self.method, self._method).explain(query, window)
+
+    def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
+        scheduler = Scheduler(deadline, self.device, self._costs)
+        with scheduler.stage("grey"):
+            gray = self.camera.undistort(to_gray(frame))
+        prior = None if prior is None else _bounded(prior)
+        return Query(frame, gray, self._pinhole, self.site, prior, self.device, scheduler)

@@ -1,0 +1,396 @@
+"""The NCC method (Fig. 5): grey, rectify by height and heading, enhance, correlate in the window, peak, refine."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from engine.geo import wrap_heading_deg
+from engine.maps.prepared import PreparedMap
+from engine.maps.samples import SampleMap
+from engine.matching import hypothesis_search
+from engine.matching.acceptance import agree_in_place, judge_peak, judge_second_look, offset_between_m
+from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
+from engine.matching.explanation import Explanation, explain_correlation
+from engine.matching.method import Method
+from engine.matching.oblique import is_ground_below, is_oblique
+from engine.matching.peak_evidence import (
+    PeakCandidate,
+    candidates_of,
+    fix_of,
+    is_hopeless,
+    quick_look,
+    with_confidence,
+)
+from engine.matching.query import Query
+from engine.matching.refinement import Refinement, improved, with_unconfirmed_tilt
+from engine.matching.second_look import can_look_coarsely, candidate_of, hopeful_look, second_look
+from engine.options import MatcherOptions
+from engine.orthomap import OrthoMap
+from engine.runtime.device import Device
+from engine.runtime.scheduler import OutOfTime
+from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
+
+MAX_WINDOW_PX = 8 << 20
+"""A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
+_SECOND_LOOK, _AT_ONCE = "ncc second look", "refinement at once"  # steps
+_HOPEFUL_LOOK = "ncc second look by a coarser level"
+_SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
+_TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
+_TURNED_SIGMA_DEG = 2.0  # of the heading then
+_MIN_CONFIDENCE_TURNED = 0.9995
+_MIN_CONFIDENCE_COARSE = 0.999  # of a peak of the coarsest level, from which refinement begins
+
+
+class Ncc(Method):
+    """Normalised cross-correlation; needs height and heading, or the time to search for the heading.
+
+    Args:
+        site: the map.
+        device: where pictures are correlated.
+        options: settings; ``options.ncc`` counts.
+    """
+
+    loops = (
+        "map_points",
+        "gauss_newton",
+        "surface_loops",
+        "local_normalisation",
+        "lattice",
+        "lower_plane",
+        "dense_loops",
+    )
+
+    def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
+        self.options = options.ncc
+        self.prepared = PreparedMap(site, device, self.options.enhance_radius_px, self.options.score)
+        self.samples = SampleMap(site, self.prepared.enhanced)
+
+    @property
+    def cache_counters(self) -> dict[str, int]:
+        """How many entries of each cache were created so far."""
+        return {"map regions": self.prepared.created, "sampled cells": self.samples.created}
+
+    def warmup(self, query: Query) -> None:
+        """Run every variant of every step, so that it is compiled and its cost known."""
+        if not self._trusts(query):
+            self.locate(query)  # a search has one variant
+            return
+        for coarser in expected_window_px(query, self.options):
+            self.refine(query, self.correlate(query, coarser))
+        untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
+        self.refine(untilted, self.correlate(untilted))
+        found = self.find(query)
+        if isinstance(found, PeakCandidate):
+            candidates_of(self._correlator(query), found)  # as of a refused frame
+        if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
+            self.find_again(query, found)
+
+    def warmup_search(self, query: Query) -> None:
+        """Search the whole map, or headings and heights about the prior."""
+        doubted = replace(query, frame=replace(query.frame, is_doubted=True))
+        self.locate(query if query.prior is None else doubted)
+
+    def locate(self, query: Query) -> Result:
+        """A fix on the finest level of the map that there is time for, refined where there is time for that."""
+        return self.refine(query, self.begin(query))
+
+    def begin(self, query: Query, *, try_turns: bool = True) -> Result:
+        """A refined fix that begins at the coarsest level, else one by correlation alone, see :meth:`correlate`.
+
+        The peak of the coarsest level is the fix where it was accepted and there is no time for a finer one, or
+        where it is beyond doubt and the finer one is at the same place, but not accepted.
+        """
+        coarse = self._by_coarse_peak(query)
+        if coarse is None:
+            return self.correlate(query, try_turns=try_turns)
+        scheduler, work_px, is_refuted = query.scheduler, float(query.gray.size), False
+        is_certain = (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
+        try:
+            with scheduler.with_fix():
+                if is_certain and scheduler.can_afford({_AT_ONCE: work_px}):
+                    with scheduler.costed(_AT_ONCE, work_px):
+                        refined = Refinement(query, self.samples, self.options).refine_at_once(coarse)
+                    if refined is not None:
+                        return refined
+                    coarse, is_refuted = with_unconfirmed_tilt(query, coarse), True
+                step, works = self._step(query)
+                finer = {level: work for level, work in works.items() if level < max(works)}
+                level = scheduler.first_affordable(step, finer)
+                if level is None:
+                    return coarse
+                fine = self.correlate(query, level, try_turns=try_turns)
+        except OutOfTime:
+            return coarse
+        if isinstance(fine, Fix):
+            return with_unconfirmed_tilt(query, fine) if is_refuted and fine.stage == "coarse" else fine
+        if is_certain and any(self._is_same(coarse, peak) for peak in fine.candidates[:1]):
+            return replace(coarse, confidence=self.options.rule.min_confidence)
+        return coarse if fine.reason is Reason.LATE else fine
+
+    def _by_coarse_peak(self, query: Query) -> Fix | None:
+        """The peak of the coarsest level, where it is accepted and a pose may be refined from it as from any.
+
+        Where roll, pitch or the slope of the ground is unknown, the pose rests on the peak, which must be fine.
+        """
+        if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
+            return None
+        step, works = self._step(query)
+        coarser, scheduler = max(works), query.scheduler
+        is_wide = query.site.is_large and works[coarser] > MAX_WINDOW_PX
+        if not (coarser and query.telemetry.has_tilt and query.site.has_surface) or is_wide:
+            return None
+        if not scheduler.can_afford({(step, coarser): works[coarser], _AT_ONCE: float(query.gray.size)}):
+            if scheduler.can_afford({(step, coarser): works[coarser]}):
+                scheduler.costs.note_refusal(_AT_ONCE)
+            return None
+        _, result = self._find_and_judge(query, step, works, coarser)
+        return None if isinstance(result, NoFix) else replace(result, stage="coarse")
+
+    def _is_same(self, coarse: Fix, fine: Fix) -> bool:
+        """Whether two peaks are of one place: where one would not be the other's rival."""
+        distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
+        return distance_m < self.options.rule.exclusion_m and agree_in_place(coarse, fine)
+
+    def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
+        """A fix by correlation alone.
+
+        Args:
+            query: the frame.
+            coarser: levels above the one whose pixels are like the frame's; None takes the finest that there is
+                time for.
+            try_turns: whether a refused frame is tried with its heading a few degrees off.
+        """
+        if query.telemetry.height_agl_m is None:
+            return self._refuse_without_height(query)
+        step, works = self._step(query)
+        if coarser is None:
+            coarser = query.scheduler.first_affordable(step, works)
+        if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
+            query.scheduler.costs.note_refusal((step, max(works)))
+            return self.correlate(query.undoubted, try_turns=try_turns)
+        if coarser is None:
+            return query.refuse_late(METHOD, (step, max(works)))
+        found, result = self._find_and_judge(query, step, works, coarser)
+        if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
+            with suppress(OutOfTime):  # the refusal that there is stands
+                result = self._look_again(query, found, result)
+                if isinstance(result, NoFix) and try_turns and found.features is not None:
+                    result = self._look_turned(query, coarser, works[coarser], result)
+            if isinstance(result, NoFix):
+                result = replace(result, candidates=candidates_of(self._correlator(query), found))
+        if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
+            return self.refine(query.with_height(found.aligned.pose), result)
+        return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
+
+    def _find_and_judge(
+        self, query: Query, step: str, works: dict[int, float], coarser: int
+    ) -> tuple[PeakCandidate | NoFix, Result]:
+        """The highest peak on a level, and what becomes of it; a variant of a step, whose cost is learned."""
+        with query.scheduler.costed((step, coarser), works[coarser]):
+            found = self.find(query, coarser=coarser)
+            return found, found if isinstance(found, NoFix) else self.judge(query, found)
+
+    def _step(self, query: Query) -> tuple[str, dict[int, float]]:
+        """The name of the step that correlates, and the work of its variants."""
+        doubted, map_px = query.frame.is_doubted, float(query.site.width_px * query.site.height_px)
+        if query.prior is None:
+            return "ncc doubted search" if doubted else "ncc search", {0: map_px}
+        windows = expected_window_px(query, self.options)
+        if doubted:
+            return "ncc doubted", {0: max(windows.values())}
+        return ("ncc", windows) if self._trusts(query) else ("ncc hypotheses", {0: map_px})
+
+    def refine(self, query: Query, result: Result) -> Result:
+        """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
+        if not isinstance(result, Fix) or result.stage != "fine" or not self._can_refine(query):
+            return result
+        if result.attitude is not None:  # found by another heading than the frame's own
+            heading_deg = result.attitude.heading_deg
+            frame = replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
+            query = replace(query, frame=frame)
+        refinement = Refinement(query, self.samples, self.options)
+        return improved(query, result, "refinement", refinement.refine)
+
+    def _can_refine(self, query: Query) -> bool:
+        """Whether poses are refined: a height that was searched for is not the frame's."""
+        return self.options.refine and query.telemetry.height_agl_m is not None and self._trusts(query)
+
+    def explain(self, query: Query, window: Window) -> Explanation:
+        """The correlation surface of a window at the frame's own height and heading."""
+        return explain_correlation(self._correlator(query), window)
+
+    def find(self, query: Query, *, coarser: int = 0, min_confidence: float = 0.0) -> PeakCandidate | NoFix:
+        """The highest peak of one frame, or a refusal where there is none.
+
+        Args:
+            query: the frame.
+            coarser: see :meth:`correlate`.
+            min_confidence: see :func:`engine.matching.peak_evidence.with_confidence`.
+        """
+        refusal = self._refuse_unusable(query)
+        if refusal is not None:
+            return refusal
+        correlator = self._correlator(query)
+        aligned = self._align(correlator, coarser)
+        if isinstance(aligned, NoFix):
+            return aligned
+        window = correlator.window(aligned)
+        if window is None:
+            return query.refuse_outside(METHOD)
+        wide = query.site.is_large and window.area_px >> 2 * aligned.level > MAX_WINDOW_PX
+        if wide and hypothesis_search.coarse_px(correlator, aligned, window) > MAX_WINDOW_PX:
+            size = f"{window.width_px} x {window.height_px} px"
+            detail = f"a window of {size} is not searched; a better prior is needed"
+            return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
+        searched = not self._trusts(query)
+        if searched or wide or query.prior is None:
+            peak, aligned = hypothesis_search.search(correlator, aligned, window)
+        else:
+            peak = correlator.search(aligned, window, quick_look(correlator, aligned, window, min_confidence))
+            peak, aligned = self._over_its_ground(correlator, aligned, window, peak, min_confidence)
+        if peak is None:
+            detail = "the map does not cover the frame anywhere in the window"
+            return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
+        if query.scheduler.deadline.remaining_ms < 0:
+            detail = "the budget was spent before the peak was known"
+            return query.refuse(Reason.LATE, detail, METHOD, window=window)
+        fix = fix_of(correlator, aligned, peak, window, searched=searched)
+        found = PeakCandidate(peak, aligned, fix, None, searched)
+        no_features = searched or wide or query.prior is None
+        return found if no_features else with_confidence(correlator, found, min_confidence)
+
+    def _over_its_ground(
+        self,
+        correlator: Correlator,
+        aligned: Aligned,
+        window: Window,
+        peak: Peak | None,
+        min_confidence: float,
+    ) -> tuple[Peak | None, Aligned]:
+        """The peak of an oblique frame, drawn once more if it was found over other ground than at the prior."""
+        query, pose = correlator.query, aligned.pose
+        if peak is None or pose.grid_attitude is None or not is_oblique(query, pose.grid_attitude):
+            return peak, aligned
+        nadir_px = correlator.nadir_px(peak, aligned)
+        again = None if is_ground_below(query, nadir_px) else correlator.align(pose, aligned.level, nadir_px)
+        second = None
+        if isinstance(again, Aligned):
+            second = correlator.search(again, window, quick_look(correlator, again, window, min_confidence))
+        return (peak, aligned) if second is None or not isinstance(again, Aligned) else (second, again)
+
+    def judge(self, query: Query, found: PeakCandidate) -> Result:
+        """The fix where its peak is accepted, else a refusal."""
+        pixels, fix = found.aligned.template.size, found.fix
+        rule, confidence = self.options.rule, fix.confidence
+        refusal = judge_peak(found.peak, pixels, found.features, confidence, rule, searched=found.searched)
+        if refusal is not None:
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
+        return fix
+
+    def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
+        """The fix by a heading that is a few degrees off, where one is much more probable, else the refusal.
+
+        A compass beside motors is often off by more than is assumed of it, and a patch that is turned by 4 degrees
+        hardly correlates. Several headings were tried, so that more is asked for than of the frame's own.
+        """
+        rule = replace(self.options.rule, min_confidence=_MIN_CONFIDENCE_TURNED)
+        best: Fix | None = None
+        for turn_deg in _TURNS_DEG:
+            if not query.scheduler.can_afford({("ncc", coarser): work}):
+                break
+            assert query.frame.heading_deg is not None  # the first look had one
+            heading_deg = wrap_heading_deg(query.frame.heading_deg + turn_deg)
+            turned = replace(
+                query, frame=replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
+            )
+            with query.scheduler.costed(("ncc", coarser), work):
+                found = self.find(turned, coarser=coarser, min_confidence=_MIN_CONFIDENCE_TURNED)
+            if isinstance(found, NoFix) or judge_peak(
+                found.peak, found.aligned.template.size, found.features, found.fix.confidence, rule
+            ):
+                continue
+            if best is None or (found.fix.confidence or 0.0) > (best.confidence or 0.0):
+                attitude = Attitude(query.frame.roll_deg or 0.0, query.frame.pitch_deg or 0.0, heading_deg)
+                best = replace(found.fix, attitude=attitude)
+        return refusal if best is None else best
+
+    def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
+        """The fix of the second look about the same place, if wanted and affordable, else the refusal."""
+        if not self.options.second_look:
+            return refusal
+        again = self.find_again(query, found, self._looked_at(query, found))
+        return refusal if again is None else self.judge_again(query, again)
+
+    def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
+        """The window of a second look: the first one's, or of what was searched for the place's surroundings."""
+        if found.features is not None:
+            return found.fix.window
+        place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
+        correlator = self._correlator(replace(query, prior=place))
+        return correlator.window(found.aligned) or found.fix.window
+
+    def find_again(self, query: Query, found: PeakCandidate, window: Window | None = None) -> PeakCandidate | None:
+        """The highest peak of the second look, see :mod:`engine.matching.second_look`.
+
+        Args:
+            query: the frame.
+            found: at the first look.
+            window: that is looked at; None takes that of the first look, which the fix names in any case.
+
+        Returns:
+            PeakCandidate | None: None where the template is nowhere on the map, or there is no time.
+        """
+        window = window or found.fix.window
+        correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)
+        if can_look_coarsely(correlator, found.aligned, window):
+            if not scheduler.can_afford({_HOPEFUL_LOOK: work_px}):
+                return None
+            with scheduler.costed(_HOPEFUL_LOOK, work_px), scheduler.stage("second look"):
+                hopeful = hopeful_look(correlator, found.aligned, window)
+            best = None if hopeful is None else candidate_of(correlator, found, hopeful)
+            if best is not None and is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
+                return best
+        if not scheduler.can_afford({_SECOND_LOOK: work_px}):
+            return None
+        with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
+            looked = second_look(correlator, found.aligned, window)
+        return None if looked is None else candidate_of(correlator, found, looked)
+
+    def judge_again(self, query: Query, found: PeakCandidate) -> Result:
+        """The fix where the peak of the second look is accepted, else a refusal."""
+        assert found.features is not None
+        assert found.fix.confidence is not None
+        refusal = judge_second_look(found.peak, found.features, found.fix.confidence, self.options.rule)
+        if refusal is not None:
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
+        return found.fix
+
+    def _trusts(self, query: Query) -> bool:
+        return self.options.of_frame(query.frame).trusts(query.telemetry.grid_heading_deg)
+
+    def _correlator(self, query: Query) -> Correlator:
+        return Correlator(query, self.prepared, self.options.of_frame(query.frame))
+
+    def _refuse_without_height(self, query: Query) -> NoFix:
+        return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
+
+    def _refuse_unusable(self, query: Query) -> NoFix | None:
+        """A refusal of a frame that lacks what the method needs."""
+        pose = query.telemetry
+        if pose.height_agl_m is None:
+            return self._refuse_without_height(query)
+        if pose.grid_heading_deg is None and self.options.heading_search_deg < 180.0:
+            return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
+        return query.refuse_flat(METHOD, self.options.rule.min_deviation)
+
+    def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
+        """The frame by its own height and heading, or by any heading where it came without one."""
+        query, pose = correlator.query, correlator.query.telemetry
+        assert pose.height_agl_m is not None  # or it was refused
+        level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
+        known = pose if pose.grid_heading_deg is not None else replace(pose, grid_heading_deg=0.0)
+        with query.scheduler.stage("align"):
+            return correlator.align(known, level)

@@ -1,0 +1,251 @@
+"""Perspective from N points: initial pose, Gauss-Newton on the inliers, and the covariance.
+
+Whether a pose is accepted is decided in :mod:`engine.matching.pose`.
+
+Convention:
+    ``cam_from_map``: x_cam = R (X - C), camera axes x right, y down, z forward. Matches are columns.
+
+References:
+    Beaton and Tukey, The fitting of power series, Technometrics 1974,
+    https://doi.org/10.1080/00401706.1974.10489171 (biweight).
+    Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 1964,
+    https://doi.org/10.1214/aoms/1177703732 (the variance of such an estimate).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
+
+_STEPS = 12  # Gauss-Newton steps at most; four or five are usual
+_STEP_SIGMAS = 2e-2  # a step this small, in standard deviations of the pose, is the last
+_PAIRS = 24  # pairs of matches that give candidate centres where the attitude is known
+_SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
+_REACH_SIGMAS = 4.0
+_MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Matches, prior of the attitude, and inlier tolerance.
+
+    Attributes:
+        points: (3, N) map points in metres, about their mean.
+        pixels: (2, N) undistorted.
+        K: (3, 3) pinhole intrinsics.
+        weights: (N,) relative inverse variances of the pixels.
+        attitude: (3, 3) rotation of the prior, or None.
+        precision: (3, 3) inverse covariance of its angles about the camera's axes in 1/rad^2, 0 without one.
+        tolerance_px: A match agrees if it reprojects at most this far off.
+        noise_floor_px: Lower bound on the standard deviation of a pixel.
+        min_inliers: Fewest inliers of a pose.
+    """
+
+    points: Array
+    pixels: Array
+    K: Array
+    weights: Array
+    attitude: Array | None
+    precision: Array
+    tolerance_px: float
+    noise_floor_px: float
+    min_inliers: int
+
+
+@dataclass(frozen=True, slots=True)
+class Reprojection:
+    """All matches reprojected by a pose.
+
+    Attributes:
+        tangents: (3, N) x / z, y / z and 1 / z in the camera.
+        projected: (2, N) pixels, far off for points behind the camera.
+        squared: (N,) of the reprojection distance.
+    """
+
+    tangents: Array
+    projected: Array
+    squared: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A refined pose.
+
+    Attributes:
+        rotation: (3, 3).
+        center: (3,) in the problem's metres.
+        view: All matches reprojected.
+        inliers: (N,) bool.
+        information: (6, 6) inverse covariance from the matches alone, for the centre in the camera's axes.
+        variance_px2: Of a pixel's x and y.
+    """
+
+    rotation: Array
+    center: Array
+    view: Reprojection
+    inliers: Mask
+    information: Array
+    variance_px2: float
+
+
+# ------------------------------------------------------------------------------------------------- initial pose
+
+
+def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) -> Start | None:
+    """Return the best pose of minimal samples, by OpenCV's USAC with MSAC scores.
+
+    Args:
+        problem: The matches.
+        max_iterations: Upper bound on the number of samples.
+        confidence: Probability, in (0, 1), at which the search stops early.
+        seed: Of the samples.
+
+    Returns:
+        Rotation (3, 3) and centre (3,), or None where no sample gives a pose.
+    """
+    params = cv2.UsacParams()
+    params.threshold = problem.tolerance_px
+    params.confidence = confidence
+    params.maxIterations = max_iterations
+    params.randomGeneratorState = seed
+    params.sampler = cv2.SAMPLING_UNIFORM
+    params.score = cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_NULL  # Gauss-Newton below refines instead
+    points, pixels = np.ascontiguousarray(problem.points.T), np.ascontiguousarray(problem.pixels.T)
+    try:
+        found, _, rotvec, t, inliers = cv2.solvePnPRansac(points, pixels, problem.K, None, params=params)
+    except cv2.error:  # every sample was degenerate
+        return None
+    if not found or inliers is None or not (np.isfinite(rotvec).all() and np.isfinite(t).all()):
+        return None
+    R = cv2.Rodrigues(rotvec)[0]
+    return R, -R.T @ t[:, 0]
+
+
+def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
+    """Return the pose near the known attitude, or None unless more than half of the matches are its inliers.
+
+    Two matches and the attitude determine the centre. A majority needs no further search: no other pose can have
+    one.
+    """
+    if problem.attitude is None:
+        return None
+    R, count = problem.attitude, problem.pixels.shape[1]
+    pairs = np.random.default_rng(seed).integers(0, count, (2, _PAIRS))
+    x = R @ problem.points
+    rays = np.linalg.inv(problem.K) @ np.concatenate([problem.pixels, np.ones((1, count))])
+    # x = c + z ray with ray = (., ., 1): x gives the difference of the depths; x and y give the first depth.
+    one, two = pairs
+    deeper = x[2, one] - x[2, two]
+    offset, across = (x[:, one] - x[:, two] - deeper * rays[:, two])[:2], (rays[:, one] - rays[:, two])[:2]
+    depth = np.sum(offset * across, axis=0) / np.maximum(np.sum(across * across, axis=0), 1e-12)
+    centers = x[:, one] - depth * rays[:, one]
+    seen = x[:, None, :] - centers[:, :, None]
+    residual = problem.K[:2, :2] @ (seen[:2] / np.maximum(seen[2], 1e-9)).reshape(2, -1)
+    residual = residual.reshape(2, _PAIRS, count) + (problem.K[:2, 2:] - problem.pixels)[:, None, :]
+    near = np.sum(residual * residual, axis=0) <= (_SLACK * problem.tolerance_px) ** 2
+    best = int(np.argmax(np.count_nonzero(near, axis=1)))
+    if 2 * np.count_nonzero(near[best]) <= count:
+        return None
+    fit = gauss_newton(problem, R, R.T @ centers[:, best], slack=_SLACK)
+    return fit if fit is not None and 2 * np.count_nonzero(fit.inliers) > count else None
+
+
+# ----------------------------------------------------------------------------------------------------- refinement
+
+
+def reproject(problem: Problem, R: Array, center: Array) -> Reprojection:
+    """Reproject all matches.
+
+    Args:
+        problem: The matches.
+        R: (3, 3) rotation of cam_from_map.
+        center: (3,) of the camera, in the problem's metres.
+
+    Returns:
+        Pixels and squared distances; points behind the camera are far off.
+    """
+    from engine.kernels import pose_fit  # numba takes a while to import
+
+    rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
+    return Reprojection(*pose_fit.reproject(problem.points, problem.pixels, problem.K, rotation, center))
+
+
+def gauss_newton(
+    problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, slack: float = 1.0
+) -> Fit | None:
+    """Iterate Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
+
+    Args:
+        problem: The matches.
+        R: (3, 3) initial rotation.
+        center: (3,) initial centre.
+        steps: Upper bound on the number of steps.
+        slack: Factor on the tolerance in the first step.
+
+    Returns:
+        The pose, or None where there are too few inliers or they do not determine it.
+    """
+    from engine.kernels.pose_fit import fit_pose  # numba takes a while to import
+
+    rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
+    attitude = rotation if problem.attitude is None else np.ascontiguousarray(problem.attitude)
+    found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
+        problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
+        problem.tolerance_px, problem.noise_floor_px, problem.min_inliers,
+        rotation, center, steps, slack, _REACH_SIGMAS, _STEP_SIGMAS,
+    )  # fmt: skip
+    if not found:
+        return None
+    return Fit(rotation, center, Reprojection(tangents, projected, squared), inliers, information, variance)
+
+
+def _inverse(problem: Problem, information: Array) -> Array | None:
+    """Return the covariance (6, 6) by matches and known attitude, or None where they do not determine the pose."""
+    total = information.copy()
+    total[3:, 3:] += problem.precision
+    found, covariance = cv2.invert(total, flags=cv2.DECOMP_CHOLESKY)
+    return np.asarray(covariance) if found else None
+
+
+def turn_from_attitude(problem: Problem, R: Array) -> Array:
+    """Return the rotation from the known attitude to another.
+
+    Args:
+        problem: With or without a known attitude.
+        R: (3, 3) of cam_from_map.
+
+    Returns:
+        (3,) radians about the camera's axes; 0 without a known attitude.
+    """
+    if problem.attitude is None:
+        return np.zeros(3)
+    turn: Array = cv2.Rodrigues(R @ problem.attitude.T)[0][:, 0]
+    return turn
+
+
+def match_covariance(problem: Problem, fit: Fit) -> Array | None:
+    """Return the covariance of a pose.
+
+    Args:
+        problem: The matches.
+        fit: The refined pose.
+
+    Returns:
+        (6, 6) of the centre in the map's axes (m) and of the rotation about the camera's (rad), or None where some
+        direction is not determined.
+    """
+    covariance = _inverse(problem, fit.information)
+    if covariance is None:
+        return None
+    sigma = np.sqrt(np.diag(covariance))
+    if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma))[0] < _MIN_EIGENVALUE:
+        return None
+    to_map = np.eye(6)
+    to_map[:3, :3] = fit.rotation.T
+    return np.asarray(to_map @ covariance @ to_map.T)

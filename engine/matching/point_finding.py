@@ -1,0 +1,115 @@
+"""Points that a picture of the frame and a view of the map share, by a matcher of pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.learned import KeypointMatcher, PairMatcher
+from engine.maps.keypoints import KeypointMap
+from engine.maps.landmarks import as_picture
+from engine.matching.align import RIM_PX
+from engine.matching.query import Query
+from engine.matching.views import MapView
+from engine.runtime.tensors import torch
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PointFinder:
+    """Matches the frames of a flight with views of one map.
+
+    Attributes:
+        matcher: of two pictures.
+        keypoints: of the map, where the matcher has any.
+        max_keypoints: of a frame.
+        max_map_keypoints: of a window.
+        max_window_px: upper bound on the pixels of a view.
+    """
+
+    matcher: PairMatcher
+    keypoints: KeypointMap | None = None
+    max_keypoints: int = 512
+    max_map_keypoints: int = 2048
+    max_window_px: int | None = None
+
+    def too_large(self, view: MapView) -> bool:
+        """Whether a view is more than is searched."""
+        return self.max_window_px is not None and view.crop.area_px > self.max_window_px
+
+    def find(
+        self, query: Query, picture: torch.Tensor, valid: NDArray[np.bool_], view: MapView
+    ) -> tuple[Array, Array]:
+        """What a picture and a view share.
+
+        Args:
+            query: the frame that the picture was made of.
+            picture: (1, 1, h, w) about in the level's pixels, upright where that is known.
+            valid: (h, w) bool, where the picture shows the frame.
+            view: of the map.
+
+        Returns:
+            (M, 2) pixels of the picture and (M, 2) pixels of the view's level.
+        """
+        picture = _plain_outside(picture, valid)
+        if self.keypoints is not None and isinstance(self.matcher, KeypointMatcher):
+            points, places = self._by_keypoints(query, view, picture, self.matcher, self.keypoints, valid)
+        else:
+            with query.scheduler.stage("match"), torch.inference_mode():
+                crop = as_picture(query.site.gray(view.crop, view.level), query.device)
+                points, places = (_points(found) for found in self.matcher(picture, crop))
+                shown = _is_valid(points, valid)
+                points, places = points[shown], places[shown]
+        known = np.isfinite(places).all(axis=1)  # a matcher of others' may say NaN
+        return points[known], places[known] + view.corner_px
+
+    def _by_keypoints(
+        self,
+        query: Query,
+        view: MapView,
+        picture: torch.Tensor,
+        matcher: KeypointMatcher,
+        known: KeypointMap,
+        valid: NDArray[np.bool_],
+    ) -> tuple[Array, Array]:
+        """Matched pixels of picture and crop, the crop's keypoints looked up."""
+        with query.scheduler.stage("frame features"):
+            mine = matcher.extract(picture, 4 * self.max_keypoints)
+            shown = np.flatnonzero(_is_valid(_points(mine.xy_px), valid))[: self.max_keypoints]
+            mine = mine.only(torch.from_numpy(shown).to(mine.xy_px.device))
+        with query.scheduler.stage("map features"):
+            theirs = known.find(view.crop, view.level, self.max_map_keypoints)
+        with query.scheduler.stage("match"):
+            size, crop_size = (valid.shape[1], valid.shape[0]), (view.crop.width_px, view.crop.height_px)
+            pairs = matcher.match(mine, size, theirs, crop_size)
+            points, places = _points(mine.xy_px[pairs[:, 0]]), _points(theirs.xy_px[pairs[:, 1]])
+        return points, places
+
+
+def _plain_outside(picture: torch.Tensor, valid: NDArray[np.bool_]) -> torch.Tensor:
+    """The picture with its mean where it shows nothing: a repeated edge is full of lines, which networks see."""
+    side = 2 * RIM_PX + 1
+    shown = cv2.dilate(valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    if shown.all() or not shown.any():
+        return picture
+    mask = torch.from_numpy(shown).to(picture.device)[None, None]
+    return torch.where(mask, picture, picture[mask].mean())
+
+
+def _points(xy_px: torch.Tensor) -> Array:
+    return np.asarray(xy_px.cpu().numpy(), np.float64)
+
+
+def _is_valid(xy_px: Array, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which points (M, 2) lie where a mask (h, w) holds; those that are not finite do not."""
+    known = np.asarray(np.isfinite(xy_px).all(axis=1))
+    x, y = (
+        np.clip(np.rint(np.where(known[:, None], xy_px, 0.0)), 0, np.array(valid.shape)[::-1] - 1)
+        .astype(np.intp)
+        .T
+    )
+    return np.asarray(known & valid[y, x])

@@ -1,0 +1,296 @@
+"""What every method is given: one frame, what is known of its position, the map, and the frame's clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
+from engine.matching.covariance import with_frame_accuracy
+from engine.matching.pose import AttitudePrior
+from engine.options import AssumedErrors
+from engine.orthomap import OrthoMap
+from engine.runtime.device import Device
+from engine.runtime.scheduler import Scheduler
+from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, Timings, Window
+from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
+
+Array = NDArray[np.float64]
+
+_AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
+_MOST_TURNED = math.radians(60.0)
+_FOUND_HEIGHT_SHARE = 0.03  # standard deviation of a height that a search found
+_ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
+
+
+@dataclass(frozen=True)
+class Query:
+    """One frame on its way to a fix.
+
+    Attributes:
+        frame: as it came.
+        gray: (H, W) its undistorted grey picture.
+        camera: the pinhole that the undistorted picture obeys.
+        site: the map.
+        prior: where the vehicle should be, or None: anywhere on the map.
+        device: where pictures are correlated.
+        scheduler: times its stages, and decides which steps there is time for.
+    """
+
+    frame: Frame
+    gray: NDArray[np.uint8]
+    camera: Camera
+    site: OrthoMap
+    prior: Prior | None
+    device: Device
+    scheduler: Scheduler = field(repr=False)
+
+    @cached_property
+    def prior_px(self) -> Array | None:
+        """The prior's position in map pixels (x, y); None without one, not finite where the CRS does not reach."""
+        prior = self.prior
+        if prior is None:
+            return None
+        with np.errstate(invalid="ignore"):
+            if prior.east_m is not None and prior.north_m is not None:
+                return self.site.pixel_from_enu(np.array([prior.east_m, prior.north_m]))
+            assert prior.lat_deg is not None  # a Prior has one of the two
+            assert prior.lon_deg is not None
+            return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+
+    @cached_property
+    def telemetry(self) -> GridPose:
+        """Height and attitude that the frame came with, the heading turned to grid north at the prior's position.
+
+        Without a position that is the middle of the map, where grid north is true north.
+        """
+        frame, heading_deg = self.frame, self.frame.heading_deg
+        if heading_deg is not None and self.prior_px is not None and np.isfinite(self.prior_px).all():
+            lat, lon = self.site.geodetic_from_pixel(self.prior_px)
+            heading_deg = wrap_heading_deg(heading_deg + self.site.frame.convergence_deg(float(lat), float(lon)))
+        return GridPose(frame.height_agl_m, heading_deg, frame.roll_deg, frame.pitch_deg)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(2, 2) metres east and north per map pixel where the vehicle should be, else at the map's middle."""
+        place = self.prior_px
+        if place is None:
+            place = np.array([self.site.width_px - 1, self.site.height_px - 1]) / 2.0
+        return self.site.enu_jacobian(place)
+
+    def level_of(self, height_m: float) -> int:
+        """The pyramid level whose pixels are like the frame's, taken from this high above the ground."""
+        return level_for(self.site.gsd_m_per_px, height_m / self.camera.focal_px, self.site.levels)
+
+    def window(
+        self,
+        center_px: Array,
+        footprint_px: tuple[float, float],
+        min_px: tuple[float, float],
+        *,
+        margin: float,
+    ) -> Window | None:
+        """The adaptive window in map pixels (eq. 4, 5), or None where it lies outside the map.
+
+        Args:
+            center_px: (2,) where the middle of the footprint should lie.
+            footprint_px: extent of the whole frame on the map.
+            min_px: extent of what will be matched. The window holds it at every position within
+                :data:`engine.window.SPREAD_SIGMAS` of the prior, also where equations 4 and 5 would be smaller.
+            margin: the paper's 1.3.
+        """
+        prior = self.prior
+        if prior is None:
+            return Window(0, 0, self.site.width_px, self.site.height_px)
+        moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
+        moved_px = np.abs(inverse_2x2(self.jacobian) @ moved_m)
+        size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
+        slack = 2.0 * SPREAD_SIGMAS * prior.sigma_m / self.site.gsd_m_per_px
+        width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
+        shape = (self.site.width_px, self.site.height_px)
+        return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
+
+    def errors(self, assumed: AssumedErrors) -> AssumedErrors:
+        """What is assumed of telemetry and map, less what the frame states of its own telemetry."""
+        return with_frame_accuracy(self.frame, assumed)
+
+    def attitude_prior(self, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
+        """The frame's attitude with its assumed errors about the body's axes; an unknown tilt is taken as level.
+
+        Args:
+            grid_heading_deg: clockwise from grid north.
+            sigma_deg: of the heading.
+            errors: of the tilt.
+        """
+        known, mount = self.telemetry, self.camera.mount
+        enu_from_camera = enu_from_body(known.roll_deg or 0.0, known.pitch_deg or 0.0, grid_heading_deg) @ mount
+        return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
+
+    def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
+        """By how much a position may be off where the height that it was measured at is not the telemetry's.
+
+        A focal length that is wrong by a share scales the height, and what the optical axis is off the vertical; a
+        distortion that the calibration lacks passes for a tilt, too. Or the height of the telemetry is wrong: the
+        picture does not tell.
+
+        Args:
+            nadir_px: (2,) of the camera.
+            up_m: of the camera.
+            camera_down: (3,) optical axis in east, north, up.
+            errors: of the telemetry.
+
+        Returns:
+            One standard deviation per axis, 0 where the two heights agree to two of theirs.
+        """
+        known_m = self.telemetry.height_agl_m
+        if known_m is None:
+            return 0.0
+        told_m = known_m - (self.frame.height_correction_m or 0.0)
+        measured_m = up_m - float(self.site.ground_at(nadir_px))
+        off_m = abs(measured_m - told_m)
+        if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
+            return 0.0
+        aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3)
+        told = self.telemetry.grid_attitude
+        turned = 0.0
+        if told is not None and self.telemetry.has_tilt:
+            told_down = self.camera.enu_from_camera(told)[:, 2]
+            turned = math.acos(min(1.0, float(told_down @ camera_down)))
+        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MOST_TURNED)))
+
+    # ------------------------------------------------------------------------------- heading and height searched
+
+    @property
+    def undoubted(self) -> Query:
+        """The same by the frame's own heading and height."""
+        return replace(self, frame=replace(self.frame, is_doubted=False))
+
+    def with_height(self, pose: GridPose) -> Query:
+        """The same by the height that a search found, which is known as well as its steps are fine."""
+        frame, height_m = self.undoubted.frame, pose.height_agl_m
+        assert frame.height_agl_m is not None
+        assert height_m is not None
+        found = replace(
+            frame,
+            height_agl_m=height_m,
+            height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
+            height_correction_m=(frame.height_correction_m or 0.0) + height_m - frame.height_agl_m,
+        )
+        return replace(self, frame=found)
+
+    # --------------------------------------------------------------------------------------------- answers
+
+    def fix(
+        self,
+        method: str,
+        nadir_px: Array,
+        covariance_m2: Array,
+        *,
+        score: float,
+        window: Window,
+        east_north_m: Array | None = None,
+        up_m: float | None = None,
+        grid_attitude: Attitude | None = None,
+        turn_covariance_rad2: Array | None = None,
+        map_sigma_m: float = 0.0,
+    ) -> Fix:
+        """A fix of this frame; its heading counts from true north there.
+
+        Args:
+            method: "ncc" or "sift".
+            nadir_px: (2,) the camera's nadir in map pixels.
+            covariance_m2: (3, 3) east, north, up.
+            score: of the match.
+            window: that was searched.
+            east_north_m: (2,) of the nadir where it is known in metres; None computes it.
+            up_m: height of the camera, or None where it is not measured.
+            grid_attitude: the heading from grid north; None where it is not measured.
+            turn_covariance_rad2: (3, 3) of a small turn about the camera's axes, with a measured attitude.
+            map_sigma_m: the part of the covariance that is the map's georeference.
+        """
+        east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
+        lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
+        angles_deg2 = None
+        if grid_attitude is not None and turn_covariance_rad2 is not None:
+            about_body = transport_covariance(self.camera.mount, turn_covariance_rad2)
+            angles_deg2 = angle_covariance_deg2(about_body, grid_attitude.roll_deg, grid_attitude.pitch_deg)
+        return Fix(
+            timestamp_ns=self.frame.timestamp_ns,
+            lat_deg=lat,
+            lon_deg=lon,
+            east_m=float(east),
+            north_m=float(north),
+            up_m=up_m,
+            covariance_m2=covariance_m2,
+            attitude=self._true_attitude(grid_attitude, lat, lon),
+            score=score,
+            method=method,
+            window=window,
+            timings=self.timings,
+            map_xy_px=(float(nadir_px[0]), float(nadir_px[1])),
+            map_sigma_m=map_sigma_m,
+            attitude_covariance_deg2=angles_deg2,
+        )
+
+    def _true_attitude(self, grid_attitude: Attitude | None, lat_deg: float, lon_deg: float) -> Attitude | None:
+        if grid_attitude is None:
+            return None
+        turn_deg = self.site.frame.convergence_deg(lat_deg, lon_deg)
+        heading_deg = wrap_heading_deg(grid_attitude.heading_deg - turn_deg)
+        return Attitude(grid_attitude.roll_deg, grid_attitude.pitch_deg, heading_deg)
+
+    @property
+    def timings(self) -> Timings:
+        """What was measured so far."""
+        return Timings(dict(self.scheduler.stages_ms))
+
+    def refuse(
+        self,
+        reason: Reason,
+        detail: str,
+        method: str,
+        *,
+        score: float | None = None,
+        window: Window | None = None,
+    ) -> NoFix:
+        """The refusal of this frame, with what was measured so far."""
+        return NoFix(
+            reason=reason,
+            detail=detail,
+            timestamp_ns=self.frame.timestamp_ns,
+            method=method,
+            score=score,
+            window=window,
+            timings=self.timings,
+        )
+
+    def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
+        """A refusal where the picture has no texture to match, else None."""
+        deviation = float(cv2.meanStdDev(self.gray)[1][0, 0])
+        if deviation >= min_deviation:
+            return None
+        figure = f"the frame's grey levels deviate by {deviation:.1f}"
+        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {min_deviation:g} is asked for", method)
+
+    def refuse_tilted(self, attitude: Attitude, method: str) -> NoFix:
+        """The refusal of a frame of which some part sees the horizon, or nearly so."""
+        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
+        return self.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", method)
+
+    def refuse_outside(self, method: str) -> NoFix:
+        """The refusal of a frame whose window has nothing in common with the map."""
+        return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
+
+    def refuse_late(self, method: str, step: Hashable) -> NoFix:
+        """The refusal of a frame for whose quickest variant of a step there is no time, see :class:`Scheduler`."""
+        self.scheduler.costs.note_refusal(step)
+        left_ms = self.scheduler.deadline.remaining_ms
+        detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
+        return self.refuse(Reason.LATE, detail, method)

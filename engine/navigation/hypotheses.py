@@ -1,0 +1,170 @@
+"""Hypotheses: places that matches of successive frames speak for, moved along by odometry and added up.
+
+A match that is not accepted is not lost: the next frames speak for its place, or against it. What a match adds is
+counted by the ground that is new (:mod:`engine.navigation.evidence`). Matches that the matcher itself doubts count
+for new ground alone, and must leave every rival behind: track before detect, in a bounded set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from engine.navigation.evidence import (
+    RELIABILITY,
+    Sources,
+    agreement_log_odds,
+    log_odds,
+    match_log_odds,
+    new_ground_share,
+    repeated_log_odds,
+)
+from engine.navigation.motion import DriftModel, OdometrySample, PositionEstimate, en_m
+from engine.values import MAX_SIGMA_M, Fix
+
+MAX_HYPOTHESES = 16
+_MIN_LOG_ODDS = -3.0  # below which a hypothesis is dropped
+_SEARCHED_MISS, _MISS = math.log(0.1), math.log(0.5)  # what a frame without a match of a right place adds
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """A match of the newest frame that is not accepted yet.
+
+    Attributes:
+        fix: the match.
+        log_odds: of itself and of the estimates that it agrees with or contradicts; of a first match.
+        doubted: the matcher refused it.
+    """
+
+    fix: Fix
+    log_odds: float
+    doubted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A place with the evidence for it.
+
+    Attributes:
+        fix: the newest match of it.
+        sample: the odometry of that.
+        count: matches of it.
+        log_odds: of all of them.
+        doubted: how many of them the matcher refused.
+    """
+
+    fix: Fix
+    sample: OdometrySample
+    count: int
+    log_odds: float
+    doubted: int = 0
+
+
+class Hypotheses:
+    """The bounded set of a flight.
+
+    Args:
+        drift: of dead reckoning.
+        gate: chi-square beyond which a match is of another place.
+    """
+
+    def __init__(self, drift: DriftModel, gate: float) -> None:
+        self._drift, self._gate = drift, gate
+        self._known: list[Hypothesis] = []
+
+    @property
+    def pending(self) -> Hypothesis | None:
+        """The strongest that the matcher itself vouches for, about which others are looked for."""
+        vouched = [each for each in self._known if each.doubted < each.count]
+        return max(vouched, key=lambda each: each.log_odds, default=None)
+
+    def clear(self) -> None:
+        """Forget all of them."""
+        self._known = []
+
+    def position(self, hypothesis: Hypothesis, now: OdometrySample) -> PositionEstimate:
+        """Dead reckoning from a hypothesis."""
+        drift_m = self._drift.sigma_m(hypothesis.sample, now)
+        sigma_m = min(math.hypot(hypothesis.fix.relative_sigma_m, drift_m), MAX_SIGMA_M)
+        moved_m = now.moved_m - hypothesis.sample.moved_m
+        return PositionEstimate(en_m(hypothesis.fix) + moved_m, sigma_m, log_odds(RELIABILITY), on_map=True)
+
+    def add(
+        self,
+        matches: Sequence[Match],
+        now: OdometrySample,
+        sources: Sources,
+        map_m2: float,
+        height_m: float | None,
+    ) -> Hypothesis | None:
+        """Add the matches of one frame; each hypothesis takes the best that agrees with it.
+
+        Args:
+            matches: of the frame; none where there is nothing in it.
+            now: its odometry.
+            sources: what else was known, and where the matcher searched.
+            map_m2: area of the window where the whole map was searched.
+            height_m: above the ground.
+
+        Returns:
+            Hypothesis | None: the strongest that a match of this frame speaks for.
+        """
+        grown: list[Hypothesis] = []
+        used: set[int] = set()
+        pending, about_pending = self.pending, sources.searched is not None and sources.searched is sources.pending
+        for known in self._known:
+            searched = about_pending and known is pending
+            before = self.position(known, now)
+            agreeing = [k for k, match in enumerate(matches) if before.chi_square(match.fix) <= self._gate]
+            best = max(agreeing, key=lambda k: matches[k].log_odds, default=None)
+            if best is None:
+                grown.append(replace(known, log_odds=known.log_odds + (_SEARCHED_MISS if searched else _MISS)))
+                continue
+            used.add(best)
+            searched_m2 = None if searched else sources.searched_m2(map_m2)
+            grown.append(_extended(known, matches[best], now, before, searched_m2, height_m))
+        for k, match in enumerate(matches):
+            if k not in used:
+                grown.append(Hypothesis(match.fix, now, 1, match.log_odds, int(match.doubted)))
+        grown.sort(key=lambda each: -each.log_odds)
+        self._known = [each for each in grown if each.log_odds >= _MIN_LOG_ODDS][:MAX_HYPOTHESES]
+        return next((each for each in self._known if each.sample is now), None)
+
+    def lead(self, hypothesis: Hypothesis) -> float:
+        """Log-odds of a hypothesis against all others; of one that the matcher vouches for, its own."""
+        if not hypothesis.doubted:
+            return hypothesis.log_odds
+        rivals = [each.log_odds for each in self._known if each is not hypothesis]
+        return hypothesis.log_odds - float(np.logaddexp.reduce([0.0, *rivals]))
+
+
+def _extended(
+    known: Hypothesis,
+    match: Match,
+    now: OdometrySample,
+    before: PositionEstimate,
+    searched_m2: float | None,
+    height_m: float | None,
+) -> Hypothesis:
+    """A hypothesis with one match more.
+
+    Args:
+        known: it.
+        match: that agrees with it.
+        now: its odometry.
+        before: where the hypothesis predicted it.
+        searched_m2: area that was searched; None where it was searched about this prediction.
+        height_m: above the ground.
+    """
+    fix = match.fix
+    share = new_ground_share(float(np.hypot(*(en_m(fix) - en_m(known.fix)))), height_m)
+    agreement = 0.0 if searched_m2 is None else agreement_log_odds(before, fix, searched_m2)
+    gain = repeated_log_odds(fix, agreement, share)
+    if match.doubted:
+        gain = share * (match_log_odds(fix) + agreement)
+    doubted = known.doubted + int(match.doubted)
+    return Hypothesis(fix, now, known.count + 1, known.log_odds + gain, doubted)

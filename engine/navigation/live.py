@@ -1,0 +1,336 @@
+"""Live: frames as they are captured, answers in time. A queue of one, in which the newest frame wins.
+
+A worker thread matches. A watchdog answers in its place when the deadline comes first, and replaces it where it
+hangs or dies. The result of a worker whose frame was already answered is discarded.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+from engine.budget import Budget
+from engine.errors import EngineError, OptionError, StateError
+from engine.navigation.navigator import Navigator
+from engine.runtime.realtime import LoadWatch, Realtime, check_realtime, start_thread
+from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
+
+_log = logging.getLogger("scenematch")
+
+_JOIN_S = 5.0  # that closing waits for abandoned workers; one that hangs for good is left behind
+_MAX_MS = 60_000.0  # of any wait in flight
+_MAX_DOUBLINGS = 10  # how often the time to create a navigator is doubled at most
+_LOOK_S = 0.02  # how often a clock of another speed is read while a frame is due
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveOptions:
+    """How long a frame and a worker are waited for.
+
+    Attributes:
+        deadline_ms: age, counted from capture, by which a frame is answered.
+        patience_ms: beyond the deadline, after which a worker counts as hanging and is replaced. One that creates
+            its navigator has as long from its start, and twice as long after each that hung in doing so.
+        max_speed_mps: of the vehicle, by which the uncertainty at a new worker's start grows with time.
+        realtime: how the worker and the watchdog are scheduled; None is as usual.
+    """
+
+    deadline_ms: float = 121.0
+    patience_ms: float = 1000.0
+    max_speed_mps: float = 15.0
+    realtime: Realtime | None = None
+
+    def __post_init__(self) -> None:
+        check_positive(self, "deadline_ms", "patience_ms", "max_speed_mps")
+        for name in ("deadline_ms", "patience_ms"):
+            if getattr(self, name) > _MAX_MS:
+                raise OptionError(f"{name}: expected at most {_MAX_MS:g}, got {getattr(self, name):g}")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of one frame.
+
+    Attributes:
+        frame: as it was submitted.
+        result: its fix, or why there is none.
+        age_ms: from capture to output.
+    """
+
+    frame: Frame
+    result: Result
+    age_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What went in and what came out: submitted = answered + dropped + at most one that waits and one in work."""
+
+    submitted: int = 0
+    dropped: int = 0
+    answered: int = 0
+    late: int = 0
+    workers_replaced: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Job:
+    frame: Frame
+    prior: Prior | None
+    captured_ns: int
+    submitted_s: float  # on time.monotonic, as a worker that hangs does so on this machine's time
+    answered: bool = False
+
+
+class Live:
+    """Answers a stream of frames.
+
+    Args:
+        make_navigator: creates a navigator that starts at a prior, or anywhere where that is None; called once by
+            the constructor, and in its own thread by every worker that replaces another.
+        deliver: takes each answer, one at a time, from one of the engine's threads.
+        start: where the flight begins.
+        options: settings.
+        clock_ns: on which frames are captured and grow old, such as a simulator's; None is ``time.monotonic_ns``.
+
+    Raises:
+        OptionError, BackendError: real time was asked for, and the system is not Linux or does not permit it.
+
+    Convention:
+        Python cannot stop a thread: one that hangs is left behind, and nothing of it is used any more. A hang that
+        holds Python's lock stops the whole process.
+    """
+
+    def __init__(
+        self,
+        make_navigator: Callable[[Prior | None], Navigator],
+        deliver: Callable[[Answer], None],
+        start: Prior | None = None,
+        options: LiveOptions | None = None,
+        clock_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self._make_navigator, self._deliver = make_navigator, deliver
+        self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
+        self._last: tuple[Fix, int] | None = None
+        self._changed = threading.Condition()
+        self._delivering = threading.Lock()
+        self._waiting: _Job | None = None
+        self._working: _Job | None = None
+        self._number = 0  # of the present worker
+        self._creating_since_ns: int | None = None  # when the worker began to; None while it has one, or pauses
+        self._hung_creations = 0  # in a row
+        self._counts = Counts()
+        self._closed = False
+        self._threads: list[threading.Thread] = []
+        check_realtime(self._options.realtime)
+        self._start_thread(self._work, make_navigator(start), 0)
+        self._start_thread(self._watch, above=1)  # a worker that computes must not keep it from answering
+
+    @property
+    def counts(self) -> Counts:
+        """What went in and came out so far."""
+        with self._changed:
+            return self._counts
+
+    def submit(self, frame: Frame, prior: Prior | None = None, captured_ns: int | None = None) -> None:
+        """Hand in the newest frame; one that still waits is dropped. Never blocks for longer than a lock is held.
+
+        Args:
+            frame: newer than every frame before it.
+            prior: of its position by another source.
+            captured_ns: when it was captured, on the clock of this pipeline; None is now.
+
+        Raises:
+            StateError: the pipeline was closed.
+        """
+        job = _Job(frame, prior, self._clock_ns() if captured_ns is None else captured_ns, time.monotonic())
+        with self._changed:
+            if self._closed:
+                raise StateError("submit: expected an open pipeline, got one that was closed")
+            self._count("submitted")
+            if self._waiting is not None:
+                self._count("dropped")
+            self._waiting = job
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Take no more frames; the one in work is answered still, one that waits is dropped.
+
+        Waits also for workers whose frames were answered without them: a process that ends while one of its
+        threads is within compiled code is aborted.
+        """
+        with self._changed:
+            self._closed = True
+            if self._waiting is not None:
+                self._count("dropped")
+                self._waiting = None
+            self._changed.notify_all()
+            job, due_s = self._working, (self._options.deadline_ms + self._options.patience_ms) * 1e-3
+            self._changed.wait_for(lambda: self._working is None and (job is None or job.answered), timeout=due_s)
+        until = time.monotonic() + _JOIN_S
+        for thread in self._threads:
+            if thread is not threading.current_thread():  # a receiver may close, too
+                thread.join(max(0.0, until - time.monotonic()))
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _work(self, navigator: Navigator | None, number: int) -> None:
+        """The worker: takes the newest frame, matches it, and delivers the result if it is not too late."""
+        if navigator is None:
+            navigator = self._create_navigator(number)
+        if navigator is None:
+            self._replace(number)
+            return
+        load = LoadWatch(self._options.realtime)
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None or self._closed or self._number != number)
+                if self._waiting is None or self._number != number:
+                    return
+                job, self._working, self._waiting = self._waiting, self._waiting, None
+                self._changed.notify_all()
+            begin_s = time.monotonic()
+            result, alive = self._match(navigator, job)
+            load.add(begin_s, time.monotonic())
+            with self._changed:
+                if self._number != number:
+                    return  # replaced meanwhile
+                self._working = None
+                self._changed.notify_all()
+                if isinstance(result, Fix):
+                    self._last = (result, job.captured_ns)
+            self._answer(job, result)
+            if not alive:
+                self._replace(number)
+                return
+
+    def _create_navigator(self, number: int) -> Navigator | None:
+        """A navigator that starts at the last fix; None, after a pause, where creating it failed."""
+        navigator = None
+        try:
+            navigator = self._make_navigator(self._resume())
+        except Exception:
+            _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
+        with self._changed:
+            if self._number == number:  # not replaced meanwhile
+                self._creating_since_ns, self._hung_creations = None, 0
+            if navigator is None:
+                pause_s = self._options.patience_ms * 1e-3
+                self._changed.wait_for(lambda: self._closed or self._number != number, timeout=pause_s)
+        return navigator
+
+    def _match(self, navigator: Navigator, job: _Job) -> tuple[Result, bool]:
+        """The result of one frame, and whether the navigator is still usable."""
+        left_ms = self._options.deadline_ms - self._age_ms(job)
+        if left_ms <= 0:
+            return _refusal(job, Reason.LATE, "the frame waited until its deadline"), True
+        try:
+            # A search of the whole map may outlast its frame's deadline: the next frame profits from it.
+            budget = Budget(total_ms=left_ms, search_ms=left_ms + self._options.patience_ms)
+            return navigator.update(job.frame, job.prior, budget), True
+        except EngineError as error:  # this frame cannot be used; the next may
+            return _refusal(job, Reason.FAILED, str(error)), True
+        except Exception as error:
+            return _refusal(job, Reason.FAILED, f"{type(error).__name__}: {error}"), False
+
+    def _watch(self) -> None:
+        """The watchdog: answers frames that are due and replaces a worker that hangs."""
+        while True:
+            with self._changed:
+                if self._closed and self._working is None:
+                    return
+                jobs = [job for job in (self._working, self._waiting) if job is not None and not job.answered]
+                due = [job for job in jobs if self._age_ms(job) >= self._options.deadline_ms]
+                hangs_in_ms, number = self._hangs_in_ms(), self._number
+                hung = hangs_in_ms <= 0
+                if self._waiting in due:
+                    self._waiting = None
+                if not due and not hung:
+                    left_ms = min([hangs_in_ms, *(self._options.deadline_ms - self._age_ms(job) for job in jobs)])
+                    wait_s = max(left_ms, 0.0) * 1e-3 if math.isfinite(left_ms) else None
+                    if wait_s is not None and self._clock_ns is not time.monotonic_ns:
+                        wait_s = min(wait_s, _LOOK_S)
+                    self._changed.wait(wait_s)
+                    continue
+            for job in due:
+                self._answer(job, _refusal(job, Reason.LATE, "no answer by the deadline"))
+            if hung:
+                self._replace(number)
+
+    def _hangs_in_ms(self) -> float:
+        """Time until the worker counts as hanging, in an answered frame or in creating its navigator."""
+        deadline_ms, patience_ms = self._options.deadline_ms, self._options.patience_ms
+        if self._creating_since_ns is not None:
+            creating_for_ms = (time.monotonic_ns() - self._creating_since_ns) * 1e-6
+            # A creation that is only slow would never finish if each attempt got the same time.
+            return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_creations, _MAX_DOUBLINGS) - creating_for_ms
+        if self._working is None or not self._working.answered:
+            return math.inf
+        return deadline_ms + patience_ms - (time.monotonic() - self._working.submitted_s) * 1e3
+
+    def _answer(self, job: _Job, result: Result) -> None:
+        """Deliver one answer a frame; a fix that came too late becomes a refusal."""
+        with self._delivering:
+            age_ms = self._age_ms(job)
+            late = age_ms > self._options.deadline_ms
+            with self._changed:
+                if job.answered:
+                    return
+                job.answered = True
+                self._count("answered", *(["late"] if late else []))
+                self._changed.notify_all()
+            if late and isinstance(result, Fix):
+                result = _refusal(job, Reason.LATE, f"the fix came {age_ms:.0f} ms after capture")
+            try:
+                self._deliver(Answer(job.frame, result, age_ms))
+            except Exception:  # the receiver's error is no reason to stop answering
+                _log.exception("deliver failed")
+
+    def _replace(self, number: int) -> None:
+        with self._changed:
+            if self._number != number:
+                return
+            self._working = None
+            self._changed.notify_all()
+            if self._closed:
+                return
+            self._hung_creations += self._creating_since_ns is not None
+            self._creating_since_ns = time.monotonic_ns()
+            self._number += 1
+            self._count("workers_replaced")
+        self._start_thread(self._work, None, number + 1)
+
+    def _resume(self) -> Prior | None:
+        """Where a new worker starts: at the last fix, as uncertain as the vehicle may have moved since."""
+        with self._changed:
+            last = self._last
+        if last is None:
+            return None
+        fix, captured_ns = last
+        moved_m = self._options.max_speed_mps * max(self._clock_ns() - captured_ns, 0) * 1e-9
+        return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + moved_m)
+
+    def _count(self, *names: str) -> None:
+        self._counts = replace(self._counts, **{name: getattr(self._counts, name) + 1 for name in names})
+
+    def _start_thread(self, target: Callable[..., None], *args: object, above: int = 0) -> None:
+        name = f"scenematch-{target.__name__}"
+        thread = start_thread(partial(target, *args), name, self._options.realtime, above=above)
+        with self._changed:
+            self._threads = [*(other for other in self._threads if other.is_alive()), thread]
+
+    def _age_ms(self, job: _Job) -> float:
+        return max(self._clock_ns() - job.captured_ns, 0) * 1e-6
+
+
+def _refusal(job: _Job, reason: Reason, detail: str) -> NoFix:
+    return NoFix(reason=reason, detail=detail, timestamp_ns=job.frame.timestamp_ns)

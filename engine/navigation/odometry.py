@@ -1,0 +1,337 @@
+"""Visual odometry: how far the vehicle moved between two pictures of the ground, by points that both show.
+
+Corners of the earlier picture are followed into the later one by pyramidal Lucas-Kanade, from where attitude and
+height let them be expected. Those that one homography explains give the camera's motion over level ground at the
+known height. What is left of the rotation is solved for with it, since a fraction of a degree looks like metres.
+
+References:
+    Lucas and Kanade, An iterative image registration technique, IJCAI 1981.
+    Shi and Tomasi, Good features to track, CVPR 1994, https://doi.org/10.1109/CVPR.1994.323794.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.matching.align import to_gray
+from engine.matching.covariance import with_frame_accuracy
+from engine.navigation.motion import GroundMotion
+from engine.options import AssumedErrors
+from engine.values import Attitude, Frame, check_positive
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+Tracker = Callable[[Gray, Gray, Array], tuple[Array, Array]]
+"""Two pictures (H, W) and the homography (3, 3) that is expected between them, to points (N, 2) px of each."""
+
+_SMALL_PX = 160  # width at which a first shift is looked for
+_MAX_SIDE_PX = 640  # larger pictures are made smaller first
+_LEVELS, _WINDOW_PX = 3, 15  # of Lucas-Kanade
+_APART_PX, _QUALITY = 8, 0.01  # between corners; of the weakest, by the strongest
+_RANSAC_PX, _RANSAC_CONFIDENCE = 1.5, 0.999
+_MAX_OFF_DEG = 70.0  # from the vertical, up to which a point lies on the ground
+_STEPS, _CONVERGED = 6, 1e-6  # of Gauss-Newton at most; the last one's length, as a share of the height
+_LEAST_PX = 0.05  # of a point's error
+_HUBER_SIGMAS = 2.0
+_LEVEL_DEG = 0.02  # where roll and pitch are unknown their change is not solved for: see docs/odometry.md
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryOptions:
+    """How pictures are followed, and which motion is refused.
+
+    Attributes:
+        max_points: that are followed from picture to picture.
+        min_points: that must agree on one motion.
+        min_share: of those that were followed, which must agree.
+        min_spread: standard deviation of those that agree, along each side of the picture and as a share of it:
+            what is fixed to the camera often fills a corner.
+        max_sigma_mps: a velocity that is less certain is refused.
+        max_interval_s: between two pictures.
+        tilt_change_sigma_deg: by how much the change of roll and of pitch between two pictures may be off.
+        heading_change_sigma_deg: the same of the heading.
+        relief_share: by how much the ground that is followed lies above or below the one that the height is over,
+            as a share of the height.
+        points_per_error: followed points whose errors are one and the same.
+        error_memory_s: how long an error stays the same, since the same ground is followed.
+    """
+
+    max_points: int = 200
+    min_points: int = 20
+    min_share: float = 0.5
+    min_spread: float = 0.12
+    max_sigma_mps: float = 2.0
+    max_interval_s: float = 3.0
+    tilt_change_sigma_deg: float = 1.0
+    heading_change_sigma_deg: float = 2.0
+    relief_share: float = 0.01
+    points_per_error: float = 3.0
+    error_memory_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, *self.__dataclass_fields__)
+        if self.min_share > 1.0:
+            raise OptionError(f"min_share: expected at most 1, got {self.min_share}")
+
+
+@dataclass(frozen=True, slots=True)
+class NoMotion:
+    """Two pictures gave no motion; why, in a few words."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    frame: Frame
+    gray: Gray
+
+
+class VisualOdometry:
+    """Follows the ground from picture to picture.
+
+    Args:
+        camera: that took them, its lens included.
+        options: settings; the defaults serve.
+        tracker: finds the same points in two pictures; None is :func:`track_corners`.
+    """
+
+    def __init__(
+        self, camera: Camera, options: OdometryOptions | None = None, tracker: Tracker | None = None
+    ) -> None:
+        self._camera, self._options = camera, options or OdometryOptions()
+        self._tracker = tracker or self._track_corners
+        self._last: _Picture | None = None
+        self._velocity_mps: Array | None = None  # (3,) that is expected of the next step
+
+    def update(self, frame: Frame) -> GroundMotion | NoMotion:
+        """How far the vehicle moved since the last frame.
+
+        Args:
+            frame: the newest, with stamp, heading and height; roll and pitch where they are known. One that comes
+                with a velocity is kept for the next and not followed.
+
+        Returns:
+            GroundMotion | NoMotion: the latter where pictures or telemetry do not support a motion.
+
+        Raises:
+            CalibrationError: the frame is not of the camera's resolution.
+        """
+        self._camera.check_size(frame.image.shape)
+        gray = to_gray(frame).copy()  # a buffer may be filled again
+        last, self._last = self._last, _Picture(frame, gray)
+        if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
+            motion: GroundMotion | NoMotion = NoMotion("the velocity is known")
+        elif last is None:
+            motion = NoMotion("there is no picture before")
+        else:
+            motion = self._between(last, self._last)
+        self._velocity_mps = np.append(motion.velocity_mps, 0.0) if isinstance(motion, GroundMotion) else None
+        return motion
+
+    def _between(self, last: _Picture, now: _Picture) -> GroundMotion | NoMotion:
+        """The motion from one picture to the next."""
+        earlier, later = last.frame, now.frame
+        if earlier.timestamp_ns is None or later.timestamp_ns is None:
+            return NoMotion("a frame has no stamp")
+        interval_s = (later.timestamp_ns - earlier.timestamp_ns) * 1e-9
+        if not 0.0 < interval_s <= self._options.max_interval_s:
+            return NoMotion(f"the pictures are {interval_s:.1f} s apart")
+        height_m, begin, end = earlier.height_agl_m, earlier.attitude, later.attitude
+        if height_m is None or begin is None or end is None:
+            return NoMotion("height or heading is unknown")
+        if np.array_equal(last.gray, now.gray):
+            self._last = (
+                None  # it was not taken when its stamp says, so that the next way would be of another time
+            )
+            return NoMotion("the picture is the last one again")
+        view = _View(self._camera, begin, end, height_m)
+        moved_m = np.zeros(3) if self._velocity_mps is None else self._velocity_mps * interval_s
+        moved_m[2] = (later.height_agl_m or height_m) - height_m
+        expected = view.homography(moved_m)
+        if self._velocity_mps is None:
+            expected = _shifted(last.gray, now.gray, expected)
+        points = self._tracker(last.gray, now.gray, expected)
+        agreed = self._agreed(*points)
+        if isinstance(agreed, NoMotion):
+            return agreed
+        known = None not in (earlier.roll_deg, earlier.pitch_deg, later.roll_deg, later.pitch_deg)
+        solved = view.solve(*agreed, moved_m, self._options, has_tilt=known)
+        if solved is None:
+            return NoMotion("the ground is seen too obliquely, or shows no one motion")
+        return self._judged(earlier, interval_s, *solved, len(agreed[0]))
+
+    def _judged(
+        self, frame: Frame, interval_s: float, moved_m: Array, noise_m2: Array, points: int
+    ) -> GroundMotion | NoMotion:
+        """The motion, unless it is too uncertain."""
+        sigma_mps = math.sqrt(float(np.linalg.eigvalsh(noise_m2)[-1])) / interval_s
+        if not sigma_mps <= self._options.max_sigma_mps:
+            return NoMotion(f"the velocity is uncertain by {sigma_mps:.1f} m/s")
+        errors, height_m = with_frame_accuracy(frame, AssumedErrors()), frame.height_agl_m or 1.0
+        height_share = math.hypot(errors.height_sigma_m(height_m) / height_m, self._options.relief_share)
+        lasting = math.hypot(height_share, math.radians(errors.heading_deg))
+        drift = 1.0 + 2.0 * self._options.error_memory_s / interval_s
+        return GroundMotion(interval_s, moved_m, noise_m2, lasting, drift, points)
+
+    def _agreed(self, begin_px: Array, end_px: Array) -> tuple[Array, Array] | NoMotion:
+        """Those of the points that one homography explains, as places (N, 2) one ahead of the lens."""
+        o, camera = self._options, self._camera
+        if len(begin_px) < o.min_points:
+            return NoMotion(f"{len(begin_px)} points could be followed, {o.min_points} are needed")
+        begin, end = camera.undistort_points(begin_px), camera.undistort_points(end_px)
+        reach = _RANSAC_PX / camera.focal_px
+        _, found = cv2.findHomography(begin, end, cv2.RANSAC, reach, confidence=_RANSAC_CONFIDENCE)
+        kept = np.zeros(len(begin), bool) if found is None else found[:, 0] > 0
+        if kept.sum() < max(o.min_points, o.min_share * len(kept)):
+            return NoMotion(f"{kept.sum()} of {len(kept)} points agree on one motion")
+        spread = (begin_px[kept].std(axis=0) / [camera.width_px, camera.height_px]).min()
+        if spread < o.min_spread:
+            return NoMotion("the points that agree fill a small part of the picture")
+        return begin[kept], end[kept]
+
+    def _track_corners(self, earlier: Gray, later: Gray, expected: Array) -> tuple[Array, Array]:
+        """:func:`track_corners` in pictures that are not larger than need be."""
+        size = np.array([earlier.shape[1], earlier.shape[0]])
+        small = np.maximum(np.round(size * min(1.0, _MAX_SIDE_PX / size.max())), 1.0)
+        if (small == size).all():
+            return track_corners(earlier, later, expected, self._options.max_points)
+        across, down = small / size
+        shrink = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1.0]])
+        shape = small.astype(int).tolist()
+        first, second = (cv2.resize(gray, shape, interpolation=cv2.INTER_AREA) for gray in (earlier, later))
+        expected = shrink @ expected @ np.linalg.inv(shrink)
+        points = track_corners(first, second, expected, self._options.max_points)
+        begin, end = ((xy_px + 0.5) * size / small - 0.5 for xy_px in points)
+        return begin, end
+
+
+def odometry_of(matcher: object) -> VisualOdometry:
+    """Odometry by the camera of a matcher.
+
+    Raises:
+        OptionError: it has none.
+    """
+    camera = getattr(matcher, "camera", None)
+    if not isinstance(camera, Camera):
+        raise OptionError(f"odometry: expected a matcher with a `camera`, got {type(matcher).__name__} without")
+    return VisualOdometry(camera)
+
+
+def track_corners(earlier: Gray, later: Gray, expected: Array, max_points: int = 200) -> tuple[Array, Array]:
+    """Corners of one picture, and where another shows them, by Lucas-Kanade.
+
+    Args:
+        earlier: (H, W) uint8.
+        later: the same.
+        expected: (3, 3) homography from pixels of the earlier to those of the later; what it explains need not be
+            found, so that a turn or a long way costs nothing.
+        max_points: as many corners at most.
+
+    Returns:
+        Two (N, 2) lists of pixels.
+    """
+    none = np.zeros((0, 2))
+    corners = cv2.goodFeaturesToTrack(earlier, max_points, _QUALITY, _APART_PX)
+    if corners is None:
+        return none, none
+    begin, size = np.asarray(corners, np.float32), (later.shape[1], later.shape[0])
+    start = cv2.perspectiveTransform(begin, expected)
+    inside = ((start >= 0) & (start <= np.array(size) - 1)).all(axis=(1, 2))
+    begin, start = begin[inside], start[inside]
+    if not len(start):
+        return none, none
+    shown = cv2.warpPerspective(earlier, expected, size, borderMode=cv2.BORDER_REPLICATE)
+    window = (_WINDOW_PX, _WINDOW_PX)
+    end, found, _ = cv2.calcOpticalFlowPyrLK(shown, later, start, None, winSize=window, maxLevel=_LEVELS)
+    good = found[:, 0] > 0
+    return begin[good, 0].astype(np.float64), end[good, 0].astype(np.float64)
+
+
+def _shifted(earlier: Gray, later: Gray, expected: Array) -> Array:
+    """The expected homography and the shift that small pictures show beyond it, by phase correlation."""
+    shown = cv2.warpPerspective(earlier, expected, later.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    size = (_SMALL_PX, max(8, round(later.shape[0] * _SMALL_PX / later.shape[1])))
+    small = [cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32) for gray in (shown, later)]
+    (right, down), _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow(size, cv2.CV_32F))
+    shift = np.eye(3)
+    shift[:2, 2] = right * later.shape[1] / size[0], down * later.shape[0] / size[1]
+    return np.asarray(shift @ expected)
+
+
+class _View:
+    """Two pictures of level ground: what becomes of it between them, by the motion of the camera."""
+
+    def __init__(self, camera: Camera, begin: Attitude, end: Attitude, height_m: float) -> None:
+        self._camera, self._height_m = camera, height_m
+        self._begin, self._end = camera.enu_from_camera(begin), camera.enu_from_camera(end)
+
+    def homography(self, moved_m: Array) -> Array:
+        """From pixels of the earlier picture to those of the later, by a motion (3,) east, north, up."""
+        down = -self._begin[2]
+        turned = self._end.T @ (self._begin - np.outer(moved_m, down) / self._height_m)
+        matrix = self._camera.matrix
+        return np.asarray(matrix @ turned @ np.linalg.inv(matrix))
+
+    def solve(
+        self, begin: Array, end: Array, moved_m: Array, options: OdometryOptions, *, has_tilt: bool
+    ) -> tuple[Array, Array] | None:
+        """The motion by places (N, 2) one ahead of the lens, before and after, from a first guess (3,) of it.
+
+        Returns:
+            (2,) metres east and north, and their covariance (2, 2); None where it cannot be solved for.
+        """
+        rays = np.column_stack([begin, np.ones(len(begin))]) @ self._begin.T
+        steep = -rays[:, 2] / np.linalg.norm(rays, axis=1)
+        if steep.min() < math.cos(math.radians(_MAX_OFF_DEG)):
+            return None
+        ground_m = rays * (self._height_m / -rays[:, 2])[:, None]
+        tilt_deg = options.tilt_change_sigma_deg if has_tilt else _LEVEL_DEG
+        sigmas = np.radians([tilt_deg, tilt_deg, options.heading_change_sigma_deg])
+        prior = np.diag([*sigmas**-2.0, 0.0, 0.0, 0.0])
+        state = np.array([0.0, 0.0, 0.0, *moved_m])  # turn about east, north, up; motion
+        for _ in range(_STEPS):
+            seen, by_state = self._seen(ground_m, state)
+            if seen is None:
+                return None
+            off = end - seen
+            weights = _weights(np.hypot(*off.T), _LEAST_PX / self._camera.focal_px) / options.points_per_error
+            weighted = (by_state * weights[:, None, None]).reshape(-1, 6).T
+            try:
+                covariance = np.linalg.inv(weighted @ by_state.reshape(-1, 6) + prior)
+            except np.linalg.LinAlgError:
+                return None
+            step = covariance @ (weighted @ off.ravel() - prior @ state)
+            state = state + step
+            if np.abs(step[3:]).max() < _CONVERGED * self._height_m:
+                break
+        return (state[3:5], np.asarray(covariance[3:5, 3:5])) if np.isfinite(covariance).all() else None
+
+    def _seen(self, ground_m: Array, state: Array) -> tuple[Array | None, Array]:
+        """Places (N, 2) of the ground in the later picture and their derivatives (N, 2, 6) by the state."""
+        turn = cv2.Rodrigues(state[:3])[0] @ self._end
+        apart_m = ground_m - state[3:]
+        place = apart_m @ turn
+        depth = place[:, 2]
+        if depth.min() <= 0.0:
+            return None, np.zeros(0)
+        cross = np.zeros((len(apart_m), 3, 3))  # of each place, so that cross @ w = place x w
+        for row, column, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
+            cross[:, row, column], cross[:, column, row] = sign * apart_m[:, axis], -sign * apart_m[:, axis]
+        moves = np.concatenate([turn.T @ cross, np.broadcast_to(-turn.T, cross.shape)], axis=2)
+        seen = place[:, :2] / depth[:, None]
+        return seen, (moves[:, :2] - seen[:, :, None] * moves[:, 2:]) / depth[:, None, None]
+
+
+def _weights(off: Array, least: float) -> Array:
+    """Precision of each point by its distance (N,) to what is expected (Huber), from ``least`` up."""
+    sigma = max(float(np.median(off)) / math.sqrt(2.0 * math.log(2.0)), least)  # the median of Rayleigh's law
+    return np.minimum(1.0, _HUBER_SIGMAS * sigma / np.maximum(off, 1e-12)) / sigma**2

@@ -1,0 +1,446 @@
+"""The settings of matching and of navigation, and what is assumed where telemetry and map do not say it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from engine.errors import OptionError
+from engine.kernels.scores import check_score
+from engine.learned.pairs import PairMatcher
+from engine.values import MAX_SIGMA_M, Frame, GridPose, check_positive
+
+PROFILES = ("engine", "paper")
+MAP_FEATURES = ("prepared", "per_frame")
+MIN_HEIGHT_M = 1.0
+"""The lowest height that is searched where the height is unknown."""
+# How far compasses and altimeters are off at most: a declination, a motor's current, another ground.
+_DOUBTED_HEADING_DEG, _DOUBTED_HEIGHT_SHARE = 24.0, 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PeakRule:
+    """When a correlation peak is accepted.
+
+    Scores are counted in :func:`engine.matching.covariance.score_sigma`, so that a rule holds for patches of any
+    size. Over two simulated towns right places lead by 8 and more, with a quarter of the frame hidden by 2.3 and
+    more; on another town's map the best led by 1.4, mirrored by 2.5, and where the prior pointed elsewhere by 3.4.
+    On 324 searches of heading or height the best reached 11.1 and led by at most 6.7.
+
+    Attributes:
+        min_sigmas: a peak below this may be chance.
+        min_margin_sigmas: how far the best rival must stay below the peak.
+        min_margin_sigmas_whole_map: the same where the whole map was searched, or the place contradicts the prior,
+            and nothing else vouches for it.
+        max_prior_chi_square: of a position against its prior, above which the two contradict each other; chance
+            exceeds this once in ten thousand.
+        min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
+            another town, turned until they fit, look like these.
+        min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
+        min_confidence: probability of :func:`engine.matching.confidence.probability` below which a peak is not
+            accepted.
+        null_test_below: confidence below which the peak must also beat the null hypothesis, its own template
+            upside down and mirrored in the same window; 1 always asks for it.
+        min_deviation: standard deviation in grey levels below which a frame has no texture.
+        exclusion_m: rivals nearer than this are the peak itself.
+    """
+
+    min_sigmas: float = 5.0
+    min_margin_sigmas: float = 2.0
+    min_margin_sigmas_whole_map: float = 3.5
+    max_prior_chi_square: float = 18.4
+    min_sigmas_searched: float = 13.0
+    min_margin_sigmas_searched: float = 8.0
+    min_confidence: float = 0.99
+    null_test_below: float = 0.9999
+    min_deviation: float = 3.0
+    exclusion_m: float = 6.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, *self.__dataclass_fields__)
+        if not self.min_confidence < 1.0:
+            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
+        if not self.null_test_below <= 1.0:
+            raise OptionError(f"null_test_below: expected a probability of at most 1, got {self.null_test_below}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AssumedErrors:
+    """One standard deviation of the telemetry, the map and the ground, where they do not state their own.
+
+    Attributes:
+        height_m: of the height, besides its share below.
+        height_share: of the height, as a share of it.
+        heading_deg: of the heading.
+        tilt_deg: of roll and of pitch, where the frame came with them.
+        unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
+        map_m: georeferencing accuracy per axis, where the map does not state it (:func:`with_map_accuracy`): that
+            of web maps and of public orthophotos.
+        surface_slope_deg: slope accuracy of the surface model under one frame, where it does not state it.
+        unknown_slope_deg: slope of the ground where flat ground is assumed: the scale of a mixture of slopes from
+            nearly none to larger ones (:mod:`engine.matching.unknown_slope`).
+    """
+
+    height_m: float = 0.5
+    height_share: float = 0.01
+    heading_deg: float = 1.0
+    tilt_deg: float = 0.37
+    unknown_tilt_deg: float = 4.0
+    map_m: float = 3.0
+    surface_slope_deg: float = 0.1
+    unknown_slope_deg: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, *self.__dataclass_fields__)
+        for name in self.__dataclass_fields__:
+            if getattr(self, name) > MAX_SIGMA_M:
+                raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
+
+    def height_sigma_m(self, height_m: float) -> float:
+        """Standard deviation of a height, in metres."""
+        return math.hypot(self.height_m, self.height_share * height_m)
+
+    def tilts_deg(self, pose: GridPose) -> tuple[float, float]:
+        """Standard deviations of roll and of pitch, in degrees, by whether they are known."""
+        unknown, known = self.unknown_tilt_deg, self.tilt_deg
+        return (unknown if pose.roll_deg is None else known, unknown if pose.pitch_deg is None else known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseOptions:
+    """Inlier tolerance, effort of the search, and thresholds of acceptance.
+
+    Attributes:
+        reprojection_px: Largest reprojection distance of an inlier.
+        max_iterations: Upper bound on the samples that RANSAC draws.
+        confidence: Probability, in (0, 1), at which RANSAC stops early.
+        min_inliers: Fewest distinct inliers of a pose.
+        distinct_px: Matches in one square cell of this side count once, since their errors are correlated.
+        max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses with as
+            many inliers by chance.
+        min_spread_px: Smallest standard deviation of the inliers in the image, in the direction where it is
+            smallest; below it they are nearly collinear.
+        min_cost_gap: Chi-square by which the pose must be better than the other pose of a plane.
+        noise_floor_px: Lower bound on the standard deviation taken for an image point's x and y.
+        seed: Of RANSAC's samples; equal inputs and seeds give equal poses.
+    """
+
+    reprojection_px: float = 3.0
+    max_iterations: int = 1000
+    confidence: float = 0.999
+    min_inliers: int = 6
+    distinct_px: float = 16.0
+    max_log10_nfa: float = -6.0
+    min_spread_px: float = 6.0
+    min_cost_gap: float = 9.0
+    noise_floor_px: float = 0.05
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("reprojection_px", "distinct_px", "min_spread_px", "min_cost_gap", "noise_floor_px"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise OptionError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if not 0 < self.confidence < 1:
+            raise OptionError(f"confidence: expected a number in (0, 1), got {self.confidence}")
+        if self.max_iterations < 1:
+            raise OptionError(f"max_iterations: expected at least 1, got {self.max_iterations}")
+        if self.min_inliers < 4:
+            raise OptionError(f"min_inliers: expected at least 4, got {self.min_inliers}")
+        if math.isnan(self.max_log10_nfa):
+            raise OptionError("max_log10_nfa: expected a number, got nan")
+        if self.seed < 0:
+            raise OptionError(f"seed: expected at least 0, got {self.seed}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NccOptions:
+    """Settings of the NCC method.
+
+    Attributes:
+        margin: the 1.3 of equations 4 and 5.
+        fraction: the rectified patch's size against the frame's.
+        score: what is correlated: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
+        enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
+        min_valid_share: a place counts only where this share of the patch lies on map that is not nodata.
+        exhaustive: score every place of the window at full resolution.
+        heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
+            also where the frame has none.
+        height_search_share: the height may be off by this share; 0 trusts it.
+        second_look: correlate structure besides grey levels where the highest peak of a window is refused.
+        refine: refine the pose densely after the peak, where heading and height are trusted.
+        rule: when a peak is accepted.
+        errors: what is assumed of the telemetry and the map.
+    """
+
+    margin: float = 1.3
+    fraction: float = 0.7
+    score: str = "local"
+    enhance_radius_px: int = 8
+    min_valid_share: float = 0.9
+    exhaustive: bool = False
+    heading_search_deg: float = 0.0
+    height_search_share: float = 0.0
+    second_look: bool = True
+    refine: bool = True
+    rule: PeakRule = field(default_factory=PeakRule)
+    errors: AssumedErrors = field(default_factory=AssumedErrors)
+
+    def __post_init__(self) -> None:
+        if math.isinf(self.margin):
+            raise OptionError(f"margin: expected a finite number, got {self.margin}")
+        if not self.margin >= 1.0:
+            raise OptionError(f"margin: expected 1 or more, got {self.margin}")
+        for name in ("fraction", "min_valid_share"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
+        for name, limit in (("heading_search_deg", 180.0), ("height_search_share", 0.5)):
+            if not 0.0 <= getattr(self, name) <= limit:
+                raise OptionError(f"{name}: expected 0 to {limit:g}, got {getattr(self, name)}")
+        check_score(self.score)
+        if self.enhance_radius_px < 0:
+            raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
+
+    def of_frame(self, frame: Frame) -> NccOptions:
+        """The same with what is searched for a frame whose heading and height are doubted."""
+        if not frame.is_doubted:
+            return self
+        return replace(
+            self,
+            heading_search_deg=max(self.heading_search_deg, _DOUBTED_HEADING_DEG),
+            height_search_share=max(self.height_search_share, _DOUBTED_HEIGHT_SHARE),
+        )
+
+    def trusts(self, heading_deg: float | None) -> bool:
+        """Whether a frame's own heading and height are the only hypothesis."""
+        return heading_deg is not None and self.heading_search_deg == self.height_search_share == 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiftOptions:
+    """Settings of the SIFT method.
+
+    Attributes:
+        margin: the 1.3 of equations 4 and 5.
+        scale: the frame is reduced to this before detection; the paper's 0.5.
+        max_keypoints: features taken from a frame of usual size; the map's are as dense.
+        keypoints_per_px: features taken from a larger one, per pixel of the map's level that it covers.
+        upsample: samples per pixel of the first octave of a frame that is drawn in the map's pixels: with 2 small
+            keypoints are found more exactly, at three times the time. The map's always have 2.
+        contrast_threshold: Lowe's, of frame and map; bare ground has little contrast.
+        map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
+        max_map_keypoints: upper limit for a window that is described per frame.
+        ratio: best against second-best descriptor distance (Lowe's test), where RANSAC must find what agrees.
+        vote_ratio: the same where matches vote for a translation, which finds it among many wrong ones.
+        vote_share: matches agree on a translation within this share of the distance to the ground.
+        tolerance_px: pixels of the map's level within which matches agree on the pose that was voted for.
+        upright: where the heading is known, turn the descriptors by it and not by each keypoint's gradients.
+        max_turn_deg: where the heading is known and descriptors are not upright, how far the angles of a match may
+            contradict it; None does not ask.
+        max_scale_factor: where the height is known, by which factor the scales of a match may contradict it; None
+            does not ask.
+        second_look: where nothing is found, look again without the heading and with heights up to
+            ``height_factor`` off.
+        height_factor: see above; 1 trusts the height also then.
+        max_height_m: where the height is unknown, it is at most this.
+        matcher: takes the place of features: it is given the reduced frame and the crop of the map, and what it
+            matches is lifted and solved for the pose as features are.
+        min_deviation: standard deviation in grey levels below which a frame has no texture.
+        max_tilt_deg: a pose further off the vertical is taken for a wrong one.
+        use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
+            features alone hardly separate a tilt from a displacement.
+        min_confidence: probability of :func:`engine.matching.confidence.probability` below which a pose is not
+            accepted.
+        null_test_below: confidence below which the pose must also beat the null hypothesis, its frame mirrored, or
+            be confirmed by the refinement with a high correlation.
+        refine: refine the pose densely after PnP, where height, heading, tilt and surface are known.
+        pose: settings of PnP and RANSAC.
+        errors: what is assumed of the telemetry and the map.
+    """
+
+    margin: float = 1.3
+    scale: float = 0.5
+    max_keypoints: int = 300
+    keypoints_per_px: float = 0.01
+    upsample: int = 2
+    contrast_threshold: float = 0.005
+    map_features: str = "prepared"
+    max_map_keypoints: int = 6000
+    ratio: float = 0.8
+    vote_ratio: float = 0.9
+    vote_share: float = 0.03
+    tolerance_px: float = 1.0
+    upright: bool = True
+    max_turn_deg: float | None = 30.0
+    max_scale_factor: float | None = 1.5
+    second_look: bool = True
+    height_factor: float = 2.0
+    max_height_m: float = 500.0
+    matcher: PairMatcher | None = None
+    min_deviation: float = 3.0
+    max_tilt_deg: float = 45.0
+    use_attitude: bool = True
+    min_confidence: float = 0.995
+    null_test_below: float = 0.9999
+    refine: bool = True
+    pose: PoseOptions = field(default_factory=PoseOptions)
+    errors: AssumedErrors = field(default_factory=AssumedErrors)
+
+    def __post_init__(self) -> None:
+        for name in ("margin", "height_factor", "max_height_m", "min_deviation", "tolerance_px"):
+            if math.isinf(getattr(self, name)):
+                raise OptionError(f"{name}: expected a finite number, got {getattr(self, name)}")
+        for name in ("margin", "height_factor"):
+            if not getattr(self, name) >= 1.0:
+                raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+        if not self.min_deviation >= 0.0:
+            raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
+        if not 0.0 <= self.min_confidence < 1.0:
+            raise OptionError(f"min_confidence: expected 0 or more and below 1, got {self.min_confidence}")
+        if not 0.0 <= self.null_test_below <= 1.0:
+            raise OptionError(f"null_test_below: expected a probability, got {self.null_test_below}")
+        for name in ("scale", "ratio", "vote_ratio", "vote_share"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
+        for name, minimum in (
+            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M),
+            ("max_tilt_deg", 0.0), ("keypoints_per_px", 0.0), ("contrast_threshold", 0.0), ("tolerance_px", 0.0),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not value > minimum:
+                raise OptionError(f"{name}: expected above {minimum:g}, got {value}")
+        if self.upsample not in (1, 2):
+            raise OptionError(f"upsample: expected 1 or 2, got {self.upsample}")
+        if self.map_features not in MAP_FEATURES:
+            raise OptionError(
+                f"map_features: expected one of {', '.join(MAP_FEATURES)}, got {self.map_features!r}"
+            )
+        for name in ("max_keypoints", "max_map_keypoints"):
+            if not getattr(self, name) >= 4:
+                raise OptionError(f"{name}: expected 4 or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedOptions:
+    """Settings of the learned method; all others are SIFT's.
+
+    Attributes:
+        weights: files of LoFTR, or of LightGlue with DISK, ALIKED or SuperPoint.
+        max_picture_px: on the level of the map where a frame is matched it covers at most so many pixels.
+        max_keypoints: of a frame; LoFTR has none.
+        max_map_keypoints: of a window.
+        max_window_px: a window with more pixels of its level is not searched.
+        tolerance_px: in place of SIFT's; networks place points less exactly.
+        min_match_confidence: of a match by LoFTR.
+    """
+
+    weights: tuple[str, ...] = ()
+    max_picture_px: int = 130_000
+    max_keypoints: int = 512
+    max_map_keypoints: int = 2048
+    max_window_px: int = 1 << 22
+    tolerance_px: float = 2.0
+    min_match_confidence: float = 0.5
+
+    def __post_init__(self) -> None:
+        limits = {"max_picture_px": 4096, "max_window_px": 4096, "max_keypoints": 4, "max_map_keypoints": 4}
+        for name, minimum in limits.items():
+            if not getattr(self, name) >= minimum:
+                raise OptionError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
+        if not 0.0 < self.tolerance_px < math.inf:
+            raise OptionError(f"tolerance_px: expected a positive number, got {self.tolerance_px}")
+        if not 0.0 <= self.min_match_confidence <= 1.0:
+            raise OptionError(f"min_match_confidence: expected 0 to 1, got {self.min_match_confidence}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatcherOptions:
+    """Settings of all methods.
+
+    Attributes:
+        profile: "engine", or "paper" for the paper's own recipe with OpenCV.
+        ncc: settings of the NCC method.
+        sift: settings of the SIFT method.
+        learned: settings of the learned method.
+    """
+
+    profile: str = "engine"
+    ncc: NccOptions = field(default_factory=NccOptions)
+    sift: SiftOptions = field(default_factory=SiftOptions)
+    learned: LearnedOptions = field(default_factory=LearnedOptions)
+
+    def __post_init__(self) -> None:
+        if self.profile not in PROFILES:
+            raise OptionError(f"profile: expected one of {', '.join(PROFILES)}, got {self.profile!r}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NavigatorOptions:
+    """How a position is carried from frame to frame, and what is accepted; ``docs/integrity.md`` has the rules.
+
+    Attributes:
+        measured_velocity_sigma_mps: of a velocity that came with the frame.
+        acceleration_mps2: how hard the vehicle accelerates, for a second at a time, while its velocity is taken
+            from its last fixes.
+        max_speed_mps: assumed while nothing is known of the velocity.
+        growth: factor on the uncertainty that the window is made for, for every refusal in a row.
+        default_interval_s: time between frames that carry no stamp.
+        gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
+        trusted_sigma_m: a prediction that is better known than this may contradict a fix.
+        min_confidence: probability of being right that is asked of a fix, by all the evidence for it.
+        lost_after: refusals in a row after which the whole map is searched again.
+        lost_sigma_m: uncertainty of the prediction at which the same is done.
+        search_every: while lost, of so many frames one searches the whole map; the others look where dead
+            reckoning leads.
+        hold_s: how long dead reckoning by measured velocities may contradict fixes that agree with each other.
+        late_s: how much older than the newest frame a frame may be.
+        attitude_lag_s: standard deviation of how late the telemetry's attitude is, while no picture measured it.
+        attitude_jitter_s: of a single frame's lag about its mean.
+        tilt_bias_deg: standard deviation of a lasting error of roll and of pitch while no picture measured it.
+        heading_bias_deg: of the heading.
+        healthy_s: age of the last fix up to which the navigator calls itself healthy.
+        odometry: whether frames that come without a velocity are followed from one to the next, as
+            ``docs/odometry.md`` says.
+    """
+
+    measured_velocity_sigma_mps: float = 0.5
+    acceleration_mps2: float = 3.0
+    max_speed_mps: float = 15.0
+    growth: float = 1.4
+    default_interval_s: float = 0.2
+    gate: float = 18.4
+    trusted_sigma_m: float = 50.0
+    min_confidence: float = 0.999
+    lost_after: int = 12
+    lost_sigma_m: float = 100.0
+    search_every: int = 3
+    hold_s: float = 15.0
+    late_s: float = 2.0
+    attitude_lag_s: float = 0.1
+    attitude_jitter_s: float = 0.03
+    tilt_bias_deg: float = 1.0
+    heading_bias_deg: float = 5.0
+    healthy_s: float = 1.0
+    odometry: bool = False
+
+    def __post_init__(self) -> None:
+        check_positive(self, *(name for name in self.__dataclass_fields__ if name != "odometry"))
+        if self.growth < 1.0:
+            raise OptionError(f"growth: expected 1 or more, got {self.growth}")
+        if self.min_confidence >= 1.0:
+            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
+
+    @property
+    def min_log_odds(self) -> float:
+        """The required probability as log(p / (1 - p))."""
+        return math.log(self.min_confidence / (1.0 - self.min_confidence))
+
+
+ACCEPT_ALL = NavigatorOptions(
+    gate=1e12,
+    min_confidence=1e-12,
+    attitude_lag_s=1e-9,
+    attitude_jitter_s=1e-9,
+    tilt_bias_deg=1e-9,
+    heading_bias_deg=1e-9,
+)
+"""Every match is accepted, as by the paper's recipe: the baseline."""

@@ -1,0 +1,98 @@
+"""Compilation of loops by numba: before a flight, on all cores, cached on disk; they release Python's lock."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterable
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+from numba import njit
+from numba.core import event
+from numba.core.sigutils import normalize_signature
+
+from engine.runtime import workers
+
+_FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by zero
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "no_cfunc_wrapper": True}
+_signatures: list[tuple[Any, str]] = []  # of the loops that Python calls
+
+
+def compiled(*signatures: str):
+    """Compile a loop by :func:`prepare`, else at its first call; cached on disk if a folder for it is writable.
+
+    Args:
+        signatures: of the arguments that it is called with; none for one that only other loops call.
+    """
+
+    def decorate(function):
+        try:
+            loop = njit(cache=True, **_OPTIONS)(function)
+        except RuntimeError:  # no folder is writable
+            loop = njit(**_OPTIONS)(function)
+        _signatures.extend((loop, signature) for signature in signatures)
+        return loop
+
+    return decorate
+
+
+def inlined(function):
+    """Make a function part of the loops that call it, within which it takes less time to compile than alone."""
+    return njit(inline="always", **_OPTIONS)(function)
+
+
+def prepare(modules: Iterable[str], report: Callable[[int, int], None] = lambda done, total: None) -> None:
+    """Compile the loops of modules of :mod:`engine.kernels`, or load them from the cache.
+
+    Where something is to be compiled, a second process begins at the other end, until both meet: what it compiled,
+    this one loads.
+
+    Args:
+        modules: of :mod:`engine.kernels`, by name.
+        report: takes how many loops are done, and of how many.
+    """
+    names = [import_module(f"engine.kernels.{module}").__name__ for module in modules]
+    written = [entry for name in names for entry in _signatures if entry[0].__module__ == name]
+    # As a first call has them: the cache tells a text from the types that it stands for.
+    loops = [(loop, normalize_signature(text)[0]) for loop, text in written]  # type: ignore[no-untyped-call]
+    helper, is_collecting = None, gc.isenabled()
+    gc.disable()  # of what a compiler allocates little is garbage before it is done
+    try:
+        for number, (loop, signature) in enumerate(loops, 1):
+            loop.compile(signature)
+            if helper is None and loop.stats.cache_misses and loop.stats.cache_path:
+                helper = workers.start_helper(partial(_compile, loops[:number:-1]))
+            report(number, len(loops))
+    finally:
+        if helper is not None:
+            helper.kill()
+            helper.join()
+        if is_collecting:
+            gc.enable()
+
+
+def _compile(loops: list[tuple[Any, Any]]) -> None:
+    for loop, signature in loops:
+        loop.compile(signature)
+
+
+class _Watch(event.Listener):
+    """Counts what is compiled or loaded."""
+
+    count = 0
+
+    def on_start(self, event: Any) -> None:
+        self.count += 1
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+_watch = _Watch()
+event.register("numba:compiler_lock", _watch)  # type: ignore[no-untyped-call]
+
+
+def count() -> int:
+    """How often a loop was compiled, or loaded from the cache, so far."""
+    return _watch.count

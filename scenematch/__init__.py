@@ -1,0 +1,124 @@
+"""The product around the engine: track a flight, compare methods, campaigns, simulation, bridges, as a library.
+
+::
+
+    from scenematch import FlightFiles, TrackSettings, track
+
+    files = FlightFiles.in_folder("flight")
+    summary = track(files, "out", TrackSettings(method="sift"))
+
+Nothing here prints: a run reports to the :class:`Progress` that it is given. A message of an error names the
+argument that it is about.
+"""
+
+from typing import TYPE_CHECKING
+
+from engine.runtime.lazy_names import imported_on_use
+
+if TYPE_CHECKING:
+    from scenematch.files.corrections import Corrections
+    from scenematch.files.datasets.sequence import ImportOptions
+    from scenematch.runs.bag_conversion import convert_to_bag
+    from scenematch.runs.bridge_files import BridgeFiles
+    from scenematch.runs.campaign import run_campaign
+    from scenematch.runs.checking import diagnose_flight
+    from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
+    from scenematch.runs.comparison import compare, parse_runs
+    from scenematch.runs.dataset_import import PhotographOptions, check_flight, import_dataset, import_photographs
+    from scenematch.runs.demo import run_demo
+    from scenematch.runs.evaluation import evaluate
+    from scenematch.runs.inputs import FlightFiles
+    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.map_audit import AuditFiles, MapAudit, audit_map
+    from scenematch.runs.map_fetch import FetchSettings, fetch_map
+    from scenematch.runs.mavlink_bridge import (
+        BridgeSettings,
+        MavlinkSettings,
+        run_mavlink_bridge,
+    )
+    from scenematch.runs.mavlink_parameters import write_parameter_file
+    from scenematch.runs.progress import Progress
+    from scenematch.runs.reporting import report
+    from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
+    from scenematch.runs.settings import TrackSettings, load_settings
+    from scenematch.runs.simulation import WorldSettings, simulate
+    from scenematch.runs.single_image import locate_image
+    from scenematch.runs.track_export import export_track
+    from scenematch.runs.tracking import track
+
+__all__ = [
+    "AuditFiles",
+    "BridgeFiles",
+    "BridgeSettings",
+    "ClosedLoopSettings",
+    "Corrections",
+    "FetchSettings",
+    "FlightFiles",
+    "ImportOptions",
+    "LiveViewTarget",
+    "MapAudit",
+    "MavlinkSettings",
+    "PhotographOptions",
+    "Progress",
+    "RosSettings",
+    "TrackSettings",
+    "WorldSettings",
+    "audit_map",
+    "check_flight",
+    "compare",
+    "convert_to_bag",
+    "diagnose_flight",
+    "evaluate",
+    "export_track",
+    "fetch_map",
+    "fly_closed_loop",
+    "import_dataset",
+    "import_photographs",
+    "load_settings",
+    "locate_image",
+    "parse_runs",
+    "report",
+    "run_campaign",
+    "run_demo",
+    "run_mavlink_bridge",
+    "run_ros_bridge",
+    "simulate",
+    "track",
+    "write_parameter_file",
+]
+
+_NAMES = {
+    "scenematch.files.corrections": "Corrections",
+    "scenematch.files.datasets.sequence": "ImportOptions",
+    "scenematch.runs.bag_conversion": "convert_to_bag",
+    "scenematch.runs.campaign": "run_campaign",
+    "scenematch.runs.checking": "diagnose_flight",
+    "scenematch.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
+    "scenematch.runs.comparison": "compare parse_runs",
+    "scenematch.runs.dataset_import": "PhotographOptions check_flight import_dataset import_photographs",
+    "scenematch.runs.demo": "run_demo",
+    "scenematch.runs.evaluation": "evaluate",
+    "scenematch.runs.inputs": "FlightFiles",
+    "scenematch.runs.live_viewing": "LiveViewTarget",
+    "scenematch.runs.map_audit": "AuditFiles MapAudit audit_map",
+    "scenematch.runs.map_fetch": "FetchSettings fetch_map",
+    "scenematch.runs.bridge_files": "BridgeFiles",
+    "scenematch.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
+    "scenematch.runs.mavlink_parameters": "write_parameter_file",
+    "scenematch.runs.progress": "Progress",
+    "scenematch.runs.reporting": "report",
+    "scenematch.runs.ros_bridge": "RosSettings run_ros_bridge",
+    "scenematch.runs.settings": "TrackSettings load_settings",
+    "scenematch.runs.simulation": "WorldSettings simulate",
+    "scenematch.runs.single_image": "locate_image",
+    "scenematch.runs.track_export": "export_track",
+    "scenematch.runs.tracking": "track",
+}
+"""The public names by module. A module is imported when one of its names is used: a run needs few of them."""
+
+if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
+    __getattr__ = imported_on_use(__name__, _NAMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,267 @@
+"""A live camera: the newest picture with its capture time, through stalls, repeats and reconnections.
+
+A thread reads, so that no picture waits in a buffer and a read that blocks stops nobody. Sources are a camera's
+number, a URL or SDP file that OpenCV's FFmpeg opens, and ``exec:COMMAND``, which writes JPEG pictures to its
+standard output: that is how GStreamer and libcamera are read without a build of OpenCV that has them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import subprocess
+import threading
+import time
+from collections.abc import Generator
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import TelemetryError
+from scenematch.files.tables import quoted
+
+__all__ = ["CameraStream", "capture"]
+
+Image = NDArray[np.uint8]
+
+EXEC = "exec:"
+"""Begins a source that is a command."""
+
+_REOPEN_S = 1.0
+_STALL_S = 2.0  # without a picture, after which the camera is opened again
+_START_S = 15.0  # the same of a command before its first picture: it may start as slowly
+_CLOSE_S = 3.0  # that closing waits for a read in progress
+_IDLE_S = 0.5  # without a new picture, after which the caller is woken
+_READ_BYTES = 65536
+_JPEG_BEGIN, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_MAX_JPEG_BYTES = 64 * 2**20
+_FFMPEG_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+# SDP files need more protocols than FFmpeg allows by itself; the rest keeps it from buffering.
+_FFMPEG_OPTIONS = (
+    "protocol_whitelist;file,crypto,data,rtp,udp,tcp,http,https,rtsp,tls|rtsp_flags;prefer_tcp"
+    "|fflags;nobuffer|flags;low_delay"
+)
+_TIMEOUTS = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 2000]
+
+_log = logging.getLogger("scenematch")
+
+
+class _Source(Protocol):
+    """An open camera. ``read`` blocks until a picture arrives, and returns None where there are no more."""
+
+    def read(self) -> tuple[Image, int] | None:
+        """The next picture (H, W, 3) RGB and its time of arrival on ``time.monotonic_ns``."""
+
+    def interrupt(self) -> None:
+        """Let a read that blocks return, where that can be done from another thread."""
+
+    def close(self) -> None:
+        """Release the camera."""
+
+
+class _OpenCvSource:
+    def __init__(self, source: str) -> None:
+        try:
+            if source.isdecimal():
+                self._camera = cv2.VideoCapture(int(source))
+            elif "://" in source or source.endswith(".sdp"):
+                self._camera = _open_stream(source)
+            else:
+                self._camera = cv2.VideoCapture(source)
+            opened = self._camera.isOpened()
+        except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python accepts
+            opened = False
+        if not opened:
+            raise TelemetryError(f"camera_source: expected a camera or stream that opens, got {quoted(source)}")
+        self._camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+
+    def read(self) -> tuple[Image, int] | None:
+        if not self._camera.grab():
+            return None
+        arrived_ns = time.monotonic_ns()
+        good, image = self._camera.retrieve()
+        return (_rgb(image), arrived_ns) if good and image is not None else None
+
+    def interrupt(self) -> None:
+        return  # the next picture or the timeout does
+
+    def close(self) -> None:
+        self._camera.release()
+
+
+def _open_stream(source: str) -> Any:
+    """A stream that does not buffer; OpenCV takes FFmpeg's options from the environment, which is put back."""
+    given = os.environ.get(_FFMPEG_VARIABLE)
+    os.environ[_FFMPEG_VARIABLE] = given or _FFMPEG_OPTIONS
+    try:
+        return cv2.VideoCapture(source, cv2.CAP_FFMPEG, _TIMEOUTS)
+    finally:
+        if given is None:
+            del os.environ[_FFMPEG_VARIABLE]
+
+
+class _CommandSource:
+    """JPEG pictures, one after the other, from the standard output of a command."""
+
+    def __init__(self, command: str) -> None:
+        try:
+            self._process: Any = subprocess.Popen(shlex.split(command), stdout=subprocess.PIPE, bufsize=0)
+        except (OSError, ValueError, IndexError) as error:
+            raise TelemetryError(f"camera_source: {quoted(command)} cannot be run: {error}") from None
+        self._buffer, self._arrived_ns = bytearray(), 0
+
+    def read(self) -> tuple[Image, int] | None:
+        while True:
+            begin = self._buffer.find(_JPEG_BEGIN)
+            end = self._buffer.find(_JPEG_END, begin + 2) if begin >= 0 else -1
+            if end >= 0:
+                data = np.frombuffer(bytes(self._buffer[begin : end + 2]), np.uint8)
+                del self._buffer[: end + 2]
+                image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+                if image is not None:  # an end within a thumbnail
+                    return _rgb(image), self._arrived_ns
+                continue
+            data = self._process.stdout.read(_READ_BYTES)
+            if not data or len(self._buffer) > _MAX_JPEG_BYTES:
+                return None
+            self._arrived_ns = time.monotonic_ns()
+            self._buffer += data
+
+    def interrupt(self) -> None:
+        self._process.kill()
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._process.stdout.close()
+
+
+def _rgb(image: Any) -> Image:
+    code = cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB
+    return np.asarray(cv2.cvtColor(image, code), np.uint8)
+
+
+class CameraStream:
+    """Reads a source in a thread, and opens it again where it ends or stalls.
+
+    Args:
+        source: number, URL, SDP file or ``exec:COMMAND``.
+
+    Raises:
+        TelemetryError: it cannot be opened now. Later failures are logged, and it is opened again.
+    """
+
+    def __init__(self, source: str) -> None:
+        self._name = source
+        self._changed = threading.Condition()
+        self._newest: tuple[Image, int] | None = None
+        self._last: Image | None = None
+        self._arrived_s = time.monotonic()
+        self._number = 0  # of the present reader; an older one that still blocks is not listened to
+        self._has_read = self._has_started = False  # ever; since it was opened last
+        self._start(self._open())
+
+    def next(self, timeout_s: float) -> tuple[Image, int] | None:
+        """The newest picture that differs from the one before it; None where none came in time."""
+        until = time.monotonic() + timeout_s
+        while (left_s := until - time.monotonic()) > 0.0:
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest is not None, left_s)
+                newest, self._newest = self._newest, None
+            if newest is not None and not self._is_repeated(newest[0]):
+                return newest
+        return None
+
+    def close(self) -> None:
+        """Stop reading; a process that ends while a thread is within compiled code is aborted."""
+        self._number += 1
+        self._source.interrupt()
+        self._thread.join(_CLOSE_S)
+
+    def reopen(self, cause: str) -> None:
+        """Abandon the present reader and open the source again.
+
+        Raises:
+            TelemetryError: a command ended without ever having given a picture.
+        """
+        if not self._has_read and self._name.startswith(EXEC) and not self._thread.is_alive():
+            raise TelemetryError(
+                f"camera_source: expected pictures, got none: {quoted(self._name)} ended before the first"
+            )
+        _log.warning("camera %s: %s; opened again", quoted(self._name), cause)
+        self._number += 1
+        self._source.interrupt()
+        self._arrived_s = time.monotonic()
+        try:
+            self._start(self._open())
+        except TelemetryError:
+            time.sleep(_REOPEN_S)
+
+    @property
+    def failure(self) -> str | None:
+        """Why the source must be opened again; None while pictures come, if only repeated ones."""
+        if not self._thread.is_alive():
+            return "the stream ended"
+        limit_s = _START_S if self._name.startswith(EXEC) and not self._has_started else _STALL_S
+        return f"no picture for {limit_s:g} s" if time.monotonic() - self._arrived_s > limit_s else None
+
+    def _is_repeated(self, image: Image) -> bool:
+        before, self._last = self._last, image
+        return before is not None and np.array_equal(image, before)
+
+    def _open(self) -> _Source:
+        if self._name.startswith(EXEC):
+            return _CommandSource(self._name.removeprefix(EXEC))
+        return _OpenCvSource(self._name)
+
+    def _start(self, source: _Source) -> None:
+        self._source, self._has_started = source, False
+        self._thread = threading.Thread(
+            target=self._read, args=(source, self._number), name="scenematch-camera", daemon=True
+        )
+        self._thread.start()
+
+    def _read(self, source: _Source, number: int) -> None:
+        try:
+            while self._number == number and (picture := source.read()) is not None:
+                with self._changed:
+                    if self._number == number:
+                        self._newest, self._arrived_s = picture, time.monotonic()
+                        self._has_read = self._has_started = True
+                        self._changed.notify_all()
+        except (cv2.error, OSError, ValueError) as error:
+            _log.warning("camera %s: %s", quoted(self._name), error)
+        finally:
+            source.close()
+
+
+def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple[Image, int] | None, None, None]:
+    """Capture pictures from a camera or stream, for ever.
+
+    Args:
+        source: as of :class:`CameraStream`; a file of pictures ends like a stream, and begins again.
+        exposure_to_grab_ms: time from exposure to arrival, a property of the camera.
+
+    Yields:
+        Picture and capture time; None where no new one came for half a second. A picture that is identical to the
+        last is none: a camera that hangs repeats its last one.
+
+    Raises:
+        TelemetryError: the camera or stream cannot be opened at first, or is a command that ends before its first
+            picture.
+    """
+    stream = CameraStream(source)
+    try:
+        while True:
+            picture = stream.next(_IDLE_S)
+            if picture is not None:
+                yield picture[0], picture[1] - round(exposure_to_grab_ms * 1e6)
+                continue
+            yield None
+            if (failure := stream.failure) is not None:
+                stream.reopen(failure)
+    finally:
+        stream.close()

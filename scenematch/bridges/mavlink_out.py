@@ -1,0 +1,380 @@
+"""Messages to the autopilot: a fix in, the fields of a MAVLink message out, as each firmware interprets them.
+
+Converts to radians, NED and 1e-7 degrees. Stamps are of capture.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from engine.errors import OptionError
+from engine.geo import enu_from_body
+from engine.values import Attitude, Fix, check_positive
+from scenematch.bridges.fix_velocity import GroundVelocity
+from scenematch.bridges.mavlink_in import MAV_AUTOPILOTS, GnssFix
+from scenematch.bridges.packets import AUTOPILOT_COMPONENT
+from scenematch.bridges.parameters import MAX_DELAY_MS
+from scenematch.bridges.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
+
+MESSAGES = {
+    "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
+    "px4": ("global_position_sensor", "odometry"),
+}
+"""Messages that each firmware accepts; the first is the default."""
+
+SENSOR_ID = 1
+"""Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
+
+_GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
+# There is no sky in a fix, and no value for unknown. What arming checks and estimators read stands for the
+# accuracy: a metre of sigma is a dilution of 1 and 10 satellites.
+_DILUTION_PER_M, _MIN_DILUTION = 1.0, 0.5
+_MAX_GPS_ID = 3
+_NO_VELOCITY = mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MavlinkOptions:
+    """Which MAVLink message carries the fixes, and which fixes are withheld.
+
+    Attributes:
+        firmware: ardupilot or px4.
+        message: one of :data:`MESSAGES` of the firmware; empty for its default.
+        max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
+        max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no more.
+        gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first, 1 its second.
+
+    Raises:
+        OptionError: a name is unknown, or a number is out of range.
+    """
+
+    firmware: str = "ardupilot"
+    message: str = ""
+    max_sigma_m: float = 10.0
+    max_age_ms: float = MAX_DELAY_MS
+    gps_id: int = 0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "max_sigma_m", "max_age_ms")
+        if self.firmware not in MAV_AUTOPILOTS:
+            raise OptionError(f"firmware: expected one of {', '.join(MAV_AUTOPILOTS)}, got {self.firmware!r}")
+        if self.message and self.message not in MESSAGES[self.firmware]:
+            known = ", ".join(MESSAGES[self.firmware])
+            raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
+        if self.max_age_ms > MAX_DELAY_MS:
+            raise OptionError(f"max_age_ms: expected at most {MAX_DELAY_MS:g}, got {self.max_age_ms:g}")
+        if not 0 <= self.gps_id <= _MAX_GPS_ID:
+            raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
+        if self.gps_id and self.kind != "gps_input":
+            raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
+        if self.max_sigma_m > 100.0:
+            raise OptionError(
+                f"max_sigma_m: expected at most 100, where ArduPilot clamps, got {self.max_sigma_m:g}"
+            )
+
+    @property
+    def kind(self) -> str:
+        """Name of the message that is sent, in lower case."""
+        return self.message or MESSAGES[self.firmware][0]
+
+    @property
+    def needs_origin(self) -> bool:
+        """Whether the message carries positions relative to the autopilot's origin."""
+        return self.kind in ("vision_position_estimate", "odometry")
+
+
+@dataclass(frozen=True, slots=True)
+class FixReport:
+    """A fix with everything else that a message carries.
+
+    Attributes:
+        fix: the position fix.
+        captured_ns: capture time of its frame on ``time.monotonic_ns``.
+        age_ms: time since capture.
+        vehicle: vehicle state at capture.
+        origin: origin of the autopilot's NED frame; None where it has none.
+        velocity: velocity from the last fixes; None where they do not give one.
+        reset_counter: steps by one where the position was acquired afresh, modulo 256.
+        unix_ns: capture time in nanoseconds since 1970.
+    """
+
+    fix: Fix
+    captured_ns: int
+    age_ms: float
+    vehicle: VehicleState
+    origin: NedOrigin | None
+    velocity: GroundVelocity | None
+    reset_counter: int
+    unix_ns: int
+
+
+def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
+    """Reason for which a fix is not sent, or None where it is sent."""
+    vehicle, fix = report.vehicle, report.fix
+    numbers = (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel(), *(fix.attitude_sigma_deg or ()))
+    if not all(map(math.isfinite, numbers)):
+        return "not finite"
+    if fix.sigma_m > options.max_sigma_m:
+        return "too uncertain"
+    if report.age_ms > options.max_age_ms:
+        return "too old"
+    if options.needs_origin:
+        if report.origin is None:
+            return "no origin"
+        if vehicle.down_m is None:
+            return "no height"
+        if None in (vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg):
+            return "no attitude"
+    # ArduPilot uses these velocities unconditionally: with none known, it would use zero.
+    reads_velocity = options.firmware == "ardupilot" and options.kind != "vision_position_estimate"
+    return "no velocity" if reads_velocity and report.velocity is None else None
+
+
+def fix_message(report: FixReport, options: MavlinkOptions) -> Any:
+    """The MAVLink message of a fix that is not withheld."""
+    if options.kind == "vision_position_estimate":
+        return _vision_position_estimate(report, options.firmware)
+    if options.kind == "odometry":
+        return _odometry(report, options.firmware)
+    return _gps_input(report, options.gps_id) if options.kind == "gps_input" else _global_position_sensor(report)
+
+
+def heartbeat_message() -> Any:
+    """Heartbeat of an onboard computer that is no autopilot."""
+    kind, no_autopilot = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+    return mavlink.MAVLink_heartbeat_message(kind, no_autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
+
+
+def timesync_message(now_ns: int, request_ns: int | None = None) -> Any:
+    """A TIMESYNC request stamped ``now_ns``, or the response to the request stamped ``request_ns``."""
+    return mavlink.MAVLink_timesync_message(*((0, now_ns) if request_ns is None else (now_ns, request_ns)))
+
+
+def set_origin_message(system_id: int, origin: NedOrigin, now_ns: int) -> Any:
+    """SET_GPS_GLOBAL_ORIGIN for an autopilot without an origin."""
+    lat_1e7, lon_1e7 = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
+    alt_mm = round(origin.alt_amsl_m * 1e3)
+    return mavlink.MAVLink_set_gps_global_origin_message(system_id, lat_1e7, lon_1e7, alt_mm, now_ns // 1000)
+
+
+def command_message(system_id: int, command: int, *values: float) -> Any:
+    """COMMAND_LONG to the autopilot; missing parameters are 0."""
+    padded = (*values, *(0.0,) * (7 - len(values)))
+    return mavlink.MAVLink_command_long_message(system_id, AUTOPILOT_COMPONENT, command, 0, *padded)
+
+
+def notice_message(severity: int, text: str) -> Any:
+    """STATUSTEXT, which the autopilot passes on to the ground station."""
+    return mavlink.MAVLink_statustext_message(severity, text.encode("ascii", "replace"))
+
+
+def acknowledgement_message(command: int, *, accepted: bool) -> Any:
+    """COMMAND_ACK."""
+    result = mavlink.MAV_RESULT_ACCEPTED if accepted else mavlink.MAV_RESULT_UNSUPPORTED
+    return mavlink.MAVLink_command_ack_message(command, result)
+
+
+def stamp_on_ground_ns(now_ns: int) -> int:
+    """Stamp of what is sent before take-off, older than any fix.
+
+    ArduPilot takes the quickest message for undelayed, which must be a fix.
+    """
+    return max(now_ns - round(MAX_DELAY_MS * 1e6), 0)
+
+
+def no_position_message(now_ns: int) -> Any:
+    """ODOMETRY that says: the camera works, and knows no position.
+
+    ArduPilot does not arm unless something has come from its visual odometry within 0.3 s, and on the ground a
+    camera sees nothing. By its quality the message is not used for navigation.
+    """
+    nan, stamp_us = math.nan, stamp_on_ground_ns(now_ns) // 1000
+    return mavlink.MAVLink_odometry_message(
+        stamp_us, mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, *(0.0, 0.0, 0.0),
+        [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, [nan] * 21, [nan] * 21, 0, mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        -1,  # failed
+    )  # fmt: skip
+
+
+def pose_covariance(fix: Fix, *, with_attitude: bool = False) -> list[float]:
+    """Upper triangle, row by row, of the (6, 6) covariance of north, east, down, roll, pitch and yaw.
+
+    ArduPilot combines the three position variances into one scalar. The height comes from another sensor, and a
+    large variance of it would dominate: it gets the horizontal one.
+
+    Args:
+        fix: with its covariance.
+        with_attitude: whether its own attitude is sent; the autopilot's, sent back, counts for little.
+
+    Returns:
+        21 values in m^2, rad^2 and their products.
+    """
+    c = fix.covariance_m2
+    pose = np.zeros((6, 6))
+    pose[0, 0], pose[0, 1], pose[1, 1] = c[1, 1], c[0, 1], c[0, 0]
+    pose[2, 2] = fix.sigma_m**2
+    pose[3:, 3:] = ANGLE_VARIANCE * np.eye(3)
+    if with_attitude and fix.attitude_covariance_deg2 is not None:
+        pose[3:, 3:] = fix.attitude_covariance_deg2 * math.radians(1.0) ** 2 + MOUNT_VARIANCE * np.eye(3)
+    return [float(v) for v in pose[np.triu_indices(6)]]
+
+
+def _measured_attitude(report: FixReport) -> Attitude | None:
+    """The attitude of the fix where it solved the whole pose and the camera does not hang on a gimbal."""
+    is_whole = report.fix.attitude_covariance_deg2 is not None and report.vehicle.holder is None
+    return report.fix.attitude if is_whole else None
+
+
+def _angles(report: FixReport) -> tuple[float, float, float]:
+    """Roll, pitch and yaw in radians, yaw in [-pi, pi]: as measured by the fix, else the vehicle's."""
+    source = _measured_attitude(report) or report.vehicle
+    assert source.roll_deg is not None  # checked by withhold_reason
+    assert source.pitch_deg is not None
+    assert source.heading_deg is not None
+    yaw = math.remainder(math.radians(source.heading_deg), 2.0 * math.pi)
+    return math.radians(source.roll_deg), math.radians(source.pitch_deg), yaw
+
+
+def _ned(report: FixReport, firmware: str) -> tuple[float, float, float]:
+    """North, east and down of the origin in metres; down is the vehicle's, since a map's datum differs."""
+    assert report.origin is not None  # checked by withhold_reason
+    assert report.vehicle.down_m is not None
+    return (*north_east_m(report.fix.lat_deg, report.fix.lon_deg, report.origin, firmware), report.vehicle.down_m)
+
+
+def _vision_position_estimate(report: FixReport, firmware: str) -> Any:
+    return mavlink.MAVLink_vision_position_estimate_message(
+        report.captured_ns // 1000,
+        *_ned(report, firmware),
+        *_angles(report),
+        pose_covariance(report.fix, with_attitude=_measured_attitude(report) is not None),
+        report.reset_counter,
+    )
+
+
+def _odometry(report: FixReport, firmware: str) -> Any:
+    # Aligned to north, which is NED for PX4; ArduPilot accepts only FRD, and reads it as NED.
+    frame = mavlink.MAV_FRAME_LOCAL_FRD if firmware == "ardupilot" else mavlink.MAV_FRAME_LOCAL_NED
+    nan = math.nan
+    velocity, covariance = [nan, nan, nan], [nan] * 21
+    if report.velocity is not None:
+        velocity = _body_velocity(report.velocity, report.vehicle)
+        covariance = [0.0] * 21
+        covariance[0] = covariance[6] = covariance[11] = report.velocity.sigma_mps**2
+    return mavlink.MAVLink_odometry_message(
+        report.captured_ns // 1000,
+        frame,
+        mavlink.MAV_FRAME_BODY_FRD,
+        *_ned(report, firmware),
+        _quaternion(*_angles(report)),
+        *velocity,
+        *(nan, nan, nan),
+        pose_covariance(report.fix, with_attitude=_measured_attitude(report) is not None),
+        covariance,
+        report.reset_counter,
+        mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        0,  # quality unknown: the covariance expresses it
+    )
+
+
+def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[float]:
+    """Velocity in m/s along the body's axes, by the autopilot's own attitude, with which it is turned back."""
+    assert vehicle.roll_deg is not None  # checked by withhold_reason
+    assert vehicle.pitch_deg is not None
+    assert vehicle.heading_deg is not None
+    enu_mps = np.array([velocity.east_mps, velocity.north_mps, vehicle.up_velocity_mps or 0.0])
+    rotation = enu_from_body(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg)
+    return [float(v) for v in rotation.T @ enu_mps]
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
+    """Quaternion w, x, y, z that rotates the body to north-east-down; angles in radians."""
+    cr, cp, cy = (math.cos(0.5 * v) for v in (roll, pitch, yaw))
+    sr, sp, sy = (math.sin(0.5 * v) for v in (roll, pitch, yaw))
+    return [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+
+
+def _gps_input(report: FixReport, gps_id: int) -> Any:
+    assert report.velocity is not None  # checked by withhold_reason
+    times_ns = (report.captured_ns, report.unix_ns)
+    return _receiver(gps_id, times_ns, report.fix, report.vehicle, report.velocity)
+
+
+def repeated_receiver_message(gnss: GnssFix, vehicle: VehicleState, gps_id: int, times_ns: tuple[int, int]) -> Any:
+    """GPS_INPUT that repeats the position of the autopilot's own receiver, for a vehicle that stands still.
+
+    ArduPilot does not arm unless each receiver has a fix, and on the ground a camera sees nothing.
+
+    Args:
+        gnss: the receiver's position.
+        vehicle: its height.
+        gps_id: receiver that the message poses as.
+        times_ns: its stamps, on the monotonic clock and since 1970: older than any fix.
+    """
+    return _receiver(gps_id, times_ns, gnss, vehicle, None)
+
+
+def _receiver(
+    gps_id: int,
+    times_ns: tuple[int, int],
+    place: Fix | GnssFix,
+    vehicle: VehicleState,
+    velocity: GroundVelocity | None,
+) -> Any:
+    """GPS_INPUT of a place at a time, on the monotonic clock and since 1970."""
+    week, week_ms = divmod(times_ns[1] // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
+    alt_m, up_mps, sigma_m = vehicle.alt_amsl_m, vehicle.up_velocity_mps, place.sigma_m
+    dilution = max(_DILUTION_PER_M * sigma_m, _MIN_DILUTION)
+    ignored = 0 if alt_m is not None else mavlink.GPS_INPUT_IGNORE_FLAG_ALT
+    ignored |= 0 if up_mps is not None else mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
+    ignored |= 0 if velocity is not None else _NO_VELOCITY
+    return mavlink.MAVLink_gps_input_message(
+        times_ns[0] // 1000,
+        gps_id,
+        ignored,
+        week_ms,
+        week,
+        3,  # a 3D fix
+        *_degrees_1e7(place),
+        alt_m or 0.0,
+        *(dilution, dilution),
+        *((0.0, 0.0) if velocity is None else (velocity.north_mps, velocity.east_mps)),
+        -(up_mps or 0.0),
+        0.0 if velocity is None else velocity.sigma_mps,
+        sigma_m,
+        sigma_m,
+        round(10.0 / dilution),
+    )
+
+
+def _global_position_sensor(report: FixReport) -> Any:
+    age_us = round(report.age_ms * 1000.0)
+    return mavlink.MAVLink_global_position_sensor_message(
+        0,
+        0,
+        SENSOR_ID,
+        # By MAVLink's definition this stamp is of sending; the time since capture is a field of its own.
+        report.captured_ns // 1000 + age_us,
+        age_us,
+        mavlink.GLOBAL_POSITION_SRC_VISION,
+        0,
+        *_degrees_1e7(report.fix),
+        math.nan,
+        math.nan,  # the fix has no height
+        report.fix.sigma_m,
+        math.nan,
+    )
+
+
+def _degrees_1e7(fix: Fix | GnssFix) -> tuple[int, int]:
+    return round(fix.lat_deg * 1e7), round(math.remainder(fix.lon_deg, 360.0) * 1e7)

@@ -1,0 +1,6 @@
+"""Checks: whether the inputs of a flight fit each other, and where on a map fixes are available."""
+
+from scenematch.check.diagnose import diagnose
+from scenematch.check.findings import Diagnosis, Finding
+
+__all__ = ["Diagnosis", "Finding", "diagnose"]

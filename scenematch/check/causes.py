@@ -1,0 +1,310 @@
+"""Causes: the single change of telemetry or calibration that makes them fit what the pictures show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import MOUNTS, mount_rotation
+from engine.geo import enu_from_body, wrap_difference_deg
+from scenematch.check.contradictions import (
+    SIGMA_DEG,
+    attitude_deg,
+    contradictions,
+    height_sigma_m,
+    is_alarming,
+)
+from scenematch.check.findings import Array, Finding, TelemetrySeries
+from scenematch.check.ground_motion import optical_centre, velocity
+from scenematch.check.sightings import Sighting
+
+_OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
+_MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
+_GAIN, _GAIN_SHARE = 0.6, 0.5  # by which a change must lessen it, the lesser of the two
+_PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
+_LEAST = 3
+_ANGLES = ("roll", "pitch", "heading")
+# An offset below both, in shares of the height and in sigmas, is named only where single pictures contradict it.
+_LEAST_HEIGHT_SHARE, _LEAST_HEIGHT_SIGMAS = 0.04, 5.0
+_SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
+_FEET = 0.3048
+IN_CALIBRATION = " in the calibration"
+"""Ends a cure that is a line of a file, which not every flight has."""
+
+
+def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
+    """What does not fit; the telemetry's attitude, height, velocity and the map are tried one after the other.
+
+    Args:
+        series: of the whole flight.
+        seen: the poses of some of its pictures.
+        map_sigma_m: georeferencing accuracy of the map.
+    """
+    if len(seen) < _LEAST:
+        return []
+    attitude = _attitude(series, seen)
+    # By a clock that is late places lie off forwards as well.
+    is_late = attitude is not None and attitude.cause == "clock"
+    turning = None if is_late else optical_centre(series, seen)
+    tries = (
+        attitude, _height(series, seen), turning or velocity(series, seen),
+        _place(series, seen, map_sigma_m),
+    )  # fmt: skip
+    return [found for found in tries if found is not None]
+
+
+def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ...]:
+    """What of the telemetry was known at enough of the sightings to be compared."""
+    index = [s.index for s in seen]
+    tilt_is_known = np.isfinite(series.angles_deg[index, :2]).any()
+    angles = {"attitude": series.angles_deg} if tilt_is_known else {"heading": series.angles_deg[:, 2:]}
+    columns = {**angles, "height": series.height_m[:, None], "velocity": series.velocity_mps,
+               "map": series.reference_m}  # fmt: skip
+    return tuple(
+        name for name, values in columns.items() if np.isfinite(values[index]).all(axis=1).sum() >= _LEAST
+    )
+
+
+# ------------------------------------------------------------------------------------------------ attitude
+
+
+def _cost(measured_deg: Array, told_deg: Array) -> float:
+    """Mean chi-square of a component, each limited."""
+    chi = (wrap_difference_deg(measured_deg - told_deg) / SIGMA_DEG) ** 2
+    known = np.isfinite(chi)
+    return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
+
+
+def _signed(angles: Array) -> Array:
+    """Angles of which the heading is what it was before it was wrapped into [0, 360) as if in degrees."""
+    heading = np.where(angles[:, 2] > 2.0 * math.pi + 1e-3, angles[:, 2] - 360.0, angles[:, 2])
+    return np.column_stack([angles[:, :2], heading])
+
+
+_DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
+    ("radians", "roll, pitch and heading are in radians", "--angles radians",
+     lambda a: np.degrees(_signed(a))),
+    ("radians", "the heading is in radians", '--column "heading_deg=57.29578*heading_deg"',
+     lambda a: _signed(a) * [1.0, 1.0, 180.0 / math.pi]),
+    ("radians", "roll and pitch are in radians",
+     '--column "roll_deg=57.29578*roll_deg" --column "pitch_deg=57.29578*pitch_deg"',
+     lambda a: a * [180.0 / math.pi, 180.0 / math.pi, 1.0]),
+    ("degrees", "the angles were multiplied by 57.3, as if they had been in radians",
+     "look at the conversion of the telemetry", np.radians),
+    ("swapped", "roll and pitch are in each other's place",
+     "--column roll_deg=pitch_deg --column pitch_deg=roll_deg",
+     lambda a: a[:, [1, 0, 2]]),
+    ("sign", "roll and pitch have the other sign", "--column roll_deg=-roll_deg --column pitch_deg=-pitch_deg",
+     lambda a: a * [-1.0, -1.0, 1.0]),
+    ("sign", "roll has the other sign: positive is right side down", "--column roll_deg=-roll_deg",
+     lambda a: a * [-1.0, 1.0, 1.0]),
+    ("sign", "pitch has the other sign: positive is nose up", "--column pitch_deg=-pitch_deg",
+     lambda a: a * [1.0, -1.0, 1.0]),
+    ("heading_convention", "the heading is counted counter-clockwise from north",
+     "--column heading_deg=-heading_deg",
+     lambda a: a * [1.0, 1.0, -1.0]),
+    ("heading_convention", "the heading is counted counter-clockwise from east, as ROS' yaw is",
+     "--column heading_deg=-heading_deg+90", lambda a: a * [1.0, 1.0, -1.0] + [0.0, 0.0, 90.0]),
+)  # fmt: skip
+
+
+def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
+    index = np.array([s.index for s in seen])
+    measured = np.array([attitude_deg(s) for s in seen])
+    angles = series.angles_deg[index]
+    if np.isfinite(angles).sum() < 2 * _LEAST:
+        return None
+    as_told = _cost(measured, angles)
+    contradicted = _contradicted(series, seen, _ANGLES)
+    if as_told < _MISFIT and not contradicted:
+        return None
+    tried: list[tuple[float, Finding]] = [
+        (_cost(measured, change(angles)) + _PENALTY["discrete"], Finding(cause, text, cure))
+        for cause, text, cure, change in _DISCRETE
+    ]
+    tried.append(_turned_heading(measured, angles))
+    tried.append(_turned_mount(measured, angles, series.mount))
+    tried.append(_late(measured, series, index))
+    cost, finding = min((row for row in tried if math.isfinite(row[0])), key=lambda row: row[0])
+    if cost < as_told - min(_GAIN, _GAIN_SHARE * as_told):
+        return finding
+    suspected = _listed(contradicted or _ANGLES)
+    text = f"{suspected} of the telemetry and of the pictures differ, and no single change would make them fit"
+    return Finding("attitude", text, f"look at {suspected}: the unit, the sign, the clock")
+
+
+def _contradicted(series: TelemetrySeries, seen: Sequence[Sighting], fields: Sequence[str]) -> list[str]:
+    """Those of the fields that too many pictures contradict."""
+    return [one.field for one in contradictions(series, seen) if one.field in fields and is_alarming(one)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
+    off_deg, sigma_deg = _median_angle(measured[:, 2] - angles[:, 2])
+    cost = _cost(measured, angles + np.array([0.0, 0.0, off_deg])) + _PENALTY["offset"]
+    text = f"the heading reads {abs(off_deg):.1f} degrees too {'low' if off_deg > 0 else 'high'}"
+    if abs(off_deg) < 30.0:
+        text += " (a magnetic heading, or a compass that is not calibrated)"
+    return cost, Finding("heading", text, f"--heading-offset-deg {off_deg:+.1f}", off_deg, sigma_deg)
+
+
+def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding]:
+    """One rotation between the telemetry's body and the one that the pictures show: the camera hangs otherwise."""
+    known = np.isfinite(angles).all(axis=1)
+    if known.sum() < _LEAST:
+        return math.inf, Finding("mount", "", "")
+    bodies = [enu_from_body(*row) for row in angles[known]]
+    shown = [enu_from_body(*row) for row in measured[known]]
+    turns = [b.T @ s for b, s in zip(bodies, shown, strict=True)]  # shown = telemetry's @ turn
+    median = _middle_rotation(turns)
+    leftover = [_rotation_deg(median.T @ turn) for turn in turns]
+    chi = np.minimum((np.array(leftover) / 1.5) ** 2 / 2.0, _OUTLIER)
+    about_down_deg = math.degrees(math.atan2(median[1, 0], median[0, 0]))
+    tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(median[2, 2])))))
+    quarter = round(about_down_deg / 90.0) * 90
+    sigma_deg = float(np.median(leftover)) / math.sqrt(len(leftover))
+    if quarter and abs(about_down_deg - quarter) < 6.0 and tilt_deg < 6.0:
+        turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        hung = np.linalg.matrix_power(turned, quarter // 90 % 4) @ mount
+        names = [name for name in MOUNTS if np.allclose(mount_rotation(name), hung, atol=1e-6)]
+        text = f"the camera is turned by {quarter % 360} degrees against its mount"
+        cure = f"--mount {names[0]}" if names else _mount_line(hung)
+        return float(chi.mean()) + _PENALTY["discrete"], Finding("mount", text, cure, float(quarter), sigma_deg)
+    if tilt_deg < 1.0:  # about the vertical alone: reported as a heading
+        return math.inf, Finding("mount", "", "")
+    axis = (mount @ np.array([0.0, 0.0, 1.0]), median @ mount @ np.array([0.0, 0.0, 1.0]))
+    forward_deg = math.degrees(math.atan2(axis[1][0], axis[1][2]) - math.atan2(axis[0][0], axis[0][2]))
+    text = (
+        f"the camera hangs {tilt_deg:.1f} degrees off its mount ({forward_deg:+.1f} towards the nose), "
+        "or roll and pitch are off by that, or the principal point"
+    )
+    cure = _mount_line(median @ mount)
+    return float(chi.mean()) + _PENALTY["rotation"], Finding("mount", text, cure, tilt_deg, sigma_deg)
+
+
+def _mount_line(mount: Array) -> str:
+    return f"mount: [{', '.join(f'{v:.5f}' for v in mount.ravel())}]{IN_CALIBRATION}"
+
+
+def _late(measured: Array, series: TelemetrySeries, index: NDArray[np.intp]) -> tuple[float, Finding]:
+    nothing = math.inf, Finding("clock", "", "")
+    known = np.isfinite(series.angles_deg).all(axis=1) & np.isfinite(series.time_s)
+    if known.sum() < 2 * _LEAST or not np.all(np.diff(series.time_s[known]) > 0.0):
+        return nothing
+    time_s, angles = series.time_s[known], series.angles_deg[known].copy()
+    angles[:, 2] = np.degrees(np.unwrap(np.radians(angles[:, 2])))
+
+    def cost_of(shift_s: float) -> float:
+        at = series.time_s[index] + shift_s
+        shifted = np.stack([np.interp(at, time_s, column) for column in angles.T], axis=1)
+        return _cost(measured, shifted)
+
+    costs = [cost_of(float(shift_s)) for shift_s in _SHIFTS_S]
+    best = int(np.argmin(costs))
+    shift_s = float(_SHIFTS_S[best])
+    late = "late" if shift_s > 0.0 else "early"
+    text = f"the telemetry is {abs(shift_s):.2f} s {late} against the pictures"
+    return costs[best] + _PENALTY["shift"], Finding(
+        "clock", text, f"--telemetry-offset-s {-shift_s:+.2f}", shift_s, 0.05
+    )
+
+
+def _median_angle(angles_deg: Array) -> tuple[float, float]:
+    """Median of angles about their mean direction, and its standard deviation."""
+    known = np.radians(angles_deg[np.isfinite(angles_deg)])
+    if not known.size:
+        return 0.0, math.inf
+    middle = math.atan2(np.sin(known).sum(), np.cos(known).sum())
+    off = wrap_difference_deg(np.degrees(known - middle))
+    spread = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    middle_deg = wrap_difference_deg(math.degrees(middle) + float(np.median(off)))
+    return middle_deg, max(spread, 0.3) * 1.25 / math.sqrt(known.size)
+
+
+def _middle_rotation(turns: Sequence[Array]) -> Array:
+    """Of rotations with a few outliers: the mean of those nearest to the one that is nearest to all."""
+    apart = np.array([[_rotation_deg(a.T @ b) for b in turns] for a in turns])
+    near = np.argsort(apart[int(np.argmin(np.median(apart, axis=1)))])[: max(_LEAST, (3 * len(turns)) // 4)]
+    u, _, vt = np.linalg.svd(np.mean([turns[k] for k in near], axis=0))
+    return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt, np.float64)
+
+
+def _rotation_deg(rotation: Array) -> float:
+    return math.degrees(math.acos(max(-1.0, min(1.0, (float(np.trace(rotation)) - 1.0) / 2.0))))
+
+
+# -------------------------------------------------------------------------------------------------- height
+
+
+def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
+    height = series.height_m[[s.index for s in seen]]
+    measured = np.array([s.height_agl_m for s in seen])
+    known = np.isfinite(height)
+    if known.sum() < _LEAST:
+        return None
+    height, measured = height[known], measured[known]
+    sigma = height_sigma_m(measured)
+
+    def cost(expected: Array) -> float:
+        return float(np.minimum(((measured - expected) / sigma) ** 2, _OUTLIER).mean())
+
+    off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
+    by_offset, by_factor = cost(height + off_m), cost(height * factor)
+    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
+    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
+    is_small = abs(off_m) < min(_LEAST_HEIGHT_SHARE * float(np.median(measured)), _LEAST_HEIGHT_SIGMAS * sigma_m)
+    if cost(height) < _MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
+        return None
+    if min(by_offset, by_factor) > cost(height) - _GAIN:
+        text = "the height does not fit the pictures, and no offset or factor would make it"
+        return Finding("height", text, "look at the telemetry's height")
+    if abs(factor / _FEET - 1.0) < 0.04:
+        text = "the height is in feet"
+        return Finding("height_feet", text, '--column "height_agl_m=0.3048*height_agl_m"', factor)
+    side = "low" if off_m > 0.0 else "high"
+    if by_factor < by_offset - 0.3:
+        text = f"heights are to be multiplied by {factor:.3f}, or the focal length divided by it"
+        return Finding("focal", text, f'--column "height_agl_m={factor:.3f}*height_agl_m"', factor, 0.01)
+    text = (
+        f"the height reads {abs(off_m):.1f} m too {side} (above sea level, above another ground?), "
+        f"or the focal length {abs(100.0 * (factor - 1.0)):.0f} % too {'short' if off_m < 0.0 else 'long'}"
+    )
+    return Finding("height", text, f"--height-offset-m {off_m:+.1f}", off_m, sigma_m)
+
+
+# ---------------------------------------------------------------------------------------------- position
+
+
+def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float) -> Finding | None:
+    index = np.array([s.index for s in seen])
+    reference_m = series.reference_m[index]
+    off = np.array([s.en_m for s in seen]) - reference_m
+    known = np.isfinite(off).all(axis=1)
+    if known.sum() < _LEAST:
+        return None
+    middle = np.median(off[known], axis=0)
+    if not np.isfinite(series.angles_deg[index, :2]).any():
+        # Who knows of no tilt may give positions of what the picture's middle shows.
+        shown = np.array([_shown_m(s, series.mount) for s in seen]) - reference_m
+        middle = min(middle, np.median(shown[known], axis=0), key=np.linalg.norm)
+    sigma_m = math.hypot(float(np.median(series.reference_sigma_m[index][known])), map_sigma_m)
+    if float(np.hypot(*middle)) < 3.0 * sigma_m:
+        return None
+    text = (
+        f"the map shows places {np.hypot(*middle):.1f} m ({middle[0]:+.1f} east, {middle[1]:+.1f} north) "
+        "from where the other positions are"
+    )
+    return Finding("map", text, "look at the map's georeference, or at the datum of the positions",
+                   float(np.hypot(*middle)), sigma_m)  # fmt: skip
+
+
+def _shown_m(seen: Sighting, mount: Array) -> Array:
+    """(2,) east and north of what the picture's middle shows, on level ground."""
+    axis = enu_from_body(*attitude_deg(seen)) @ mount[:, 2]
+    return seen.en_m + axis[:2] / max(-float(axis[2]), 0.1) * seen.height_agl_m

@@ -1,0 +1,159 @@
+"""From the telemetry and the pictures of a flight to what does not fit among its inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.matching.covariance import map_sigma_of
+from engine.navigation.evidence import position_of
+from engine.orthomap import OrthoMap
+from engine.values import Frame, Prior
+from scenematch.check.causes import findings, is_known
+from scenematch.check.contradictions import contradictions
+from scenematch.check.findings import Diagnosis, Finding, TelemetrySeries
+from scenematch.check.sightings import sight
+
+Array = NDArray[np.float64]
+
+LOOKED_AT = 16
+_SPEED_MPS = 5.0  # by which a position grows uncertain with the time to the next that is known
+_MAX_SIGMA_M = 300.0  # of a prior; beyond, the whole map is searched where it can be
+# Nanoseconds in the units that stamps are given in by mistake, and the intervals between pictures that are usual.
+_UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}
+_USUAL_NS = (5e6, 2e10)
+_FROZEN_SHARE = 0.1
+
+
+class Telemetry(Protocol):
+    """What is said of one picture: a :class:`engine.values.Frame` or a row of telemetry.csv."""
+
+    @property
+    def timestamp_ns(self) -> int | None:
+        """Of the capture; roll_deg, pitch_deg, heading_deg, height_agl_m and velocities are read as well."""
+
+
+def diagnose(
+    telemetry: Sequence[Telemetry],
+    picture: Callable[[int], Frame],
+    site: OrthoMap,
+    camera: Camera,
+    *,
+    priors: Sequence[Prior | None] | None = None,
+    start: Prior | None = None,
+    reference: Sequence[Prior | None] | None = None,
+) -> Diagnosis:
+    """Compare what a flight's telemetry says with what its pictures show by themselves.
+
+    Args:
+        telemetry: of every picture, in the order of capture.
+        picture: reads the picture of an index; some thirty are read.
+        site: the map.
+        camera: the calibration.
+        priors: positions that came with the pictures, by another source; None where they have none.
+        start: where the flight begins; None where that is not known.
+        reference: positions that the map is held against; None takes ``priors``.
+
+    Returns:
+        Diagnosis: what does not fit, the strongest first.
+    """
+    count = len(telemetry)
+    priors = [None] * count if priors is None else list(priors)
+    series = _series(telemetry, priors if reference is None else list(reference), site, camera)
+    chosen = np.unique(np.linspace(0, count - 1, min(LOOKED_AT, count)).round().astype(int)).tolist()
+    frames = [picture(k) for k in chosen]
+    static = [
+        found for found in (_stamps(telemetry), _frozen(chosen, frames, picture, count)) if found is not None
+    ]
+    if start is not None:
+        priors[0] = start
+    seen = sight(frames, [_searched(k, priors, series.time_s, site) for k in chosen], site, camera)
+    if seen.mirrored:
+        cure = "take them from the camera before they are flipped"
+        static.append(Finding("mirrored", "the pictures are mirrored", cure))
+        return Diagnosis(static, len(chosen), len(seen.sightings), ())
+    sightings = [replace(s, index=chosen[s.index]) for s in seen.sightings]
+    found = findings(series, sightings, map_sigma_of(site))
+    compared, contradicted = is_known(series, sightings), contradictions(series, sightings)
+    return Diagnosis(static + found, len(chosen), len(sightings), compared, contradicted)
+
+
+def _searched(k: int, priors: Sequence[Prior | None], time_s: Array, site: OrthoMap) -> Prior | None:
+    """Where a picture is looked for: about the position that is known nearest to it in time."""
+    known = [j for j, prior in enumerate(priors) if prior is not None]
+    if not known:
+        return None
+    nearest = min(
+        known, key=lambda j: abs(time_s[j] - time_s[k]) if np.isfinite(time_s[[j, k]]).all() else abs(j - k)
+    )
+    prior = priors[nearest]
+    assert prior is not None
+    elapsed_s = abs(float(time_s[nearest] - time_s[k])) if nearest != k else 0.0
+    sigma_m = prior.sigma_m + _SPEED_MPS * elapsed_s
+    if np.isfinite(sigma_m) and sigma_m <= _MAX_SIGMA_M:
+        return replace(prior, sigma_m=sigma_m)
+    return None if site.is_searchable else replace(prior, sigma_m=_MAX_SIGMA_M)
+
+
+def _series(
+    telemetry: Sequence[Telemetry], reference: Sequence[Prior | None], site: OrthoMap, camera: Camera
+) -> TelemetrySeries:
+    def column(*names: str) -> Array:
+        rows = [[getattr(row, name) for name in names] for row in telemetry]
+        return np.array([[np.nan if v is None else v for v in row] for row in rows], np.float64)
+
+    factor = _unit(telemetry)[1]
+    places = [None if prior is None else position_of(prior, site) for prior in reference]
+    return TelemetrySeries(
+        time_s=column("timestamp_ns")[:, 0] * factor * 1e-9,
+        angles_deg=column("roll_deg", "pitch_deg", "heading_deg"),
+        height_m=column("height_agl_m")[:, 0],
+        velocity_mps=column("east_velocity_mps", "north_velocity_mps"),
+        reference_m=np.array([[np.nan, np.nan] if place is None else place.en_m for place in places], np.float64),
+        reference_sigma_m=np.array([np.nan if place is None else place.sigma_m for place in places], np.float64),
+        mount=camera.mount,
+        focal_px=camera.focal_px,
+    )
+
+
+def _unit(telemetry: Sequence[Telemetry]) -> tuple[str, float]:
+    """The unit that the stamps are in, and the nanoseconds in it."""
+    stamps = np.array([row.timestamp_ns for row in telemetry if row.timestamp_ns is not None], np.float64)
+    if len(stamps) < 3:
+        return "nanoseconds", 1.0
+    interval = float(np.median(np.diff(stamps)))
+    if not 0.0 <= interval < _USUAL_NS[0]:
+        return "nanoseconds", 1.0
+    interval = float(np.mean(np.diff(stamps)))  # of seconds most are 0
+    for unit, factor in _UNITS.items():
+        if _USUAL_NS[0] <= interval * factor <= _USUAL_NS[1]:
+            return unit, factor
+    return "nanoseconds", 1.0
+
+
+def _stamps(telemetry: Sequence[Telemetry]) -> Finding | None:
+    unit, factor = _unit(telemetry)
+    if factor == 1.0:
+        return None
+    text = f"timestamp_ns seems to be in {unit}: between pictures it grows by less than 5 ms"
+    return Finding("stamps", text, f'--column "timestamp_ns={factor:.0f}*timestamp_ns"', factor)
+
+
+def _frozen(
+    chosen: Sequence[int], frames: Sequence[Frame], picture: Callable[[int], Frame], count: int
+) -> Finding | None:
+    """Each picture that was looked at is compared with the next one of the flight."""
+    repeated = looked = 0
+    for k, frame in zip(chosen, frames, strict=True):
+        if k + 1 < count:
+            looked += 1
+            repeated += bool(np.array_equal(np.asarray(frame.image), np.asarray(picture(k + 1).image)))
+    if repeated <= _FROZEN_SHARE * looked:
+        return None
+    text = f"{repeated} of {looked} pictures are repeated by the next"
+    return Finding("frozen", text, "look at the camera, or at how its pictures were saved", float(repeated))

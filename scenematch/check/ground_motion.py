@@ -1,0 +1,198 @@
+"""Ground motion between sightings against the velocity: unit, axes, and places that move with the heading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import wrap_difference_deg
+from scenematch.check.findings import Array, Finding, TelemetrySeries
+from scenematch.check.sightings import Sighting
+
+_OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
+_MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
+_GAIN = 0.6  # by which a change must lessen it
+_LEAST = 3
+_VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048}
+# Of places that move with the heading: by how much they lessen the cost, to which share, and what is named at all.
+_TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_LEAST_DEG = 0.35, 2.5, 4.0, 1.2
+_LEAST_COST = 0.1
+# Legs that show them: the vehicle turns at all, as the telemetry says, and tilts about as usual at both ends.
+_TURN_DEG, _TURN_OFF_DEG, _TILT_OFF_DEG = 15.0, 10.0, 8.0
+_MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
+_VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Leg:
+    """The way between two sightings.
+
+    Attributes:
+        first: where it begins.
+        last: where it ends.
+        moved_m: (2,) east and north by the sightings.
+        reckoned_m: (2,) the same by the velocity.
+        sigma_m: of their difference, per axis.
+    """
+
+    first: Sighting
+    last: Sighting
+    moved_m: Array
+    reckoned_m: Array
+    sigma_m: float
+
+    @property
+    def off(self) -> Array:
+        """(2,) the difference, in sigmas."""
+        return (self.moved_m - self.reckoned_m) / self.sigma_m
+
+    @property
+    def turn_deg(self) -> float:
+        """Of the heading, by the sightings; from -180 up to 180."""
+        return wrap_difference_deg(self.last.attitude.heading_deg - self.first.attitude.heading_deg)
+
+    @property
+    def turned(self) -> Array:
+        """(2, 2) what an offset forward and to the right adds to the difference, in sigmas a metre."""
+        return (_heading_rotation(self.last) - _heading_rotation(self.first)) / self.sigma_m
+
+
+def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
+    """The unit, the axes and the sign of a velocity that does not fit the ways between sightings."""
+    legs = _legs(series, seen)
+    if len(legs) < _LEAST:
+        return None
+    moved, reckoned = np.array([leg.moved_m for leg in legs]), np.array([leg.reckoned_m for leg in legs])
+    sigma = np.array([[leg.sigma_m] for leg in legs])
+
+    def cost(expected: Array) -> float:
+        return _limited((moved - expected) / sigma)
+
+    tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
+              "--column east_velocity_mps=north_velocity_mps --column north_velocity_mps=east_velocity_mps"),
+             (cost(-reckoned), "the velocity has the other sign",
+              "--column east_velocity_mps=-east_velocity_mps "
+              "--column north_velocity_mps=-north_velocity_mps")]  # fmt: skip
+    tried += [
+        (cost(factor * reckoned), f"the velocity is in {unit}",
+         " ".join(f'--column "{n}_velocity_mps={factor:.4g}*{n}_velocity_mps"' for n in ("east", "north")))
+        for unit, factor in _VELOCITY_FACTORS.items()
+    ]  # fmt: skip
+    square = float((reckoned**2).sum())
+    factor = float(np.median((moved * reckoned).sum(axis=1) / np.maximum((reckoned**2).sum(axis=1), 1e-9)))
+    if square > 0.0 and factor > 0.0:
+        text = f"the vehicle moves {factor:.2f} times as far between pictures as velocity and stamps say"
+        tried.append(
+            (
+                cost(factor * reckoned) + 0.1,
+                text,
+                "look at the frame rate, the stamps and the unit of the velocity",
+            )
+        )
+    best, text, cure = min(tried, key=lambda row: row[0])
+    if cost(reckoned) < _MISFIT:
+        return None
+    if best > cost(reckoned) - _GAIN:
+        text = "velocity and stamps do not fit the ways between the pictures, and no single change would make them"
+        return Finding("velocity", text, "look at the velocity and the stamps")
+    return Finding("velocity", text, cure, factor)
+
+
+def leg_differences(series: TelemetrySeries, seen: Sequence[Sighting]) -> Array:
+    """(N,) by how many standard deviations each way between two pictures differs from that of the velocity."""
+    legs = _legs(series, seen)
+    return np.array([np.abs(leg.off).max() for leg in legs] if len(legs) >= _LEAST else [], np.float64)
+
+
+def _legs(series: TelemetrySeries, seen: Sequence[Sighting]) -> list[_Leg]:
+    """The legs between sightings whose velocity is known."""
+    return [leg for first, last in pairwise(seen) if (leg := _leg(series, first, last)) is not None]
+
+
+def _heading_rotation(seen: Sighting) -> Array:
+    """(2, 2) from forward and right to east and north."""
+    heading = math.radians(seen.attitude.heading_deg)
+    sine, cosine = math.sin(heading), math.cos(heading)
+    return np.array([[sine, cosine], [cosine, -sine]])
+
+
+def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
+    """Places that are off forwards or to the right: at every turn of the vehicle they move."""
+    tilts_deg = np.array([(one.attitude.roll_deg, one.attitude.pitch_deg) for one in seen])
+    off_deg = np.abs(tilts_deg - np.median(tilts_deg, axis=0)).max(axis=1)
+    usual = [one for one, tilt_off_deg in zip(seen, off_deg, strict=True) if tilt_off_deg < _TILT_OFF_DEG]
+    legs = [leg for leg in _legs(series, usual) if _turns_as_told(series, leg)]
+    turning = np.array([abs(leg.turn_deg) > _TURN_DEG for leg in legs], bool)
+    if len(legs) < _LEAST or not turning.any():
+        return None
+    rows, off = np.array([leg.turned for leg in legs]), np.array([leg.off for leg in legs])
+    aside_m, information = _common_offset(rows, off, turning)
+    as_told, best = _limited(off), _limited(off - rows @ aside_m)
+    height_m = float(np.median([one.height_agl_m for one in seen]))
+    # Legs are mostly better known than is assumed of them.
+    sigma_m = math.sqrt(max(best, _LEAST_COST) * float(np.trace(np.linalg.inv(information))))
+    size_m = float(np.hypot(*aside_m))
+    aside_deg = math.degrees(math.atan2(size_m, height_m))
+    if as_told - best < _TURNING_GAIN or best > as_told / _TURNING_RATIO:
+        return None
+    if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
+        return None
+    return _named(aside_m, sigma_m, height_m, series)
+
+
+def _limited(left: Array) -> float:
+    """Mean chi-square of what is left, each limited."""
+    return float(np.minimum(left**2, _OUTLIER).mean())
+
+
+def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
+    """Whether the telemetry confirms the turn: to a false sighting and back, both legs would show one offset."""
+    first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2].tolist()
+    off_deg: float = wrap_difference_deg(leg.turn_deg - (last_deg - first_deg))
+    return abs(off_deg) < _TURN_OFF_DEG  # not where it is unknown
+
+
+def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The offset that most legs share, and its information (2, 2).
+
+    One leg that turns shows it, and the best of these is averaged with all legs that agree: an offset of many
+    sigmas is an outlier of each leg before it is known.
+    """
+    shown = np.linalg.solve(rows[turning], off[turning][..., None])[..., 0]
+    offset_m = min(shown, key=lambda one: _limited(off - rows @ one))
+    agreeing = (np.abs(off - rows @ offset_m) < _OUTLIER**0.5).all(axis=1)
+    design = rows[agreeing].reshape(-1, 2)
+    information = design.T @ design
+    return np.linalg.solve(information, design.T @ off[agreeing].ravel()), information
+
+
+def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySeries) -> Finding:
+    size_m = float(np.hypot(*aside_m))
+    off_px = series.focal_px / height_m * (series.mount.T @ [*aside_m, 0.0])[:2]
+    text = (
+        f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of where they are, whichever way "
+        "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
+    )
+    cure = f"look at the calibration: cx and cy would be {-off_px[0]:+.0f} and {-off_px[1]:+.0f} px other"
+    return Finding(
+        "mount", text, cure, math.degrees(math.atan2(size_m, height_m)), math.degrees(sigma_m / height_m)
+    )
+
+
+def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> _Leg | None:
+    between = slice(a.index, b.index + 1)
+    time_s, velocity = series.time_s[between], series.velocity_mps[between]
+    seconds = float(time_s[-1] - time_s[0])
+    if not (np.isfinite(velocity).all() and np.isfinite(time_s).all()) or not seconds > 0.0:
+        return None
+    reckoned = np.asarray(np.trapezoid(velocity, time_s, axis=0), np.float64)
+    moved = b.en_m - a.en_m
+    if seconds > _MAX_LEG_S or max(float(np.hypot(*moved)), float(np.hypot(*reckoned))) < _MIN_LEG_M:
+        return None
+    coarse_m = _ACCELERATION_MPS2 / 12.0 * float((np.diff(time_s) ** 2).sum())  # of the trapezoids
+    return _Leg(a, b, moved, reckoned, math.hypot(_LEG_SIGMA_M, _VELOCITY_SIGMA_MPS * seconds, coarse_m))

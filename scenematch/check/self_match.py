@@ -1,0 +1,212 @@
+"""Self-match: statistics of a map by correlating it with patches of its own that were changed.
+
+At every audited cell the patch that the camera would see is changed by noise, other ground and small errors of the
+telemetry, and correlated with the window that a prior allows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.kernels.peaks import fit_summit
+from engine.kernels.scores import enhance
+from engine.maps.prepared import PreparedMap
+from engine.matching.covariance import score_sigma
+from engine.ncc_fft import surface
+from engine.options import NccOptions
+from engine.orthomap import OrthoMap
+from engine.runtime.device import CPU
+from engine.runtime.workers import in_order, safe_count
+from engine.values import Window
+from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
+from scenematch.check.plan import AuditPlan
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+Pictures = NDArray[np.float32]
+
+# The change of a patch, the same at every cell.
+_DRAWS = 2
+_TURN_DEG, _SCALE, _SHIFT_PX = 1.0, 1.01, 0.4  # residual errors of telemetry and level
+_NOISE_SD = 3.0  # grey levels, of the sensor
+_CHANGE, _CHANGE_PX = 1.0, 2.0  # other ground: standard deviations of the enhanced picture, and grain
+_SHAKE_PX, _SHAKE_BLUR_PX = (
+    2.0,
+    1.0,
+)  # shift at the edges, and a blur: a change that only fine texture is sensitive to
+_NEAR_PX = 3  # largest shift at which a changed patch counts as matched at its own position
+
+
+@dataclass(frozen=True, slots=True)
+class SelfMatchStatistics:
+    """Statistics of cells (...,); NaN where the map has no data.
+
+    Attributes:
+        texture: deviation of the grey levels from their neighbourhood's mean.
+        rival: highest NCC of the unchanged patch outside its exclusion zone.
+        stability: NCC of the patch with itself, blurred, rotated and scaled a little.
+        sharpness: curvature of the unchanged peak along its flattest direction, per square pixel.
+        score: NCC of the changed patch at its own position, in sigmas.
+        lead: that less its best rival, in sigmas.
+        other_score: ``score`` of a patch of another date's map, unchanged; NaN without one.
+        other_lead: ``lead`` of the same.
+    """
+
+    texture: Array
+    rival: Array
+    stability: Array
+    sharpness: Array
+    score: Array
+    lead: Array
+    other_score: Array
+    other_lead: Array
+
+
+# ------------------------------------------------------------------------------------------------- measuring
+
+
+def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
+    """Yield the statistics of each audited cell, row by row, by all cores.
+
+    A large map is read on demand, and by one core.
+    """
+    options = plan.options.ncc
+    prepared = PreparedMap(plan.site, CPU, options.enhance_radius_px, options.score)
+    noise, centers_px = _noise(plan.shape), plan.centers_px[plan.audited]
+
+    def measured(index: int) -> SelfMatchStatistics:
+        return _measure(plan, prepared, noise, centers_px[index])
+
+    reads_files = any(site is not None and site.reads_files for site in (plan.site, plan.other))
+    yield from in_order(measured, len(centers_px), 1 if reads_files else safe_count())
+
+
+def _noise(shape: tuple[int, int]) -> Pictures:
+    """(draws, 2, h, w): the sensor's noise in grey levels, and other ground of unit deviation."""
+    noise = np.random.default_rng(0).normal(size=(_DRAWS, 2, *shape)).astype(np.float32)
+    noise[:, 0] *= _NOISE_SD
+    for draw in noise[:, 1]:
+        draw[:] = cv2.GaussianBlur(draw, (0, 0), _CHANGE_PX)
+        draw /= draw.std()
+    return noise
+
+
+def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px: Array) -> SelfMatchStatistics:
+    site, level, (height, width) = plan.site, plan.level, plan.shape
+    middle = site.level_from_full(center_px, level)
+    x0, y0 = plan.corner_px(center_px)
+    nothing = SelfMatchStatistics(*[np.array(np.nan)] * len(fields(SelfMatchStatistics)))
+    if not plan.contains(center_px):
+        return nothing
+    extent = Window(x0, y0, width, height)
+    if not site.fully_valid and site.valid(extent, level).mean() < plan.options.ncc.min_valid_share:
+        return nothing
+    gray = site.gray(extent, level)
+    other = None if plan.other is None else _seen_on(plan.other, plan, extent)
+    # Nodata is 0 once enhanced: rivals there are weak, as with the masked NCC that a flight uses.
+    region = prepared.cut(_window(plan, middle), level)
+    scores = surface(region.search, _templates(gray, noise, plan.options.ncc, other))
+    x, y = x0 - region.window.x0, y0 - region.window.y0
+    own, rivals = _own_and_rivals(scores, x, y, plan.exclusion_px)
+    leads = own - rivals
+    sigma = score_sigma(height * width)
+    changed = slice(2, 2 + _DRAWS)
+    values = [
+        _texture(gray),
+        rivals[0],
+        own[1],
+        _sharpness(scores[0], x, y),
+        own[changed].mean() / sigma,
+        leads[changed].mean() / sigma,
+        *([np.nan] * 2 if other is None else [own[-1] / sigma, leads[-1] / sigma]),
+    ]
+    return SelfMatchStatistics(*[np.array(value, np.float64) for value in values])
+
+
+def _window(plan: AuditPlan, middle_px: Array) -> Window:
+    """The adaptive window (eq. 4, 5) with the slack of the prior, in pixels of the level."""
+    site, level, (height, width) = plan.site, plan.level, plan.shape
+    rows, columns = site.level_shape(level)
+    slack = 2.0 * SPREAD_SIGMAS * plan.options.prior_sigma_m / (site.gsd_m_per_px * 2.0**level)
+    size = window_size_px(plan.view.footprint_px, (0.0, 0.0), margin=plan.options.ncc.margin)
+    size = (max(size[0], width + 4 + slack), max(size[1], height + 4 + slack))
+    window = place_window((float(middle_px[0]), float(middle_px[1])), size, (columns, rows))
+    assert window is not None  # the cell is on the map
+    return window
+
+
+def _templates(gray: Gray, noise: Pictures, options: NccOptions, other: Gray | None) -> Pictures:
+    """(T, h, w) enhanced: the patch unchanged, shaken, changed (draws), and that of another date."""
+
+    def enhanced(picture: Gray) -> Pictures:
+        return enhance(picture, radius_px=options.enhance_radius_px, score=options.score)
+
+    part = _SHAKE_PX / (max(gray.shape) / 2.0)
+    shaken = cv2.GaussianBlur(_perturbed(gray, math.degrees(part), 1.0 + part, 0.0), (0, 0), _SHAKE_BLUR_PX)
+    templates = [enhanced(gray), enhanced(np.asarray(shaken, np.uint8))]
+    for sign, (sensor, ground) in zip((1.0, -1.0), noise, strict=True):
+        turned = _perturbed(gray, sign * _TURN_DEG, _SCALE**sign, sign * _SHIFT_PX)
+        seen = np.clip(turned + sensor, 0.0, 255.0).astype(np.uint8)
+        templates.append(enhanced(seen) + _CHANGE * ground)
+    if other is not None:
+        templates.append(enhanced(other))
+    return np.stack(templates)
+
+
+def _perturbed(gray: Gray, angle_deg: float, scale: float, shift_px: float) -> Gray:
+    """The picture rotated and scaled about its middle, and moved along its diagonal."""
+    height, width = gray.shape
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2.0, (height - 1) / 2.0), angle_deg, scale)
+    matrix[:, 2] += shift_px
+    return np.asarray(cv2.warpAffine(gray, matrix, (width, height), borderMode=cv2.BORDER_REFLECT_101), np.uint8)
+
+
+def _texture(gray: Gray) -> float:
+    smooth = cv2.GaussianBlur(gray, (3, 3), 0).astype(np.float32)
+    return float((smooth - cv2.blur(smooth, (17, 17))).std())
+
+
+def _own_and_rivals(scores: Pictures, x: int, y: int, exclusion_px: float) -> tuple[Array, Array]:
+    """The highest score (T,) at a position, and outside its exclusion zone (-1 where nothing is outside)."""
+    near = scores[:, max(0, y - _NEAR_PX) : y + _NEAR_PX + 1, max(0, x - _NEAR_PX) : x + _NEAR_PX + 1]
+    down, across = np.ogrid[-y : scores.shape[1] - y, -x : scores.shape[2] - x]
+    outside = down * down + across * across > max(exclusion_px, _NEAR_PX) ** 2
+    rivals = np.where(outside, scores, -1.0).max(axis=(1, 2))
+    return near.max(axis=(1, 2)).astype(np.float64), rivals.astype(np.float64)
+
+
+def _sharpness(scores: Pictures, x: int, y: int) -> float:
+    """Curvature of the score along the flattest direction, negated; 0 at the edge of the surface."""
+    r = min(2, x, y, scores.shape[1] - 1 - x, scores.shape[0] - 1 - y)
+    if r <= 0:
+        return 0.0
+    curvature = fit_summit(scores[y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))[2]
+    return max(0.0, float(-np.linalg.eigvalsh(curvature)[-1]))
+
+
+def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:
+    """The same ground (h, w) on another map, or None where that does not cover it."""
+    (height, width), scale = plan.shape, 2.0**plan.level
+    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
+    full = plan.site.full_from_level(corners + np.array([extent.x0, extent.y0]), plan.level)
+    there = other.pixel_from_geodetic(*plan.site.geodetic_from_pixel(full))
+    level = level_for(other.gsd_m_per_px, plan.site.gsd_m_per_px * scale, other.levels)
+    there = other.level_from_full(there, level)
+    low, high = np.floor(there.min(axis=0)).astype(int) - 1, np.ceil(there.max(axis=0)).astype(int) + 2
+    rows, columns = other.level_shape(level)
+    if low.min() < 0 or high[0] > columns or high[1] > rows:
+        return None
+    window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+    if not other.fully_valid and other.valid(window, level).mean() < plan.options.ncc.min_valid_share:
+        return None
+    matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), (there - low).astype(np.float32))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpPerspective(other.gray(window, level), matrix, (width, height), flags=flags), np.uint8
+    )

@@ -1,0 +1,153 @@
+"""Sightings: poses that pictures show by themselves, without any telemetry."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.geo import wrap_heading_deg
+from engine.matching.matcher import SceneMatcher
+from engine.options import MatcherOptions
+from engine.orthomap import OrthoMap
+from engine.values import Attitude, Fix, Frame, Prior
+
+Array = NDArray[np.float64]
+
+_ENOUGH_SHARE = 0.25  # of the pictures; with fewer the search goes on
+_LEAST = 4
+_PROBED = 5  # pictures by which a change is tried
+_HEIGHT_FACTORS = (1.0, 0.88, 1.14, 0.77, 1.3)
+_MOST_S = 15.0  # that the search for height and turn may take
+_TURNS_DEG = (0, 8, -8, 16, -16, 24, -24, 32, -32, 40, -40)
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """The pose of one picture.
+
+    Attributes:
+        index: of the picture.
+        attitude: of the body, by the calibration's mount.
+        height_agl_m: above the ground below.
+        en_m: (2,) east and north.
+    """
+
+    index: int
+    attitude: Attitude
+    height_agl_m: float
+    en_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What the pictures showed.
+
+    Attributes:
+        sightings: in the order of the pictures.
+        mirrored: whether they were seen in mirrored pictures only.
+    """
+
+    sightings: list[Sighting]
+    mirrored: bool
+
+
+def sight(frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMap, camera: Camera) -> Seen:
+    """The poses of pictures by their features alone, else by correlation over headings and heights.
+
+    Args:
+        frames: a few, from all over the flight.
+        priors: where each may be; None is anywhere on the map.
+        site: the map.
+        camera: the calibration.
+    """
+    features = SceneMatcher(site, camera, "sift", "cpu", MatcherOptions())
+    found = _by_features(features, frames, priors)
+    if _is_enough(found, frames):
+        return Seen(found, mirrored=False)
+    mirrored = [_mirrored(frame) for frame in frames]
+    there = _by_features(features, mirrored, priors)
+    if _is_enough(there, frames):
+        return Seen(there, mirrored=True)
+    correlation = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions())
+    correlated = _by_correlation(correlation, frames, priors)
+    if _is_enough(correlated, frames):
+        return Seen(correlated, mirrored=False)
+    reflected = _by_correlation(correlation, mirrored, priors)
+    if _is_enough(reflected, frames):
+        return Seen(reflected, mirrored=True)
+    return Seen(max((found, correlated), key=len), mirrored=False)
+
+
+def _is_enough(found: Sequence[Sighting], frames: Sequence[Frame]) -> bool:
+    return len(found) >= max(min(_LEAST, len(frames)), _ENOUGH_SHARE * len(frames))
+
+
+def _mirrored(frame: Frame) -> Frame:
+    image = frame.image
+    flipped = np.ascontiguousarray(image[:, ::-1]) if isinstance(image, np.ndarray) else image.flip(1)
+    return replace(frame, image=flipped)
+
+
+def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]) -> list[Sighting]:
+    out = []
+    for index, result in enumerate(matcher.locate_many([Frame(frame.image) for frame in frames], priors)):
+        if isinstance(result, Fix) and (found := _sighting(index, result, matcher.site)) is not None:
+            out.append(found)
+    return out
+
+
+def _by_correlation(
+    matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]
+) -> list[Sighting]:
+    """By the height and the turn with which most of a few pictures are found, refined to a whole pose."""
+    if not matcher.site.has_surface:  # refinement needs one
+        return []
+    usable = [
+        k for k, frame in enumerate(frames) if frame.height_agl_m is not None and frame.heading_deg is not None
+    ]
+    usable = [k for k in usable if priors[k] is not None]  # of the whole map each would be a search of its own
+    probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
+    best: tuple[int, float, float] = (0, 1.0, 0.0)
+    until_s = time.monotonic() + _MOST_S
+    for factor, turn_deg in product(_HEIGHT_FACTORS, _TURNS_DEG):
+        hits = 0
+        for k in probed:
+            result = matcher.locate(_changed(frames[k], factor, turn_deg), priors[k])
+            hits += isinstance(result, Fix) and result.stage == "refined"
+        best = max(best, (hits, factor, float(turn_deg)), key=lambda row: row[0])
+        if 2 * best[0] > len(probed) or time.monotonic() > until_s:
+            break
+    if best[0] < 2:
+        return []
+    changed = [_changed(frames[k], *best[1:]) for k in usable]
+    out = []
+    for k, result in zip(usable, matcher.locate_many(changed, [priors[k] for k in usable]), strict=True):
+        if isinstance(result, Fix) and (found := _sighting(k, result, matcher.site)) is not None:
+            out.append(found)
+    return out
+
+
+def _changed(frame: Frame, height_factor: float, turn_deg: float) -> Frame:
+    assert frame.height_agl_m is not None
+    assert frame.heading_deg is not None
+    return replace(
+        frame,
+        height_agl_m=frame.height_agl_m * height_factor,
+        heading_deg=wrap_heading_deg(frame.heading_deg + turn_deg),
+        height_sigma_m=0.05 * frame.height_agl_m,
+        heading_sigma_deg=4.0,
+    )
+
+
+def _sighting(index: int, fix: Fix, site: OrthoMap) -> Sighting | None:
+    """Of a fix that measured its whole pose."""
+    if fix.attitude is None or fix.up_m is None:
+        return None
+    height_m = fix.up_m - site.ground_at(np.array(fix.map_xy_px))
+    return Sighting(index, fix.attitude, height_m, np.array([fix.east_m, fix.north_m])) if height_m > 0 else None

@@ -1,0 +1,6 @@
+"""``python -m scenematch.cli`` is ``scenematch``."""
+
+from scenematch.cli import main
+
+if __name__ == "__main__":  # a process that is spawned imports this file under another name
+    main()

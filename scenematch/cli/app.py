@@ -1,0 +1,152 @@
+"""The typer application: its commands by name, and how their errors end."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import cache
+from typing import Annotated, Any
+
+import typer
+from typer.main import get_command
+
+from engine.errors import EngineError, OptionError
+from scenematch.cli import console
+from scenematch.cli.argument_names import (
+    Command,
+    argument_of,
+    error_as_typed,
+    ros_arguments_last,
+    typed_name,
+    urls_as_typed,
+)
+from scenematch.cli.commands import (
+    bag,
+    bridge,
+    campaign,
+    check,
+    compare,
+    dataset,
+    demo,
+    doctor,
+    evaluate,
+    export,
+    init,
+    locate,
+    report,
+    simulate,
+    track,
+)
+from scenematch.cli.commands import map as map_commands
+
+app = typer.Typer(
+    name="scenematch",
+    help="Position fixes for a drone without GNSS: a downward camera matched against a georeferenced map.",
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},  # commands inherit it
+)
+map_app = typer.Typer(help="A map: facts, audit, fetching.")
+dataset_app = typer.Typer(help="Published data sets.")
+bridge_app = typer.Typer(help="Live, beside an autopilot.")
+
+# In the order of the help.
+app.command(cls=Command)(demo.demo)
+app.command(cls=Command)(check.check)
+app.command(cls=Command)(track.track)
+app.command(cls=Command)(compare.compare)
+app.command(cls=Command)(campaign.campaign)
+app.command(cls=Command)(init.init)
+app.command(cls=Command)(locate.locate)
+app.command(cls=Command)(simulate.simulate)
+app.command(cls=Command)(evaluate.evaluate)
+app.command(cls=Command)(report.report)
+app.command(cls=Command)(export.export)
+app.command(cls=Command)(bag.bag)
+app.command(cls=Command)(doctor.doctor)
+map_app.command("info", cls=Command)(map_commands.info)
+map_app.command("audit", cls=Command)(map_commands.audit)
+map_app.command("fetch", cls=Command)(map_commands.fetch)
+dataset_app.command("import", cls=Command)(dataset.import_dataset)
+dataset_app.command("check", cls=Command)(dataset.check)
+bridge_app.command("mavlink", cls=Command)(bridge.mavlink)
+bridge_app.command("mavlink-params", cls=Command)(bridge.mavlink_params)
+bridge_app.command("camera-delay", cls=Command)(bridge.camera_delay)
+bridge_app.command("ros", cls=Command)(bridge.ros)
+app.add_typer(map_app, name="map")
+app.add_typer(dataset_app, name="dataset")
+app.add_typer(bridge_app, name="bridge")
+
+# typer brings its own copy of click, or depends on click: what it raises is found by descent, not by import.
+_UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
+INTERRUPTED = 130
+
+
+@cache
+def command() -> Any:
+    """All commands as one, built once a process: reading their signatures takes a tenth of a second."""
+    return get_command(app)
+
+
+def run(arguments: list[str]) -> int:
+    """Run the command line and return its exit code.
+
+    What is wrong is one line on standard error and, with --json, an object on standard output as well.
+    """
+    given = arguments
+    if arguments[:2] == ["bridge", "ros"]:
+        arguments = [*arguments[:2], *ros_arguments_last(arguments[2:])]
+    try:
+        result = command().main(args=arguments or ["--help"], prog_name="scenematch", standalone_mode=False)
+    except _UsageError as error:
+        return _fail(_usage(error), 2, given, _usage_argument(error))
+    except EngineError as error:
+        text = error_as_typed(error)
+        return _fail(text, 2 if isinstance(error, OptionError) else 1, given, argument_of(text))
+    except OSError as error:
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        return _fail(text, 1, given, argument_of(text))
+    except (KeyboardInterrupt, typer.Abort):
+        result = INTERRUPTED
+    if result == INTERRUPTED:
+        return _fail("interrupted", INTERRUPTED, given)
+    if not arguments:
+        return 2
+    return result if isinstance(result, int) else 0
+
+
+def _usage(error: Any) -> str:
+    """What was wrong with the command line, and where help is."""
+    where = error.ctx.command_path if error.ctx is not None else "scenematch"
+    return f"{error.format_message().rstrip('.')} (see {where} --help)"
+
+
+def _usage_argument(error: Any) -> str | None:
+    """The argument that is wrong, missing or unknown; None where it is something else."""
+    parameter = getattr(error, "param", None)
+    return getattr(error, "option_name", None) if parameter is None else typed_name(parameter)
+
+
+def _fail(text: str, code: int, given: list[str], argument: str | None = None) -> int:
+    text = urls_as_typed(text, given)
+    console.say(f"scenematch: {text}")
+    if "--json" in given:
+        with suppress(OSError):  # standard output may be what failed
+            console.print_json({"error": text, "argument": argument})
+    return code
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(version("scenematch-engine"))
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Options before the command."""

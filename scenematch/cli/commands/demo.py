@@ -1,0 +1,43 @@
+"""The command `demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenematch.cli import console, tables
+from scenematch.cli.options import DeviceOption, ForceOption, JsonOption, ThreadsOption, use_threads
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Report folder.")] = Path("demo-report"),
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=2, metavar="N", help="Fly only the first N frames.")
+    ] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
+    ] = 1,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Built-in flight, both methods, Table I.
+
+    Draws a town and the paper's flight over it, follows it with NCC and SIFT, each in the paper's own recipe
+    and as this engine does it, and prints the paper's Table I beside the results. Needs no data.
+    """
+    from scenematch.runs.demo import run_demo
+
+    use_threads(threads)
+    results = run_demo(out, frames=frames, seed=seed, device=device, force=force, progress=console.PROGRESS)
+    if as_json:
+        console.print_json(results)
+    else:
+        tables.print_paper_table(results, seed)
+    console.say(f"report: {out.resolve()}")
+    console.next_step(
+        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-scenematch/report.html"
+    )

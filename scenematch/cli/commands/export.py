@@ -1,0 +1,38 @@
+"""The command `export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenematch.cli import console
+from scenematch.cli.options import JsonOption
+
+
+def export(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
+    kind: Annotated[str, typer.Option("--format", metavar="gpx|geojson|kml|tum|nmea", help="What is written.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Without it track.FORMAT in the folder.")
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", metavar="FILE", help="Write this at the fixes' moments instead, to compare with."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A finished track as GPX, GeoJSON, KML, TUM, NMEA.
+
+    Refused frames leave gaps. Times of day are written where the frames' stamps are UTC.
+    """
+    from scenematch.runs.track_export import export_track
+
+    facts = export_track(directory, kind, out, truth=truth, force=force)
+    console.facts(facts, as_json, title=f"track in {directory}")
+    if kind == "tum" and truth is None:
+        console.next_step(f"export {console.quoted(directory)} --format tum --truth TRUTH", as_json=as_json)
+    else:
+        console.next_step(f"report {console.quoted(directory)} OTHER_RUN", as_json=as_json)

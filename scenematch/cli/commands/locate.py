@@ -1,0 +1,119 @@
+"""The command `locate`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from scenematch.cli import console
+from scenematch.cli.options import (
+    CameraPitchOption,
+    DeviceOption,
+    HfovOption,
+    JsonOption,
+    MapBoundsOption,
+    MapCrsOption,
+    MapOption,
+    MapSigmaOption,
+    MethodOption,
+    MountOption,
+    OptionalCameraOption,
+    ScaleCalibrationOption,
+    SurfaceOption,
+    ThreadsOption,
+    WeightsOption,
+    use_threads,
+)
+
+if TYPE_CHECKING:
+    from engine.values import Fix, NoFix
+
+
+def locate(
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
+    map_path: MapOption,
+    camera: OptionalCameraOption = None,
+    hfov_deg: HfovOption = None,
+    mount: MountOption = None,
+    camera_pitch_deg: CameraPitchOption = None,
+    scale_calibration: ScaleCalibrationOption = False,
+    surface: SurfaceOption = None,
+    map_sigma_m: MapSigmaOption = None,
+    map_bounds: MapBoundsOption = None,
+    map_crs: MapCrsOption = None,
+    height_agl_m: Annotated[
+        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground.")
+    ] = None,
+    heading_deg: Annotated[
+        float | None, typer.Option("--heading", metavar="DEG", help="Degrees clockwise from true north.")
+    ] = None,
+    roll_deg: Annotated[
+        float | None, typer.Option("--roll", metavar="DEG", help="Degrees, right side down.")
+    ] = None,
+    pitch_deg: Annotated[float | None, typer.Option("--pitch", metavar="DEG", help="Degrees, nose up.")] = None,
+    near: Annotated[
+        str | None,
+        typer.Option("--near", metavar="LAT,LON[,SIGMA_M]", help="Search here; without it the whole map."),
+    ] = None,
+    method: MethodOption = "auto",
+    weights: WeightsOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Find one picture on the map.
+
+    Prints a fix and exits with 0, or prints why there is none and exits with 1.
+    """
+    from engine.values import Fix
+    from scenematch.runs.single_image import locate_image
+
+    use_threads(threads)
+    result = locate_image(
+        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
+        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
+        scale_calibration=scale_calibration, height_agl_m=height_agl_m,
+        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
+        weights=weights or (), device=device, progress=console.PROGRESS,
+    )  # fmt: skip
+    facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
+    facts["latency_ms"] = result.timings.total_ms
+    console.facts(facts, as_json, title=str(image))
+    if isinstance(result, Fix):
+        console.next_step(f"track {console.options(map=map_path)} --frames FRAMES --out out", as_json=as_json)
+    else:
+        console.next_step(f"map info {console.quoted(map_path)}", as_json=as_json)
+    raise typer.Exit(0 if isinstance(result, Fix) else 1)
+
+
+def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:
+    facts = {
+        "status": "fix",
+        "lat_deg": fix.lat_deg,
+        "lon_deg": fix.lon_deg,
+        "east_m": fix.east_m,
+        "north_m": fix.north_m,
+        "up_m": fix.up_m,
+        "sigma_m": fix.sigma_m,
+        "score": fix.score,
+        "method": fix.method,
+        "map_xy_px": list(fix.map_xy_px),
+    }
+    if as_json:
+        facts["covariance_m2"] = fix.covariance_m2.tolist()
+        facts["attitude"] = None if fix.attitude is None else asdict(fix.attitude)
+        facts["attitude_sigma_deg"] = None if fix.attitude_sigma_deg is None else list(fix.attitude_sigma_deg)
+    return facts
+
+
+def _no_fix_facts(refusal: NoFix) -> dict[str, Any]:
+    return {
+        "status": "no_fix",
+        "reason": refusal.reason.value,
+        "detail": refusal.detail,
+        "score": refusal.score,
+        "method": refusal.method,
+    }

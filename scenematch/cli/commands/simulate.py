@@ -1,0 +1,126 @@
+"""The command `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from engine.errors import OptionError
+from scenematch.cli import console
+from scenematch.cli.options import (
+    ForceOption,
+    JsonOption,
+    RerunConnectOption,
+    RerunOption,
+    SurfaceOption,
+    ThreadsOption,
+    use_threads,
+)
+
+if TYPE_CHECKING:
+    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.simulation import WorldSettings
+
+_FLIGHT = {
+    "map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
+    "telemetry": "telemetry.csv",
+}  # fmt: skip
+
+
+def simulate(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Flight folder, created by this run.")],
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
+    ] = 1,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=1, metavar="N", help="Fly only the first N frames.")
+    ] = None,
+    condition: Annotated[
+        str | None,
+        typer.Option(
+            "--condition", metavar="NAME", help="Light, season and air of the frames; noon unless given."
+        ),
+    ] = None,
+    relief_m: Annotated[float, typer.Option("--relief-m", metavar="H", help="Height of a town's hills.")] = 0.0,
+    map_path: Annotated[
+        Path | None, typer.Option("--map", metavar="FILE", help="Your own map as the world, in place of a town.")
+    ] = None,
+    surface: SurfaceOption = None,
+    camera_pitch_deg: Annotated[
+        float,
+        typer.Option(
+            "--camera-pitch-deg", metavar="P", help="Of the camera, as a gimbal's: -90 straight down, -45 oblique."
+        ),
+    ] = -90.0,
+    closed_loop: Annotated[
+        bool, typer.Option("--closed-loop", help="Fly by the engine's fixes, with GPS off.")
+    ] = False,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", metavar="M", help="With --closed-loop: how long; 5 unless given.")
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option("--method", metavar="auto|ncc|sift", help="With --closed-loop; auto unless given."),
+    ] = None,
+    fault: Annotated[
+        str | None,
+        typer.Option("--fault", metavar="none|killed|shifted|frozen", help="With --closed-loop: what goes wrong."),
+    ] = None,
+    recording: RerunOption = None,
+    viewer: RerunConnectOption = None,
+    device: Annotated[
+        str | None,
+        typer.Option("--device", metavar="auto|cpu|cuda", help="With --closed-loop: where tensors live."),
+    ] = None,
+    threads: ThreadsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A simulated flight with its truth.
+
+    Writes a flight folder that track reads. With --closed-loop the vehicle steers by the engine's fixes, and the
+    folder holds its track, estimate, figures and summary too.
+    """
+    from scenematch.runs.arguments import check_unused
+    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.simulation import WorldSettings
+    from scenematch.runs.simulation import simulate as simulate_flight
+
+    use_threads(threads)
+    world = WorldSettings(
+        seed=seed,
+        condition=condition,
+        relief_m=relief_m,
+        map=map_path,
+        surface=surface,
+        camera_pitch_deg=camera_pitch_deg,
+    )
+    loop = {"minutes": minutes, "method": method, "fault": fault, "device": device}
+    if not closed_loop:
+        check_unused(loop | {"recording": recording, "viewer": viewer}, "closed_loop")
+        facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
+    elif frames is not None:
+        raise OptionError("frames: expected without `closed_loop`, which has `minutes`")
+    else:
+        facts = _fly_closed_loop(out, world, loop, LiveViewTarget(recording, viewer), force)
+    console.facts(facts, as_json, title=f"simulated flight {seed}")
+    flight = {name: out / file for name, file in _FLIGHT.items()}
+    if not closed_loop:
+        console.next_step(f"track {console.options(**flight, out=f'{out}-track')}", as_json=as_json)
+        return
+    shown = f"export {console.quoted(out)} --format geojson"
+    following = shown if facts["availability"] else f"check {console.options(**flight)}"
+    console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
+
+
+def _fly_closed_loop(
+    out: Path, world: WorldSettings, loop: Mapping[str, Any], live_view: LiveViewTarget, force: bool
+) -> dict[str, Any]:
+    """The figures of a flight by the engine's fixes; what is None of the loop's settings is its default."""
+    from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
+
+    settings = ClosedLoopSettings(**{name: value for name, value in loop.items() if value is not None})
+    return fly_closed_loop(out, world, settings, force=force, live_view=live_view, progress=console.PROGRESS)

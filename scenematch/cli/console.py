@@ -1,0 +1,167 @@
+"""How results look: tables for people on a terminal, JSON for programs. Everything but results goes to stderr.
+
+rich is imported by what draws with it: neither help nor a pipe of JSON does.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from scenematch.cli.argument_names import as_typed
+from scenematch.runs.progress import Progress
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bars
+    from rich.table import Table
+
+_DRAWN_EVERY_S = 0.1
+_PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
+
+
+def say(text: str) -> None:
+    """One line for a person, on standard error; never folded."""
+    line = " ".join(part.strip() for part in text.splitlines())  # spaces stay: they may be those of a path
+    print(line.strip(), file=sys.stderr, flush=True)
+
+
+def next_step(command: str, *, as_json: bool = False, hint: str = "") -> None:
+    """What a person may do next: one command, on standard error, and never where a program reads.
+
+    Args:
+        command: without the program's name; what the user has yet to choose is in capitals.
+        as_json: whether the results went to a program.
+        hint: what is to be done before it, such as a file to open.
+    """
+    if not as_json:
+        say(f"next: {f'{hint}; ' if hint else ''}scenematch {command}")
+
+
+def quoted(value: object) -> str:
+    """A value as a shell takes it for one word."""
+    return shlex.quote(str(value))
+
+
+def options(**values: object) -> str:
+    """Options with their values as they are typed, those that are None left out: ``log_offset_s=2``."""
+    given = ((name, value) for name, value in values.items() if value is not None)
+    return " ".join(f"--{name.replace('_', '-')} {quoted(value)}" for name, value in given)
+
+
+@cache
+def _errors() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+class _ConsoleProgress(Progress):
+    """Messages on standard error, and on a terminal a bar for each task."""
+
+    def __init__(self) -> None:
+        self._bars: dict[str, Bars] = {}
+        self._drawn_s = -math.inf
+
+    def message(self, text: str) -> None:
+        say(as_typed(text))
+
+    def update(self, description: str, done: int, total: int) -> None:
+        if not _errors().is_terminal:
+            return
+        bars = self._bars.get(description)
+        if bars is None:
+            from rich.progress import Progress as Bars
+
+            # Without a thread that draws: beside other threads no workers are forked (engine.runtime.workers).
+            bars = self._bars[description] = Bars(console=_errors(), transient=True, auto_refresh=False)
+            bars.add_task(description)
+            bars.start()
+        is_due = time.monotonic() - self._drawn_s > _DRAWN_EVERY_S
+        if is_due:
+            self._drawn_s = time.monotonic()
+        bars.update(bars.task_ids[0], completed=done, total=total, refresh=is_due)
+
+    def finish(self, description: str) -> None:
+        bars = self._bars.pop(description, None)
+        if bars is not None:
+            bars.stop()
+
+
+PROGRESS = _ConsoleProgress()
+"""What runs report to. A task that is never updated shows nothing, as all of them do in a pipe."""
+
+
+def print_json(value: Any) -> None:
+    """Machine-readable results on standard output."""
+    json.dump(value, sys.stdout, indent=2)
+    sys.stdout.write("\n")
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """A titled table for people on standard output; the first column is words, the others are figures."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="")
+    for index, name in enumerate(columns):
+        table.add_column(name, justify="left" if index == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    _print(title, table)
+
+
+def print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:
+    """Names and values for people on standard output, one a line; a long value is folded under itself."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in pairs:
+        table.add_row(Text(name), Text(value))
+    _print(title, table)
+
+
+def _print(title: str, table: Table) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(Text(title, style="bold"), soft_wrap=True)
+        console.print(table)
+        return
+    wide = Console(highlight=False, width=_PIPE_WIDTH)
+    with wide.capture() as capture:
+        wide.print(table)
+    lines = (line.rstrip() for line in capture.get().splitlines())
+    print(title, *lines, sep="\n")
+
+
+def facts(values: Mapping[str, Any], as_json: bool, title: str) -> None:
+    """Names and values, one a line."""
+    if as_json:
+        print_json(values)
+    else:
+        print_pairs(title, ((name, _text(value, name)) for name, value in values.items()))
+
+
+def _text(value: Any, name: str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):  # of a latitude, 7 decimals are a centimetre
+        return f"{value:.7f}" if name.endswith(("lat_deg", "lon_deg", "bounds_deg")) else f"{value:.6g}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_text(item, name) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_text(item, name)}" for key, item in value.items()) or "none"
+    return "-" if value is None else str(value)

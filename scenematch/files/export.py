@@ -1,0 +1,318 @@
+"""A finished track in the formats of other programs: GPX, GeoJSON, KML, TUM and NMEA.
+
+Convention:
+    GPX and NMEA define a height as one above the sea: they have none where that of the track is in another datum.
+    TUM and GeoJSON have the track's own heights, in the datum of the surface model.
+    A refused frame, and a crossing of the 180th meridian, end a segment. Stamps from September 2001 on are UTC;
+    earlier ones count from the start of the vehicle, and such a track is written without times of day.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime, timedelta
+from functools import reduce
+from operator import xor
+from xml.sax.saxutils import escape
+
+from engine.errors import TelemetryError
+from scenematch.files.notes import FrameNote
+from scenematch.files.resampling import UTC_FROM_NS
+from scenematch.files.ros.messages import quaternion_xyzw
+from scenematch.files.tables import cell_text
+from scenematch.files.track import TrackRow
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseRow(TrackRow):
+    """A row of a track with the rest of the pose; what is unknown is None.
+
+    Attributes:
+        alt_amsl_m: height above mean sea level.
+        sigma_up_m: standard deviation of the height.
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+        heading_deg: clockwise from true north.
+        roll_sigma_deg: standard deviation of the roll.
+        pitch_sigma_deg: of the pitch.
+        heading_sigma_deg: of the heading.
+    """
+
+    alt_amsl_m: float | None = None
+    sigma_up_m: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    heading_deg: float | None = None
+    roll_sigma_deg: float | None = None
+    pitch_sigma_deg: float | None = None
+    heading_sigma_deg: float | None = None
+
+    @property
+    def angles_deg(self) -> tuple[float, float, float] | None:
+        """Roll, pitch and heading, or None where one is unknown."""
+        if self.roll_deg is None or self.pitch_deg is None or self.heading_deg is None:
+            return None
+        return self.roll_deg, self.pitch_deg, self.heading_deg
+
+
+Segment = list[PoseRow]
+_ANGLES = ("roll_deg", "pitch_deg", "heading_deg", "roll_sigma_deg", "pitch_sigma_deg", "heading_sigma_deg")
+_NOTED = ("sigma_up_m", *_ANGLES)
+
+
+def pose_rows(
+    rows: Iterable[TrackRow], notes: Sequence[FrameNote] | None = None, *, is_amsl: bool = False
+) -> list[PoseRow]:
+    """The rows of a track with the rest of their poses.
+
+    Args:
+        rows: of track.csv.
+        notes: of notes.csv; those of frames that the track lacks do not count.
+        is_amsl: whether the heights of the track are above mean sea level.
+    """
+    by_frame = {note.frame: note for note in notes or ()}
+    found = []
+    for row in rows:
+        note = by_frame.get(row.frame) if row.fixed else None
+        more = {} if note is None else {name: getattr(note, name) for name in _NOTED}
+        known = {each.name: getattr(row, each.name) for each in fields(TrackRow)}
+        found.append(PoseRow(**known, **more, alt_amsl_m=row.up_m if is_amsl else None))
+    return found
+
+
+def segments(rows: Iterable[PoseRow]) -> list[Segment]:
+    """Split a track into uninterrupted sequences of fixes."""
+    found: list[Segment] = []
+    previous: PoseRow | None = None
+    for row in rows:
+        if row.fixed:
+            if previous is None or abs(_lon_deg(row) - _lon_deg(previous)) > 180.0:
+                found.append([])
+            found[-1].append(row)
+        previous = row if row.fixed else None
+    return found
+
+
+def to_gpx(rows: Sequence[PoseRow]) -> str:
+    """The track as GPX 1.1: one ``trkseg`` per segment; elevations where they are known above the sea."""
+    parts = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<gpx version="1.1" creator="scenematch" xmlns="http://www.topografix.com/GPX/1/1">',
+        "<trk><name>scenematch</name>",
+    ]
+    for segment in segments(rows):
+        parts += ["<trkseg>", *map(_gpx_point, segment), "</trkseg>"]
+    return "\n".join([*parts, "</trk>", "</gpx>", ""])
+
+
+def _gpx_point(row: PoseRow) -> str:
+    time = _utc(row)
+    # The schema prescribes the order elevation, time, name.
+    elements = [
+        "" if row.alt_amsl_m is None else f"<ele>{row.alt_amsl_m:.3f}</ele>",
+        "" if time is None else f"<time>{_iso(time)}</time>",
+        f"<name>{escape(row.frame)}</name>",
+    ]
+    return f'<trkpt lat="{row.lat_deg:.9f}" lon="{_lon_deg(row):.9f}">{"".join(elements)}</trkpt>'
+
+
+def to_geojson(rows: Sequence[PoseRow]) -> str:
+    """The track as GeoJSON: a MultiLineString, and each fix as a Point with its pose and sigmas."""
+    parts = segments(rows)
+    lines = [[_lon_lat(row) for row in part] for part in parts if len(part) > 1]
+    features: list[dict[str, object]] = []
+    if lines:
+        features.append(_feature("MultiLineString", lines, {"name": "scenematch"}))
+    features += [_feature("Point", _lon_lat(row), _properties(row)) for part in parts for row in part]
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+
+
+def _lon_lat(row: PoseRow) -> list[float]:
+    assert row.lat_deg is not None
+    return [round(_lon_deg(row), 9), round(row.lat_deg, 9)]
+
+
+def _feature(kind: str, coordinates: object, properties: dict[str, object]) -> dict[str, object]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+
+
+def _properties(row: PoseRow) -> dict[str, object]:
+    time = _utc(row)
+    return {
+        "frame": row.frame,
+        "timestamp_ns": row.timestamp_ns,
+        "time": None if time is None else _iso(time),
+        "up_m": row.up_m,
+        "alt_amsl_m": row.alt_amsl_m,
+        **{name: getattr(row, name) for name in _ANGLES},
+        "sigma_east_m": row.sigma_east_m,
+        "sigma_north_m": row.sigma_north_m,
+        "sigma_up_m": row.sigma_up_m,
+        "covariance_en_m2": row.covariance_en_m2,
+        "method": row.method,
+        "score": row.score,
+    }
+
+
+def to_kml(rows: Sequence[PoseRow]) -> str:
+    """The track as KML 2.2: lines on the ground, and each fix as a placemark with its sigmas in metres."""
+    found = segments(rows)
+    lines = [segment for segment in found if len(segment) > 1]
+    parts = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<kml xmlns="http://www.opengis.net/kml/2.2">',
+        "<Document><name>scenematch</name>",
+    ]
+    if lines:
+        parts.append("<Placemark><name>track</name><MultiGeometry>")
+        parts += [
+            f"<LineString><tessellate>1</tessellate><coordinates>{' '.join(map(_kml_position, segment))}"
+            "</coordinates></LineString>"
+            for segment in lines
+        ]
+        parts.append("</MultiGeometry></Placemark>")
+    parts += [
+        "<Folder><name>fixes</name>",
+        *(_kml_point(row) for segment in found for row in segment),
+        "</Folder>",
+    ]
+    return "\n".join([*parts, "</Document>", "</kml>", ""])
+
+
+def _kml_position(row: PoseRow) -> str:
+    return f"{_lon_deg(row):.9f},{row.lat_deg:.9f}"
+
+
+def _kml_point(row: PoseRow) -> str:
+    time = _utc(row)
+    stamp = "" if time is None else f"<TimeStamp><when>{_iso(time)}</when></TimeStamp>"
+    description = ""  # the truth has no sigmas
+    if row.sigma_east_m is not None and row.sigma_north_m is not None:
+        sigmas = f"sigma east {row.sigma_east_m:.2f} m, north {row.sigma_north_m:.2f} m"
+        description = f"<description>{sigmas}</description>"
+    return (
+        f"<Placemark><name>{escape(row.frame)}</name>{description}{stamp}"
+        f"<Point><coordinates>{_kml_position(row)}</coordinates></Point></Placemark>"
+    )
+
+
+def to_tum(rows: Sequence[PoseRow]) -> str:
+    """The track as TUM, the format of evo: ``timestamp x y z qx qy qz qw`` in seconds and metres east, north, up.
+
+    The quaternion rotates the body (forward, left, up) to east, north, up, as in ROS. A program that reads TUM
+    takes each line for a whole pose, so that fixes without a height or without an attitude are left out beside
+    those with one (:func:`tum_rows`). Where no fix has one, all z are 0 or all quaternions unity, and the first
+    line says so.
+
+    Raises:
+        TelemetryError: a fix has no stamp.
+    """
+    kept = tum_rows(rows)
+    head = "# timestamp x y z qx qy qz qw: s, m east, north, up"
+    if all(row.up_m is None for row in kept):
+        head += "; no height is known, z is 0"
+    if all(row.angles_deg is None for row in kept):
+        head += "; attitude is not known, the quaternion is unity"
+    lines = [head]
+    for row in kept:
+        if row.timestamp_ns is None:
+            raise TelemetryError(
+                f"timestamp_ns: expected a stamp for the format tum, got none at frame {row.frame}"
+            )
+        sign, (seconds, rest_ns) = "-" * (row.timestamp_ns < 0), divmod(abs(row.timestamp_ns), 1_000_000_000)
+        position = " ".join(cell_text(value or 0.0, 4) for value in (row.east_m, row.north_m, row.up_m))
+        turn = (0.0, 0.0, 0.0, 1.0) if row.angles_deg is None else quaternion_xyzw(*row.angles_deg)
+        quaternion = " ".join(f"{round(value, 9) + 0.0:.9g}" for value in turn)  # without a negative zero
+        lines.append(f"{sign}{seconds}.{rest_ns:09d} {position} {quaternion}")
+    return "\n".join([*lines, ""])
+
+
+def tum_rows(rows: Sequence[PoseRow]) -> list[PoseRow]:
+    """The fixes that TUM holds: those with a height and an attitude, where any fix has one."""
+    kept = [row for segment in segments(rows) for row in segment]
+    if any(row.up_m is not None for row in kept):
+        kept = [row for row in kept if row.up_m is not None]
+    if any(row.angles_deg is not None for row in kept):
+        kept = [row for row in kept if row.angles_deg is not None]
+    return kept
+
+
+def to_nmea(rows: Sequence[PoseRow]) -> str:
+    """The track as NMEA 0183: GGA and RMC per frame; a refused frame is void, so that a reader sees the gap.
+
+    The number of satellites is 0 and the dilution of precision blank; the quality is 1, as programs expect of a
+    position. Time and date are blank where stamps are not UTC, the height where it is not known above the sea.
+    """
+    sentences = (sentence for row in rows for sentence in (_gga(row), _rmc(row)))
+    return "".join(f"{sentence}\r\n" for sentence in sentences)
+
+
+def _gga(row: PoseRow) -> str:
+    time, _ = _utc_fields(row)
+    height = "" if row.alt_amsl_m is None else f"{row.alt_amsl_m:.2f}"
+    unit = "M" if height else ""
+    return nmea_sentence(f"GPGGA,{time},{_nmea_position(row)},{int(row.fixed)},00,,{height},{unit},,,,")
+
+
+def _rmc(row: PoseRow) -> str:
+    time, date = _utc_fields(row)
+    status, mode = ("A", "A") if row.fixed else ("V", "N")
+    return nmea_sentence(f"GPRMC,{time},{status},{_nmea_position(row)},,,{date},,,{mode}")
+
+
+def nmea_sentence(body: str) -> str:
+    """An NMEA sentence: ``$``, the body, and the checksum, the exclusive or of the body's bytes."""
+    return f"${body}*{reduce(xor, body.encode('ascii'), 0):02X}"
+
+
+def degrees_minutes(value_deg: float, digits: int) -> str:
+    """Unsigned degrees in ``digits`` digits and minutes with 6 decimals (2 mm); minutes stay below 60."""
+    # Rounded before the split: 59.9999999 minutes become the next degree.
+    degrees, micro_minutes = divmod(round(abs(value_deg) * 60e6), 60_000_000)
+    minutes, rest = divmod(micro_minutes, 1_000_000)
+    return f"{degrees:0{digits}d}{minutes:02d}.{rest:06d}"
+
+
+def _nmea_position(row: PoseRow) -> str:
+    if row.lat_deg is None or not row.fixed:
+        return ",,,"
+    lon_deg = _lon_deg(row)
+    lat = f"{degrees_minutes(row.lat_deg, 2)},{'S' if row.lat_deg < 0 else 'N'}"
+    return f"{lat},{degrees_minutes(lon_deg, 3)},{'W' if lon_deg < 0 else 'E'}"
+
+
+def _utc_fields(row: PoseRow) -> tuple[str, str]:
+    """Time of day and date as NMEA writes them, both after rounding to a hundredth of a second."""
+    time = _utc(row)
+    if time is None:
+        return "", ""
+    time = time.replace(microsecond=0) + timedelta(microseconds=round(time.microsecond, -4))
+    return f"{time:%H%M%S}.{time.microsecond // 10_000:02d}", f"{time:%d%m%y}"
+
+
+def _lon_deg(row: PoseRow) -> float:
+    """Longitude in [-180, 180)."""
+    assert row.lon_deg is not None
+    return row.lon_deg if -180.0 <= row.lon_deg < 180.0 else (row.lon_deg + 180.0) % 360.0 - 180.0
+
+
+def _utc(row: PoseRow) -> datetime | None:
+    if row.timestamp_ns is None or row.timestamp_ns < UTC_FROM_NS:
+        return None
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=row.timestamp_ns // 1000)
+
+
+def _iso(time: datetime) -> str:
+    return f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond:06d}Z"
+
+
+WRITERS: dict[str, Callable[[Sequence[PoseRow]], str]] = {
+    "gpx": to_gpx,
+    "geojson": to_geojson,
+    "kml": to_kml,
+    "tum": to_tum,
+    "nmea": to_nmea,
+}
+"""Function that formats a track, by the name of the format."""

@@ -1,0 +1,294 @@
+"""A flight: its frames, read one at a time, with the telemetry of each; and the writer of a flight folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from engine.camera import Camera
+from engine.errors import TelemetryError
+from engine.geo import wrap_heading_deg
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.values import Frame, Prior, Truth
+from scenematch.files.frames import VIDEO_SUFFIXES, FrameSource, VideoFile, open_frames
+from scenematch.files.geotiff import write_geotiff
+from scenematch.files.logs.readers import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
+from scenematch.files.photos import photo_telemetry
+from scenematch.files.resampling import rows_and_sources_at
+from scenematch.files.ros.bags import BagFrames, is_bag
+from scenematch.files.telemetry import TelemetryRow, open_telemetry, write_telemetry
+from scenematch.files.truth import write_truth
+
+__all__ = ["Flight", "FlightFrame", "LogClock", "open_flight", "write_flight_folder"]
+
+_JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True, slots=True)
+class FlightFrame:
+    """One frame of a flight.
+
+    Attributes:
+        name: file name of the image, or its index in a video or bag.
+        frame: the image with its telemetry.
+        prior: the position in the telemetry with its sigma, or None.
+        telemetry: the whole row, or None where the flight has no telemetry.
+    """
+
+    name: str
+    frame: Frame
+    prior: Prior | None
+    telemetry: TelemetryRow | None
+
+
+@dataclass
+class Flight:
+    """Frames in the order of capture. Iterating reads one image at a time and may be repeated.
+
+    Attributes:
+        source: source of the images.
+        rows: the telemetry, one row per frame; empty where there is none.
+        height_sources: where a log or photographs were read, the source of each row's height, or empty.
+        names: names of the frames, in order.
+        unused: number of images without a row of telemetry.
+        has_gimbal: whether the attitude is that of a gimbal, and says by itself where the camera looks.
+        remarks: what is doubtful about the telemetry, a sentence each.
+    """
+
+    source: FrameSource
+    rows: list[TelemetryRow]
+    height_sources: Sequence[str] = ()
+    has_gimbal: bool = False
+    remarks: Sequence[str] = ()
+    names: list[str] = field(init=False)
+    unused: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.names = [row.frame for row in self.rows] or list(self.source.names)
+        self.unused = len(set(self.source.names) - set(self.names))
+
+    @property
+    def heights(self) -> dict[str, int]:
+        """The number of frames whose height comes from each source."""
+        return dict(Counter(source for source in self.height_sources if source))
+
+    def every(self, step: int) -> Flight:
+        """Every ``step``-th frame of these, from the first on, each with its own telemetry."""
+        part = replace(self, rows=self.rows[::step], height_sources=self.height_sources[::step])
+        part.names, part.unused = self.names[::step], self.unused
+        return part
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[FlightFrame]:
+        for index in range(len(self.names)):
+            yield self.read(index)
+
+    def read(self, index: int) -> FlightFrame:
+        """Read one frame; in a video or bag this is fast for ascending indices.
+
+        Raises:
+            TelemetryError: the image is missing or cannot be decoded.
+        """
+        name, row = self.names[index], self.rows[index] if self.rows else None
+        image = self.source.read(name)
+        if row is None:
+            return FlightFrame(name, Frame(image), None, None)
+        return FlightFrame(name, _frame(image, row), row.prior, row)
+
+
+def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
+    return Frame(
+        image,
+        timestamp_ns=row.timestamp_ns,
+        height_agl_m=row.height_agl_m,
+        heading_deg=row.heading_deg,
+        roll_deg=row.roll_deg,
+        pitch_deg=row.pitch_deg,
+        east_velocity_mps=row.east_velocity_mps,
+        north_velocity_mps=row.north_velocity_mps,
+        height_sigma_m=row.height_sigma_m,
+        heading_sigma_deg=row.heading_sigma_deg,
+        tilt_sigma_deg=row.tilt_sigma_deg,
+        velocity_sigma_mps=row.velocity_sigma_mps,
+    )
+
+
+def open_flight(
+    frames: str | Path,
+    telemetry: str | Path | None = None,
+    camera: Camera | None = None,
+    clock: LogClock = AS_LOGGED,
+    image_topic: str | None = None,
+    columns: Mapping[str, str] = {},
+    odometry_topic: str | None = None,
+) -> Flight:
+    """Open a flight and check up front that its parts belong together.
+
+    Args:
+        frames: a folder of images, a video, or a ROS bag.
+        telemetry: telemetry.csv, or a log (.BIN, .ulg, .SRT, a bag) that is interpolated at the frames' times.
+            None uses the bag's own telemetry, the .SRT beside a video, or the EXIF of photographs; without EXIF
+            times the images come in natural order and without telemetry.
+        camera: checked against the size of the first image.
+        clock: capture times of the frames, where the telemetry is a log.
+        image_topic: topic of a bag's images; None where there is only one.
+        columns: what a telemetry.csv calls a column, by its name in :data:`scenematch.files.telemetry.COLUMNS`.
+        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
+
+    Returns:
+        The flight; no image but the first has been read.
+
+    Raises:
+        TelemetryError: a file cannot be read, or a row names a frame that does not exist.
+        CalibrationError: the first image has another size than the calibration.
+    """
+    source = BagFrames(Path(frames), image_topic) if is_bag(frames) else open_frames(frames)
+    if telemetry is None and isinstance(source, BagFrames):
+        telemetry = frames
+    if telemetry is None:
+        telemetry = subtitles_beside(frames)
+    height_sources: list[str] = []
+    remarks: list[str] = []
+    of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"
+    if telemetry is not None and is_log(telemetry):
+        log = open_log(telemetry, odometry_topic)
+        rows, height_sources = rows_and_sources_at(log, *stamp_frames(source, log, clock))
+    elif telemetry is not None:
+        _check_is_table(Path(telemetry))
+        table = open_telemetry(telemetry, source, source.description, columns)
+        rows, remarks = table.rows, table.remarks
+    elif isinstance(source, VideoFile):
+        rows = []
+    else:
+        rows, remarks = photo_telemetry([source.path / name for name in source.names])
+        height_sources = ["" if row.height_agl_m is None else "take-off" for row in rows]
+    has_gimbal = of_gimbal and any(row.roll_deg is not None for row in rows)
+    flight = Flight(source, rows, height_sources, has_gimbal, remarks)
+    if camera is not None:
+        camera.check_size(source.read(flight.names[0]).shape)
+    return flight
+
+
+def _check_is_table(telemetry: Path) -> None:
+    """Metadata in a video is not read: no library for it is kept, light and made for every supported Python."""
+    if telemetry.suffix.lower() in (*VIDEO_SUFFIXES, ".klv", ".360"):
+        raise TelemetryError(
+            f"{telemetry}: expected a table or a flight log, got a video's metadata (MISB KLV, GoPro GPMF), "
+            "which is not read; convert it to a .SRT as docs/map-and-flight-files.md shows"
+        )
+
+
+def subtitles_beside(frames: str | Path) -> Path | None:
+    """The .SRT of a video's name beside it, as DJI writes it; None where there is none."""
+    path = Path(frames)
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        return None
+    beside = (path.with_suffix(suffix) for suffix in (".SRT", ".srt"))
+    return next((file for file in beside if file.is_file()), None)
+
+
+def write_flight_folder(
+    directory: str | Path,
+    *,
+    frames: Iterable[tuple[str, Frame]],
+    truth: Iterable[Truth],
+    camera: Camera,
+    ortho_rgb: NDArray[np.uint8],
+    pixel_to_crs: ArrayLike,
+    crs_epsg: int,
+    surface_m: NDArray[Any] | None = None,
+    start: Prior | None = None,
+    georeference_sigma_m: float | None = None,
+    slope_sigma_deg: float | None = None,
+) -> None:
+    """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
+
+    Args:
+        directory: the folder, created where it does not exist.
+        frames: file name (.jpg or .png) and stamped frame, consumed one at a time and before ``truth``.
+        truth: the true states, in the order of time.
+        camera: intrinsics and mount.
+        ortho_rgb: map, (H, W, 3) or grey (H, W), uint8.
+        pixel_to_crs: (2, 3) affine transform from the map's pixel centres (x, y, 1) to the CRS.
+        crs_epsg: EPSG code of the CRS.
+        surface_m: (H, W) heights in metres on the map's grid, or None.
+        start: prior in latitude and longitude for the first row of the telemetry.
+        georeference_sigma_m: georeferencing accuracy that map.tif states, or None.
+        slope_sigma_deg: slope accuracy that dsm.tif states, or None.
+
+    Raises:
+        TelemetryError: a frame has no stamp, or a file cannot be written.
+        MapError: map.tif or dsm.tif cannot be written.
+    """
+    directory = Path(directory)
+    (directory / "frames").mkdir(parents=True, exist_ok=True)
+    rows: list[TelemetryRow] = []
+    for name, frame in frames:
+        _write_image(directory / "frames" / name, frame)
+        rows.append(_telemetry_row(name, frame, start if not rows else None))
+    write_telemetry(directory / "telemetry.csv", rows)
+    write_truth(directory / "truth.csv", list(truth))
+    (directory / "camera.yaml").write_text(camera_info(camera), encoding="utf-8")
+    tags = {} if georeference_sigma_m is None else {GEOREFERENCE_TAG: georeference_sigma_m}
+    write_geotiff(directory / "map.tif", ortho_rgb, pixel_to_crs, crs_epsg, tags=tags)
+    if surface_m is not None:
+        tags = {} if slope_sigma_deg is None else {SLOPE_TAG: slope_sigma_deg}
+        heights_m = np.asarray(surface_m, np.float32)
+        write_geotiff(directory / "dsm.tif", heights_m, pixel_to_crs, crs_epsg, tags=tags)
+
+
+def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow:
+    if frame.timestamp_ns is None:
+        raise TelemetryError(f"{name}: timestamp_ns: expected a stamp to write into telemetry.csv, got None")
+    return TelemetryRow(
+        timestamp_ns=frame.timestamp_ns,
+        frame=name,
+        height_agl_m=frame.height_agl_m,
+        heading_deg=None if frame.heading_deg is None else wrap_heading_deg(frame.heading_deg),
+        roll_deg=frame.roll_deg,
+        pitch_deg=frame.pitch_deg,
+        east_velocity_mps=frame.east_velocity_mps,
+        north_velocity_mps=frame.north_velocity_mps,
+        height_sigma_m=frame.height_sigma_m,
+        heading_sigma_deg=frame.heading_sigma_deg,
+        tilt_sigma_deg=frame.tilt_sigma_deg,
+        velocity_sigma_mps=frame.velocity_sigma_mps,
+        lat_deg=prior.lat_deg if prior else None,
+        lon_deg=prior.lon_deg if prior else None,
+        sigma_m=prior.sigma_m if prior else None,
+    )
+
+
+def _write_image(path: Path, frame: Frame) -> None:
+    from PIL import Image
+
+    image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
+    try:
+        Image.fromarray(image).save(path, quality=_JPEG_QUALITY, subsampling=0)
+    except (OSError, ValueError) as error:
+        raise TelemetryError(f"{path}: cannot be written: {error}") from None
+
+
+def camera_info(camera: Camera) -> str:
+    """The text of camera.yaml: ROS camera_info and the mount."""
+
+    def block(name: str, rows: int, values: NDArray[np.float64]) -> str:
+        data = ", ".join(repr(float(value)) for value in values.ravel())
+        return f"{name}:\n  rows: {rows}\n  cols: {values.size // rows}\n  data: [{data}]\n"
+
+    return (
+        f"image_width: {camera.width_px}\nimage_height: {camera.height_px}\ncamera_name: nadir\n"
+        + block("camera_matrix", 3, camera.matrix)
+        + f"distortion_model: {camera.distortion_model}\n"
+        + block("distortion_coefficients", 1, camera.distortion)
+        + "# optical (x right, y down, z forward) to body (forward, right, down): v_body = mount * v_camera\n"
+        + block("mount", 3, camera.mount)
+    )

@@ -1,0 +1,115 @@
+"""notes.csv: details of each frame that track.csv lacks, so that a report can be drawn again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from engine.values import Fix, NoFix
+from scenematch.files.tables import cell_text, read_table, write_table
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameNote:
+    """One row of notes.csv; what is unknown is None. The fields are the columns, in their order.
+
+    Attributes:
+        frame: name of the frame.
+        state: state of the navigator after the frame, see :class:`engine.navigation.navigator.NavigatorState`.
+        window_x0_px: first column of the map window that was searched.
+        window_y0_px: first row of the map window that was searched.
+        heading_deg: heading of the match, clockwise from true north.
+        stage: last stage of the search that the budget allowed.
+        confidence: probability that the fix is correct.
+        detail: one sentence with figures on why the frame was refused.
+        sigma_up_m: standard deviation of the height, where it was measured.
+        roll_deg: of the whole pose, where that was measured; positive right side down.
+        pitch_deg: the same; positive nose up.
+        roll_sigma_deg: standard deviation of the roll, where it is known, as of the next two.
+        pitch_sigma_deg: of the pitch.
+        heading_sigma_deg: of the heading.
+    """
+
+    frame: str
+    state: str
+    window_x0_px: int | None = None
+    window_y0_px: int | None = None
+    heading_deg: float | None = None
+    stage: str | None = None
+    confidence: float | None = None
+    detail: str | None = None
+    sigma_up_m: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_sigma_deg: float | None = None
+    pitch_sigma_deg: float | None = None
+    heading_sigma_deg: float | None = None
+
+
+COLUMNS = tuple(f.name for f in fields(FrameNote))
+"""The header of notes.csv."""
+_LATER = COLUMNS[COLUMNS.index("sigma_up_m") :]  # columns that older runs lack
+
+
+def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
+    """The note of one frame's result.
+
+    Args:
+        name: name of the frame.
+        result: the fix or the refusal.
+        state: state of the navigator after it.
+    """
+    x0, y0 = (None, None) if result.window is None else (result.window.x0, result.window.y0)
+    if isinstance(result, NoFix):
+        return FrameNote(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
+    # Where no height was measured, roll and pitch are the telemetry's, or none.
+    tilt = None if result.up_m is None else result.attitude
+    roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)
+    return FrameNote(
+        frame=name,
+        state=state,
+        window_x0_px=x0,
+        window_y0_px=y0,
+        heading_deg=None if result.attitude is None else float(result.attitude.heading_deg),
+        sigma_up_m=None if result.up_m is None else math.sqrt(result.covariance_m2[2, 2]),
+        roll_deg=None if tilt is None else float(tilt.roll_deg),
+        pitch_deg=None if tilt is None else float(tilt.pitch_deg),
+        roll_sigma_deg=roll_sigma_deg,
+        pitch_sigma_deg=pitch_sigma_deg,
+        heading_sigma_deg=heading_sigma_deg,
+        stage=result.stage,
+        confidence=None if result.confidence is None else float(result.confidence),
+    )
+
+
+def write_notes(path: str | Path, notes: Iterable[FrameNote]) -> None:
+    """Write notes.csv.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    write_table(path, COLUMNS, ([cell_text(getattr(note, name), 4) for name in COLUMNS] for note in notes))
+
+
+def read_notes(path: str | Path) -> list[FrameNote]:
+    """Read notes.csv.
+
+    Raises:
+        TelemetryError: the file cannot be read, or a cell is not what its column holds.
+    """
+    return [
+        FrameNote(
+            frame=csv_row.text("frame"),
+            state=csv_row.text("state"),
+            window_x0_px=csv_row.integer("window_x0_px"),
+            window_y0_px=csv_row.integer("window_y0_px"),
+            heading_deg=csv_row.number("heading_deg"),
+            stage=csv_row.values["stage"] or None,
+            confidence=csv_row.number("confidence"),
+            detail=csv_row.values["detail"] or None,
+            **{name: csv_row.number(name) for name in _LATER},
+        )
+        for csv_row in read_table(path, [name for name in COLUMNS if name not in _LATER], _LATER)
+    ]

@@ -1,0 +1,294 @@
+"""Photographs: what a camera and a drone wrote into them, EXIF and DJI's XMP; and the telemetry in it.
+
+Convention:
+    Heights are above the take-off point, positions those of the receiver on board. A gimbal that wrote zeros only
+    is none, and a photograph that a viewer saved was turned by it: its heading and tilt are unknown.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engine.errors import TelemetryError
+from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
+from engine.values import Truth
+from scenematch.files.frames import PictureFolder
+from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
+
+COMPASS_SIGMA_DEG = 3.0
+"""Standard deviation of a heading by a drone's compass."""
+GIMBAL_SIGMA_DEG = 2.0
+"""Standard deviation of roll and of pitch as a gimbal states them: where it says 0.0 and -89.9 throughout a
+survey, poses by SIFT are up to 3 degrees off, 1.5 as root mean square."""
+_VIEWERS = ("Photo Viewer", "Photo Gallery", "Picasa")
+"""Parts of the names of programs that save a photograph because it was turned, without turning what it says."""
+_SOFTWARE = 0x0131
+_GIMBAL = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
+_GPS_IFD, _EXIF_IFD = 0x8825, 0x8769
+_XMP_BYTES = 512 * 1024
+_XMP_VALUE = re.compile(rb"drone-dji:(\w+)(?:=\"|>)\s*([+-]?[0-9]+(?:\.[0-9]+)?)")
+_XMP_DEWARP = re.compile(rb"drone-dji:DewarpData(?:=\"|>)[0-9-]{0,20};([-+0-9.,eE ]{1,400})")
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoTags:
+    """What stands in one photograph.
+
+    Attributes:
+        path: the file.
+        size_px: width and height of the stored picture.
+        exif: tags of the camera by number.
+        gps: tags of the position by number.
+        xmp: numbers of DJI's XMP by name.
+        dewarp: DJI's DewarpData: fx, fy, cx, cy, k1, k2, p1, p2, k3; empty where there is none.
+        software: what wrote the file last.
+    """
+
+    path: Path
+    size_px: tuple[int, int]
+    exif: Mapping[int, Any]
+    gps: Mapping[int, Any]
+    xmp: Mapping[str, float]
+    dewarp: tuple[float, ...] = ()
+    software: str = ""
+
+    @property
+    def was_turned(self) -> bool:
+        """Whether the picture may have been turned since it was taken: which side is its top is then unknown."""
+        return any(viewer in self.software for viewer in _VIEWERS)
+
+    def number(self, tag: int) -> float | None:
+        """A finite number of the camera's tags, or None."""
+        return _finite(self.exif.get(tag))
+
+
+def read_photo_tags(path: Path) -> PhotoTags:
+    """Read the tags of one picture; those that it lacks are empty.
+
+    Raises:
+        TelemetryError: the picture cannot be opened.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            tags, size_px = picture.getexif(), picture.size
+            gps, exif = tags.get_ifd(_GPS_IFD), tags.get_ifd(_EXIF_IFD)
+            software = str(tags.get(_SOFTWARE, "")).strip("\0 ")
+        with path.open("rb") as file:
+            head = file.read(_XMP_BYTES)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise TelemetryError(f"{path}: expected a readable picture: {str(error).splitlines()[0]}") from None
+    xmp = {key.decode(): float(value) for key, value in _XMP_VALUE.findall(head)}
+    found = _XMP_DEWARP.search(head)
+    numbers = [_finite(part) for part in found.group(1).split(b",")] if found else []
+    dewarp = tuple(number for number in numbers if number is not None)
+    return PhotoTags(path, size_px, exif, gps, xmp, dewarp if len(dewarp) == 9 else (), software)
+
+
+def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryRow]:
+    """Telemetry from photographs' EXIF and DJI's XMP, see :func:`photo_telemetry`.
+
+    Args:
+        source: a folder, or paths of images.
+    """
+    if isinstance(source, (str, Path)):
+        folder = PictureFolder(Path(source))
+        source = [folder.path / name for name in folder.names]
+    return photo_telemetry([Path(path) for path in source])[0]
+
+
+def photo_truth(folder: Path) -> list[Truth]:
+    """Where photographs were taken, by their own receiver; its heights are left out, a truth needs better ones.
+
+    Raises:
+        TelemetryError: the folder cannot be read, or none of its photographs has a time and a position.
+    """
+    found = [
+        Truth(timestamp_ns=row.timestamp_ns, lat_deg=row.lat_deg, lon_deg=row.lon_deg)
+        for row in exif_telemetry(folder)
+        if row.lat_deg is not None and row.lon_deg is not None
+    ]
+    if not found:
+        raise TelemetryError(f"{folder}: expected photographs with a time and a position in their EXIF, got none")
+    return found
+
+
+def photo_telemetry(paths: Sequence[Path]) -> tuple[list[TelemetryRow], list[str]]:
+    """Telemetry from photographs' EXIF and DJI's XMP.
+
+    ==================================  =====================================================================
+    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC where there is no offset
+    GPSLatitude, GPSLongitude           the prior; GPSHPositioningError its sigma
+    GPSAltitude                         alt_amsl_m
+    GPSImgDirection                     heading_deg, where its reference is true north
+    drone-dji:RelativeAltitude          height_agl_m, above the take-off point
+    drone-dji:Gimbal*Degree             heading, roll and pitch of a body with the camera mounted nadir; three
+                                        zeros are no gimbal
+    drone-dji:FlightYawDegree           heading_deg, where there are no gimbal angles
+    ==================================  =====================================================================
+
+    Args:
+        paths: of the images.
+
+    Returns:
+        Rows in the order of time, named by file name; photographs without a capture time are omitted.
+        Photographs of the same second without sub-seconds are spaced evenly within it. And what is doubtful about
+        them, a sentence each.
+
+    Raises:
+        TelemetryError: an image cannot be opened.
+    """
+    photos = [read_photo_tags(path) for path in paths]
+    rows = [row for tags in photos if (row := _exif_row(tags)) is not None]
+    rows.sort(key=lambda row: row.timestamp_ns)  # stable: equal stamps keep the order of the names
+    counts, seen = Counter(row.timestamp_ns for row in rows), Counter[int]()
+    for i, row in enumerate(rows):
+        shift_ns = seen[row.timestamp_ns] * 1_000_000_000 // counts[row.timestamp_ns]
+        seen[row.timestamp_ns] += 1
+        rows[i] = replace(row, timestamp_ns=row.timestamp_ns + shift_ns)
+    return rows, _remarks(photos)
+
+
+def _remarks(photos: Sequence[PhotoTags]) -> list[str]:
+    turned = sum(tags.was_turned for tags in photos)
+    zeros = sum(set(map(tags.xmp.get, _GIMBAL)) == {0.0} for tags in photos)
+    remarks = {
+        "photographs that a viewer turned and saved, whose heading is unknown": turned,
+        "photographs without a gimbal's angles, whose heading is the flight's and tilt unknown": zeros,
+    }
+    return [f"{remark}: {count}" for remark, count in remarks.items() if count]
+
+
+def _exif_row(tags: PhotoTags) -> TelemetryRow | None:
+    stamp_ns = _capture_ns(tags.exif)
+    if stamp_ns is None:
+        return None
+    height_m = tags.xmp.get("RelativeAltitude", 0.0)
+    height_known = height_m > 0.0
+    attitude = {} if tags.was_turned else _gimbal_attitude(tags.xmp) or _flight_heading(tags)
+    return TelemetryRow(
+        timestamp_ns=stamp_ns,
+        frame=tags.path.name,
+        height_agl_m=height_m if height_known else None,
+        height_sigma_m=take_off_sigma_m(height_m) if height_known else None,
+        alt_amsl_m=_altitude_m(tags.gps),
+        **attitude,
+        **_position(tags.gps),
+    )
+
+
+def _capture_ns(exif: Mapping[int, Any]) -> int | None:
+    """Nanoseconds since 1970 of DateTimeOriginal (0x9003), its sub-seconds (0x9291) and offset (0x9011)."""
+    offset = str(exif.get(0x9011, "")).strip("\0 ") or "+00:00"
+    try:
+        time = datetime.strptime(f"{str(exif[0x9003]).strip(chr(0) + ' ')} {offset}", "%Y:%m:%d %H:%M:%S %z")
+    except (KeyError, ValueError):
+        return None
+    fraction = re.match(r"[0-9]*", str(exif.get(0x9291, "")).strip())
+    nanoseconds = int(fraction.group().ljust(9, "0")[:9]) if fraction else 0
+    since = time - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + nanoseconds
+
+
+def _finite(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _position(gps: Mapping[int, Any]) -> dict[str, float | None]:
+    lat_deg, lon_deg = _degrees(gps.get(2), gps.get(1) == "S"), _degrees(gps.get(4), gps.get(3) == "W")
+    # Receivers without a fix write zeros.
+    if lat_deg is None or lon_deg is None or (lat_deg == 0.0 and lon_deg == 0.0):
+        return {}
+    if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
+        return {}
+    sigma_m = _finite(gps.get(0x1F))
+    return {"lat_deg": lat_deg, "lon_deg": lon_deg, "sigma_m": sigma_m if sigma_m and sigma_m > 0.0 else None}
+
+
+def _degrees(parts: Any, negative: bool) -> float | None:
+    values = [_finite(part) for part in parts or ()]
+    if len(values) != 3 or None in values:
+        return None
+    degrees = sum(
+        value / unit for value, unit in zip(values, (1.0, 60.0, 3600.0), strict=True) if value is not None
+    )
+    return -degrees if negative else degrees
+
+
+def _altitude_m(gps: Mapping[int, Any]) -> float | None:
+    altitude_m = _finite(gps.get(6))
+    below_sea = gps.get(5) in (1, b"\x01")
+    return -altitude_m if altitude_m is not None and below_sea else altitude_m
+
+
+def _flight_heading(tags: PhotoTags) -> dict[str, float | None]:
+    """The heading of the vehicle, or the direction that the receiver noted, where it is from true north."""
+    heading_deg = _finite(tags.xmp.get("FlightYawDegree"))
+    if heading_deg is None and tags.gps.get(16) == "T":
+        heading_deg = _finite(tags.gps.get(17))
+    if heading_deg is None:
+        return {}
+    return {"heading_deg": wrap_heading_deg(heading_deg), "heading_sigma_deg": COMPASS_SIGMA_DEG}
+
+
+def _gimbal_attitude(xmp: Mapping[str, float]) -> dict[str, float | None] | None:
+    try:
+        roll_deg, pitch_deg, yaw_deg = (xmp[name] for name in _GIMBAL)
+    except KeyError:
+        return None
+    return gimbal_columns(roll_deg, pitch_deg, yaw_deg)
+
+
+def gimbal_columns(roll_deg: float, pitch_deg: float, yaw_deg: float) -> dict[str, float | None] | None:
+    """Columns of telemetry by a gimbal's angles; None of one that wrote zeros only, as some models do without one.
+
+    Args:
+        roll_deg: of the gimbal.
+        pitch_deg: of the gimbal, -90 looks straight down.
+        yaw_deg: of the gimbal, clockwise from true north.
+    """
+    if roll_deg == pitch_deg == yaw_deg == 0.0:
+        return None
+    body_roll_deg, body_pitch_deg, heading_deg = nadir_attitude(roll_deg, pitch_deg, yaw_deg)
+    return {
+        "roll_deg": body_roll_deg,
+        "pitch_deg": body_pitch_deg,
+        "heading_deg": heading_deg,
+        "heading_sigma_deg": COMPASS_SIGMA_DEG,
+        "tilt_sigma_deg": GIMBAL_SIGMA_DEG,
+    }
+
+
+def nadir_attitude(
+    gimbal_roll_deg: float, gimbal_pitch_deg: float, gimbal_yaw_deg: float
+) -> tuple[float, float, float]:
+    """Attitude of a body on which the gimbal's camera would be mounted nadir, the image's top to the nose.
+
+    DJI's angles rotate the camera's forward, right and down axes; a pitch of -90 degrees is nadir. The camera's
+    forward is the body's down, its up the body's forward. The result is the same with a roll of 180 degrees, as
+    some models write it.
+
+    Args:
+        gimbal_roll_deg: roll in degrees.
+        gimbal_pitch_deg: pitch in degrees, -90 looks straight down.
+        gimbal_yaw_deg: yaw in degrees, clockwise from true north.
+
+    Returns:
+        Roll, pitch and heading in degrees.
+    """
+    forward, right, down = enu_from_body(gimbal_roll_deg, gimbal_pitch_deg, gimbal_yaw_deg).T
+    return attitude_from_rotation(np.stack([-down, right, forward], axis=1))

@@ -1,0 +1,382 @@
+"""Bags of ROS 1 and ROS 2 (sqlite3, mcap): the images, telemetry and calibration of a flight.
+
+Convention:
+    Stamps are those of the headers, of capture. A message without a header (std_msgs/Float64), or with a zero
+    stamp, has the time of its recording. Frames are named by their index from 0, as those of a video.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.errors import CalibrationError, EngineError, TelemetryError, require
+from engine.geo import enu_from_body
+from scenematch.files.frames import FrameSource
+from scenematch.files.resampling import (
+    FlightLog,
+    Floats,
+    Stamps,
+    TimeSeries,
+    interpolate,
+    make_log,
+    make_position_series,
+    make_series,
+)
+from scenematch.files.ros.messages import (
+    ODOMETRY_TYPES,
+    attitude_from_message,
+    body_velocity_from_message,
+    camera_from_message,
+    image_from_message,
+    position_from_message,
+    range_from_message,
+    stamp_ns,
+)
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+"""Suffixes of bag files, in lower or upper case; a folder is a bag where it contains metadata.yaml."""
+IMAGE, CAMERA_INFO = "/camera/image_raw", "/camera/camera_info"
+IMU, COMPASS = "/mavros/imu/data", "/mavros/global_position/compass_hdg"
+HEIGHT, RANGE = "/mavros/global_position/rel_alt", "/mavros/rangefinder/rangefinder"
+VELOCITY, POSITION = "/mavros/local_position/velocity_local", "/mavros/global_position/global"
+TRUTH, TRUTH_ATTITUDE = "/truth/fix", "/truth/imu"
+TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
+"""Topics that are written, and preferred where a bag has several of a type."""
+
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_FLOAT, _CALIBRATION = ("std_msgs/msg/Float64",), ("sensor_msgs/msg/CameraInfo",)
+
+Sample = tuple[int, tuple[float | None, ...]]
+"""Stamp in nanoseconds, and values; None where one is unknown."""
+
+
+def is_bag(path: str | Path) -> bool:
+    """Whether a path is a bag, by its suffix or, for a folder, by its metadata.yaml."""
+    path = Path(path)
+    return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+
+
+class BagFrames(FrameSource):
+    """The images of one topic of a bag, read forward; going back restarts at the first.
+
+    Of pictures with the same stamp the first counts; names are indices among all of the topic.
+
+    Args:
+        path: the bag.
+        topic: topic of the images; None where there is only one.
+
+    Raises:
+        TelemetryError: the bag cannot be read, has no images, or has several image topics and none was given.
+    """
+
+    def __init__(self, path: Path, topic: str | None = None) -> None:
+        self.path = path
+        with _opened(path) as reader:
+            self.topic = _image_topic(path, reader, topic)
+            stamps_ns = [time_ns for _, time_ns, _ in _messages(path, reader, {self.topic}, _IMAGES)]
+        if not stamps_ns:
+            raise TelemetryError(f"{path}: expected pictures on {self.topic}, got none")
+        # Simulators publish a picture again where there is no new one yet.
+        fresh = [k for k in range(len(stamps_ns)) if k == 0 or stamps_ns[k] != stamps_ns[k - 1]]
+        self.names, self._stamps_ns = [str(index) for index in fresh], [stamps_ns[index] for index in fresh]
+        self._reset()
+
+    @property
+    def description(self) -> str:
+        """The range of indices, for messages."""
+        return f"an index from 0 to {self.names[-1]} of {self.topic}"
+
+    def stamps_ns(self) -> list[int]:
+        """Capture time of each frame in nanoseconds.
+
+        Raises:
+            TelemetryError: a stamp is not later than the one before it.
+        """
+        for name, (before, after) in zip(self.names[1:], itertools.pairwise(self._stamps_ns), strict=True):
+            if after <= before:
+                raise TelemetryError(
+                    f"{self.path}: {self.topic}: expected frame {name} after {before / 1e9:.6f} s, "
+                    f"got {after / 1e9:.6f} s"
+                )
+        return list(self._stamps_ns)
+
+    def _reset(self) -> None:
+        self._stream, self._next = _image_messages(self.path, self.topic), 0
+        self._last: tuple[int, NDArray[np.uint8]] | None = None
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Read one frame as (H, W, 3) RGB uint8; fast for ascending indices."""
+        self.check_name(name)
+        index = int(name)
+        if self._last is None or self._last[0] != index:
+            if index < self._next:
+                self._reset()
+            skipped = index - self._next
+            self._next = index + 1
+            message = next(itertools.islice(self._stream, skipped, None), None)
+            if message is None:
+                raise TelemetryError(
+                    f"{self.path}: {self.topic}: frame {index} has vanished since the bag was opened"
+                )
+            try:
+                image = image_from_message(message)
+            except TelemetryError as error:
+                raise TelemetryError(f"{self.path}: {self.topic}: frame {index}: {error}") from None
+            rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
+            self._last = (index, rgb)
+        return self._last[1].copy()
+
+
+def _image_messages(path: Path, topic: str) -> Iterator[Any]:
+    """The image messages of one topic; closing the generator closes the file."""
+    with _opened(path) as reader:
+        for _, _, message in _messages(path, reader, {topic}, _IMAGES):
+            yield message
+
+
+def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
+    """Read the calibration in a bag: the camera_info beside the image topic, else any other.
+
+    Args:
+        path: the bag.
+        topic: topic of the images; None where there is only one.
+
+    Raises:
+        TelemetryError: the bag cannot be read, or has no calibration.
+        CalibrationError: the calibration is not usable.
+    """
+    path = Path(path)
+    with _opened(path) as reader:
+        beside = _image_topic(path, reader, topic).rpartition("/")[0] + "/camera_info"
+        found = _topic(reader, _CALIBRATION, (beside, ""))
+        first = None if found is None else next(_messages(path, reader, {found}, _CALIBRATION), None)
+    if first is None:
+        raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with `camera`")
+    try:
+        return camera_from_message(first[2])
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = None) -> FlightLog:
+    """Read the telemetry of a bag.
+
+    ==========================  ===========================================================================
+    ``.../compass_hdg``         heading_deg, unless the same MAVROS' Imu has it with a stamp
+    sensor_msgs/Imu             roll_deg, pitch_deg
+    sensor_msgs/Range           height along the body's down axis
+    ``.../rel_alt``             height above take-off
+    ``.../velocity_local``      east and north velocity; without ``odometry_topic``
+    ``odometry_topic``          the velocity along the body, turned by the attitude above
+    sensor_msgs/NavSatFix       the prior
+    ==========================  ===========================================================================
+
+    Args:
+        path: the bag.
+        truth: whether the ``/truth`` topics replace these, where the bag has them.
+        odometry_topic: of another camera's odometry, whose velocity and its accuracy are used: nav_msgs/Odometry,
+            geometry_msgs/TwistWithCovarianceStamped or TwistStamped.
+
+    Raises:
+        TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
+    """
+    with _opened(path) as reader:
+        has_truth = truth and _topic(reader, _TAKEN["place"][0], (TRUTH,)) is not None
+        suffixes = _TRUTH_SUFFIXES if has_truth else _SUFFIXES
+        found = {name: _topic(reader, _TAKEN[name][0], options) for name, options in suffixes.items()}
+        if odometry_topic is not None:
+            found["odometry"] = _odometry_topic(path, reader, odometry_topic)
+        names = {topic: name for name, topic in found.items() if topic is not None}
+        known: dict[str, list[Sample]] = {name: [] for name in names.values()}
+        kinds = {kind for name in known for kind in _TAKEN[name][0]}
+        for topic, time_ns, message in _messages(path, reader, set(names), kinds) if names else ():
+            try:
+                numbers = _TAKEN[names[topic]][1](message)
+            except TelemetryError as error:
+                raise TelemetryError(f"{path}: {topic}: {error}") from None
+            if numbers is not None:
+                known[names[topic]].append((time_ns, numbers))
+    if _is_same_mavros(found.get("imu"), found.get("compass")):
+        known.pop("compass", None)
+    column = _columns(known)
+    (position_ns, lat_deg), (_, lon_deg) = column("place", 0), column("place", 1)
+    series: dict[str, TimeSeries | None] = {
+        "roll_deg": make_series(*column("imu", 0)),
+        "pitch_deg": make_series(*column("imu", 1)),
+        "heading_deg": make_series(*(column("compass", 0) if "compass" in known else column("imu", 2))),
+        "alt_amsl_m": make_series(*column("altitude", 0)),
+        "east_velocity_mps": make_series(*column("velocity", 0)),
+        "north_velocity_mps": make_series(*column("velocity", 1)),
+        "sigma_m": make_series(*column("place", 2)),
+        **make_position_series(position_ns, lat_deg, lon_deg),
+    }
+    if odometry_topic is not None:
+        series |= _odometry_series(path, odometry_topic, known["odometry"], series)
+    heights = {"rangefinder": make_series(*column("range", 0)), "take-off": make_series(*column("height", 0))}
+    return make_log(path, series, heights)
+
+
+_TAKEN: dict[str, tuple[tuple[str, ...], Callable[[Any], tuple[float | None, ...] | None]]] = {
+    "imu": (("sensor_msgs/msg/Imu",), attitude_from_message),
+    "compass": (_FLOAT, lambda message: (message.data,)),
+    "range": (("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
+    "height": (_FLOAT, lambda message: (message.data,)),
+    "altitude": (_FLOAT, lambda message: (message.data,)),
+    "velocity": (("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
+    "place": (("sensor_msgs/msg/NavSatFix",), position_from_message),
+    "odometry": (tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
+}
+"""Message types of each quantity, and the function that extracts its values; None where a message has none."""
+_SUFFIXES = {
+    "imu": ("/imu/data", ""),
+    "compass": ("/compass_hdg",),
+    "range": (RANGE, ""),
+    "height": ("/rel_alt",),
+    "velocity": ("/velocity_local",),
+    "place": (POSITION, ""),
+}
+_TRUTH_SUFFIXES = {
+    "imu": (TRUTH_ATTITUDE,),
+    "height": (TRUTH_HEIGHT,),
+    "altitude": (TRUTH_ALTITUDE,),
+    "place": (TRUTH,),
+}
+
+
+def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
+    kinds = _TAKEN["odometry"][0]
+    names = _topic_names(reader, kinds)
+    if topic not in names:
+        raise TelemetryError(f"{path}: expected {' or '.join(kinds)} on {topic}, got {', '.join(names) or 'none'}")
+    return topic
+
+
+def _odometry_series(
+    path: Path, topic: str, samples: list[Sample], series: Mapping[str, TimeSeries | None]
+) -> dict[str, TimeSeries | None]:
+    """East and north velocity and its accuracy: what is along the body, turned by the attitude at that time."""
+    stamps_ns = np.array([time_ns for time_ns, _ in samples], np.int64)
+
+    def angle_deg(name: str) -> Floats:
+        found = series[name]
+        unknown = np.full(len(stamps_ns), np.nan)
+        return unknown if found is None else interpolate(found, stamps_ns, is_angle=name != "pitch_deg")
+
+    # Without roll and pitch the vehicle counts as level, as a picture's does.
+    roll_deg, pitch_deg = np.nan_to_num(angle_deg("roll_deg")), np.nan_to_num(angle_deg("pitch_deg"))
+    attitudes = zip(roll_deg, pitch_deg, angle_deg("heading_deg"), strict=True)
+    along_body = np.array([values for _, values in samples], np.float64).reshape(-1, 4)
+    turned = [enu_from_body(*angles) @ each for angles, each in zip(attitudes, along_body[:, :3], strict=True)]
+    enu_mps = np.array(turned, np.float64).reshape(-1, 3)
+    if not np.isfinite(enu_mps).all(axis=1).any():
+        lacks = "a heading at the times of" if len(samples) else "a velocity that can be used on"
+        raise TelemetryError(f"{path}: expected {lacks} {topic}, got none")
+    return {
+        "east_velocity_mps": make_series(stamps_ns, enu_mps[:, 0]),
+        "north_velocity_mps": make_series(stamps_ns, enu_mps[:, 1]),
+        "velocity_sigma_mps": make_series(stamps_ns, along_body[:, 3], along_body[:, 3] > 0.0),
+    }
+
+
+def _is_same_mavros(imu: str | None, compass: str | None) -> bool:
+    """Whether both topics are of one MAVROS, whose Imu has the same heading, with the time of its measurement."""
+    ends = "/imu/data", "/global_position/compass_hdg"
+    if imu is None or compass is None or not (imu.endswith(ends[0]) and compass.endswith(ends[1])):
+        return False
+    return imu.removesuffix(ends[0]) == compass.removesuffix(ends[1])
+
+
+def _columns(known: dict[str, list[Sample]]) -> Callable[[str, int], tuple[Stamps, Floats]]:
+    """A function that returns stamps (N,) in nanoseconds and values (N,) of one quantity; NaN where unknown."""
+
+    def column(name: str, index: int) -> tuple[Stamps, Floats]:
+        samples = known.get(name, [])
+        values = [numbers[index] for _, numbers in samples]
+        return np.array([time for time, _ in samples], np.int64), np.array(values, np.float64)
+
+    return column
+
+
+def _stamp_ns(message: Any, recorded_ns: int) -> int:
+    return (stamp_ns(message) if hasattr(message, "header") else 0) or recorded_ns
+
+
+def _image_topic(path: Path, reader: Any, topic: str | None) -> str:
+    names = _topic_names(reader, _IMAGES)
+    if topic is None and len(names) == 1:
+        return names[0]
+    if topic is not None and topic in names:
+        return topic
+    expected = "one topic with pictures" if topic is None else f"pictures on {topic}"
+    hint = "; choose with `image_topic`" if topic is None and names else ""
+    raise TelemetryError(f"{path}: expected {expected}, got {', '.join(names) or 'none'}{hint}")
+
+
+def _topic_names(reader: Any, msgtypes: tuple[str, ...]) -> list[str]:
+    return sorted({str(c.topic) for c in reader.connections if c.msgtype in msgtypes and c.msgcount})
+
+
+def _topic(reader: Any, msgtypes: tuple[str, ...], suffixes: tuple[str, ...]) -> str | None:
+    """The first topic of these types whose name has a suffix, best first; an empty suffix excludes truth."""
+    for suffix in suffixes:
+        for name in _topic_names(reader, msgtypes):
+            if name.endswith(suffix) and (suffix or not name.startswith("/truth/")):
+                return name
+    return None
+
+
+def _messages(
+    path: Path, reader: Any, topics: Collection[str], msgtypes: Collection[str]
+) -> Iterator[tuple[str, int, Any]]:
+    """Topic, stamp in nanoseconds and message of the given topics, in the order of recording."""
+    wanted = [c for c in reader.connections if c.topic in topics and c.msgtype in msgtypes]
+    with _readable(path):
+        for connection, recorded_ns, data in reader.messages(wanted):
+            message = reader.deserialize(data, connection.msgtype)
+            yield str(connection.topic), _stamp_ns(message, recorded_ns), message
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """An open reader of the bag."""
+    highlevel, typesys = import_rosbags()
+    if not path.exists():
+        raise TelemetryError(f"{path}: no such bag")
+    with _readable(path):
+        reader = highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
+        reader.open()
+    try:
+        yield reader
+    finally:
+        with suppress(Exception):  # the interpreter may be shutting down, or the bag corrupt
+            reader.close()
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Convert whatever rosbags raises on a corrupt bag to a TelemetryError of one line."""
+    try:
+        yield
+    except EngineError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise TelemetryError(f"{path}: expected a bag that can be read: {reason}") from None
+
+
+def import_rosbags() -> tuple[Any, Any]:
+    """Import the modules of rosbags for reading and for types.
+
+    Raises:
+        MissingExtraError: rosbags is not installed.
+    """
+    require("rosbags", "bags")
+    return require("rosbags.highlevel", "bags"), require("rosbags.typesys", "bags")

@@ -1,0 +1,157 @@
+"""Time stamps of a table: nanoseconds, microseconds, milliseconds, seconds or UTC dates, by name or recognised.
+
+Convention:
+    A column's name states its unit: timestamp_ns, timestamp_us, timestamp_ms, timestamp_s, timestamp_utc. What
+    stands in timestamp_ns and cannot be nanoseconds, since no camera takes more than a thousand frames a second,
+    is recognised by the interval between the rows and by the size of UTC's numbers, and said; what may be two
+    units is refused.
+"""
+
+from __future__ import annotations
+
+import calendar
+import itertools
+import re
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+
+from engine.errors import TelemetryError
+from scenematch.files.tables import CsvRow
+
+STAMP_COLUMNS = ("timestamp_ns", "timestamp_us", "timestamp_ms", "timestamp_s", "timestamp_utc")
+"""Columns that a stamp may stand in, in order of preference."""
+OTHER_STAMPS = {STAMP_COLUMNS[0]: STAMP_COLUMNS[1:]}
+"""Columns that may stand in the place of ``timestamp_ns``."""
+_UNIT_NS = {"timestamp_ns": 1, "timestamp_us": 10**3, "timestamp_ms": 10**6, "timestamp_s": 10**9}
+_WORDS = {
+    "timestamp_ns": "nanoseconds", "timestamp_us": "microseconds", "timestamp_ms": "milliseconds",
+    "timestamp_s": "seconds",
+}  # fmt: skip
+_SHORTEST_NS = 10**6  # between two frames
+_USUAL_NS = (5 * 10**6, 20 * 10**9)  # between two frames whose unit is not known
+_UTC_NS = (10**18, 41 * 10**17)  # the years 2001 to 2099
+_NUMBER = re.compile(r"[+-]?[0-9]{1,19}(\.[0-9]{0,30})?([eE]\+?[0-9]{1,2})?")
+_DATE = re.compile(
+    r"([0-9]{4})[-/]([0-9]{2})[-/]([0-9]{2})[T ]([0-9]{2}):([0-9]{2}):([0-9]{2})(?:[.,]([0-9]{1,12}))?"
+    r" ?(Z|UTC|[+-][0-9]{2}:?[0-9]{2})?"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Stamps:
+    """The stamps of a table.
+
+    Attributes:
+        ns: in nanoseconds, one a row, strictly increasing.
+        remark: how they were read, where their column does not say it; None where it does.
+    """
+
+    ns: list[int]
+    remark: str | None = None
+
+
+def read_stamps(rows: Sequence[CsvRow]) -> Stamps:
+    """The stamps of rows.
+
+    Args:
+        rows: of a table with at least one of :data:`STAMP_COLUMNS`.
+
+    Raises:
+        TelemetryError: a stamp is blank or none, does not increase, or its unit cannot be recognised.
+    """
+    column = next((name for name in STAMP_COLUMNS if any(row.values[name] for row in rows)), STAMP_COLUMNS[0])
+    dates = [_DATE.fullmatch(row.values[column]) for row in rows]
+    if column == "timestamp_utc" or any(dates):
+        return _dated(rows, column, dates)
+    values = [_number(row, column) for row in rows]
+    _check_increasing(rows, column, values)
+    unit = column
+    if len(values) > 1:
+        spacing = statistics.median(later - earlier for earlier, later in itertools.pairwise(values))
+        unit = _unit(rows[0], column, values, spacing)
+    stamps_ns = [
+        _whole(row, column, value * _UNIT_NS[unit], unit) for row, value in zip(rows, values, strict=True)
+    ]
+    _check_increasing(rows, column, stamps_ns)
+    if unit == column:
+        return Stamps(stamps_ns)
+    return Stamps(
+        stamps_ns, f"{rows[0].path.name}: {column} is taken as {_WORDS[unit]}: rows are {float(spacing):g} apart"
+    )
+
+
+def _dated(rows: Sequence[CsvRow], column: str, dates: Sequence[re.Match[str] | None]) -> Stamps:
+    stamps_ns = []
+    for row, date in zip(rows, dates, strict=True):
+        stamp_ns = None if date is None else _utc_ns(date)
+        if stamp_ns is None:
+            raise row.error(column, "a date in UTC such as 2026-05-01T12:00:00.250Z")
+        stamps_ns.append(stamp_ns)
+    _check_increasing(rows, column, stamps_ns)
+    if all(date is not None and date[8] for date in dates) or column == "timestamp_utc":
+        return Stamps(stamps_ns)
+    return Stamps(stamps_ns, f"{rows[0].path.name}: {column} holds dates without a time zone, taken as UTC")
+
+
+def _utc_ns(date: re.Match[str]) -> int | None:
+    """Nanoseconds since 1970 of a date; None where there is no such date."""
+    year, month, day, hour, minute, second = (int(date[k]) for k in range(1, 7))
+    if not (1 <= month <= 12 and hour < 24 and minute < 60 and second <= 60 and year >= 1970):
+        return None
+    if not 1 <= day <= calendar.monthrange(year, month)[1]:
+        return None
+    seconds = calendar.timegm((year, month, day, hour, minute, second))
+    zone = date[8] or "Z"
+    if zone[0] in "+-":
+        ahead_s = int(zone[1:3]) * 3600 + int(zone[-2:]) * 60
+        seconds -= ahead_s if zone[0] == "+" else -ahead_s
+    stamp_ns = seconds * 10**9 + int((date[7] or "").ljust(9, "0")[:9])
+    return stamp_ns if stamp_ns < 2**63 else None
+
+
+def _number(row: CsvRow, column: str) -> Decimal:
+    text = row.values[column]
+    if not text or not _NUMBER.fullmatch(text):
+        expected = (
+            f"whole {_WORDS[column]}" if column == "timestamp_ns" and not text else "a number or a date in UTC"
+        )
+        raise row.error(column, expected)
+    return Decimal(text)
+
+
+def _whole(row: CsvRow, column: str, stamp_ns: Decimal, unit: str) -> int:
+    if not -(2**63) <= stamp_ns < 2**63:
+        raise row.error(column, "a whole number of 64 bits, in nanoseconds")
+    if unit == "timestamp_ns" and stamp_ns != round(stamp_ns):
+        raise row.error(column, "a whole number")
+    return round(stamp_ns)
+
+
+def _check_increasing(rows: Sequence[CsvRow], column: str, values: Sequence[Decimal] | Sequence[int]) -> None:
+    for k in range(1, len(values)):
+        if values[k] <= values[k - 1]:
+            raise rows[k].error(column, f"a stamp later than the row before ({rows[k - 1].values[column]})")
+
+
+def _unit(first: CsvRow, column: str, values: Sequence[Decimal], spacing: Decimal) -> str:
+    """The column whose unit the values have."""
+    found = [
+        unit for unit, unit_ns in _UNIT_NS.items()
+        if _USUAL_NS[0] <= spacing * unit_ns <= _USUAL_NS[1] and values[-1] * unit_ns < 2**63
+    ]  # fmt: skip
+    utc = [
+        unit for unit in found if all(_UTC_NS[0] <= value * _UNIT_NS[unit] < _UTC_NS[1] for value in values)
+    ]  # fmt: skip
+    is_stated = column != "timestamp_ns" or not utc
+    if spacing * _UNIT_NS[column] >= _SHORTEST_NS and is_stated:
+        return column
+    found = utc or found
+    if column == "timestamp_ns" and len(found) == 1:
+        return found[0]
+    apart = f"{first.path}: {column}: expected {_WORDS[column]}, got rows {float(spacing):g} apart"
+    if not found:
+        raise TelemetryError(f"{apart}, which no unit makes the interval of a camera's frames")
+    units = " or ".join(_WORDS[unit] for unit in found)
+    raise TelemetryError(f"{apart}, which may be {units}: name the column {' or '.join(found)}")

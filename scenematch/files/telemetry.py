@@ -1,0 +1,216 @@
+"""telemetry.csv: position, height, attitude and velocity that the vehicle knew at each frame.
+
+Convention:
+    One row per frame, in the order of capture; a blank cell is unknown. See :mod:`scenematch.files.tables`.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from engine.errors import TelemetryError
+from engine.geo import wrap_heading_deg
+from engine.values import Prior
+from scenematch.files.column_names import advice, question
+from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
+from scenematch.files.tables import (
+    ANY,
+    HALF_TURN,
+    HEADING,
+    LONGITUDE,
+    POSITIVE,
+    POSITIVE_SIGMA,
+    QUARTER_TURN,
+    SIGMA,
+    CsvRow,
+    cell_text,
+    known_columns,
+    read_header,
+    read_table,
+    write_table,
+)
+
+__all__ = [
+    "COLUMNS",
+    "DEFAULT_PRIOR_SIGMA_M",
+    "TelemetryRow",
+    "ground_amsl_m",
+    "open_telemetry",
+    "read_telemetry",
+    "write_telemetry",
+]
+
+DEFAULT_PRIOR_SIGMA_M = 15.0
+"""Standard deviation, per axis, of a prior whose ``sigma_m`` is blank: a poor single-frequency GPS position."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TelemetryRow:
+    """Telemetry of one frame; what is unknown is None.
+
+    Attributes:
+        timestamp_ns: capture time on the vehicle's clock.
+        frame: file name of the image, or for a video the index of the frame from 0.
+        height_agl_m: height above the ground.
+        height_sigma_m: standard deviation of it, where it is known.
+        alt_amsl_m: height above mean sea level.
+        heading_deg: clockwise from true north in [0, 360).
+        heading_sigma_deg: standard deviation of it, where it is known.
+        roll_deg: positive right side down.
+        pitch_deg: positive nose up.
+        tilt_sigma_deg: standard deviation of roll and of pitch, where it is known.
+        east_velocity_mps: velocity over ground.
+        north_velocity_mps: velocity over ground.
+        velocity_sigma_mps: standard deviation of it, per axis, where it is known.
+        lat_deg: WGS84 latitude of a prior.
+        lon_deg: WGS84 longitude of the prior.
+        sigma_m: standard deviation of the prior, per axis.
+    """
+
+    timestamp_ns: int
+    frame: str
+    height_agl_m: float | None = None
+    height_sigma_m: float | None = None
+    alt_amsl_m: float | None = None
+    heading_deg: float | None = None
+    heading_sigma_deg: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    tilt_sigma_deg: float | None = None
+    east_velocity_mps: float | None = None
+    north_velocity_mps: float | None = None
+    velocity_sigma_mps: float | None = None
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    sigma_m: float | None = None
+
+    @property
+    def prior(self) -> Prior | None:
+        """The position with its sigma (:data:`DEFAULT_PRIOR_SIGMA_M` where blank), or None without position."""
+        if self.lat_deg is None or self.lon_deg is None:
+            return None
+        sigma_m = DEFAULT_PRIOR_SIGMA_M if self.sigma_m is None else self.sigma_m
+        return Prior(lat_deg=self.lat_deg, lon_deg=self.lon_deg, sigma_m=sigma_m)
+
+
+def take_off_sigma_m(height_m: float) -> float:
+    """Standard deviation of a height above take-off, taken as one above the ground: that lies elsewhere.
+
+    Five metres of ground and barometer, and a twentieth of the height, by which a barometer errs on a day 15
+    degrees off the standard atmosphere.
+    """
+    return math.hypot(_TAKE_OFF_M, _TAKE_OFF_SHARE * height_m)
+
+
+_TAKE_OFF_M, _TAKE_OFF_SHARE = 5.0, 0.05
+_BOUNDS = {
+    "height_agl_m": POSITIVE,
+    "height_sigma_m": POSITIVE_SIGMA,
+    "alt_amsl_m": ANY,
+    "heading_deg": HEADING,
+    "heading_sigma_deg": POSITIVE_SIGMA,
+    "roll_deg": HALF_TURN,
+    "pitch_deg": QUARTER_TURN,
+    "tilt_sigma_deg": POSITIVE_SIGMA,
+    "east_velocity_mps": ANY,
+    "north_velocity_mps": ANY,
+    "velocity_sigma_mps": POSITIVE_SIGMA,
+    "lat_deg": QUARTER_TURN,
+    "lon_deg": LONGITUDE,
+    "sigma_m": SIGMA,
+}
+_DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
+    ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3
+)
+_REQUIRED = ("timestamp_ns", "frame")
+COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
+"""All columns that telemetry.csv may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What a telemetry.csv holds.
+
+    Attributes:
+        rows: one a frame.
+        remarks: what was recognised and not stated by the file, a sentence each.
+    """
+
+    rows: list[TelemetryRow]
+    remarks: list[str]
+
+
+def read_telemetry(
+    path: str | Path, frames: Container[str] | None = None, description: str = "a frame that is there"
+) -> list[TelemetryRow]:
+    """The rows of :func:`open_telemetry`."""
+    return open_telemetry(path, frames, description).rows
+
+
+def open_telemetry(
+    path: str | Path,
+    frames: Container[str] | None = None,
+    description: str = "a frame that is there",
+    names: Mapping[str, str] = {},
+) -> Telemetry:
+    """Read telemetry.csv; headings are normalised to [0, 360).
+
+    Args:
+        path: the file.
+        frames: the frame names that are allowed, or None for any.
+        description: those names in words, for messages.
+        names: what the file calls a column, by its name in :data:`COLUMNS`; others have their own names.
+
+    Raises:
+        TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
+    """
+    optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
+    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, advice=advice))
+    stamps = read_stamps(csv_rows)
+    rows: list[TelemetryRow] = []
+    line_of_frame: dict[str, int] = {}
+    for csv_row, stamp_ns in zip(csv_rows, stamps.ns, strict=True):
+        row = _telemetry_row(csv_row, stamp_ns)
+        if frames is not None and row.frame not in frames:
+            raise csv_row.error("frame", description)
+        if row.frame in line_of_frame:
+            raise csv_row.error("frame", f"each frame once (it stands in line {line_of_frame[row.frame]} too)")
+        line_of_frame[row.frame] = csv_row.line
+        rows.append(row)
+    if not rows:
+        raise TelemetryError(f"{path}: expected one row a frame, got a header and no rows")
+    asked = question(read_header(path), names, tuple(_BOUNDS))
+    remarks = [stamps.remark, None if asked is None else f"{Path(path).name}: {asked}"]
+    return Telemetry(rows, [remark for remark in remarks if remark is not None])
+
+
+def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
+    values = {name: csv_row.number(name, bounds) for name, bounds in _BOUNDS.items()}
+    for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
+        if values[name] is None and values[other] is not None:
+            raise csv_row.error(name, f"a value, as {other} has one")
+    if values["heading_deg"] is not None:
+        values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
+    return TelemetryRow(timestamp_ns=stamp_ns, frame=csv_row.text("frame"), **values)
+
+
+def write_telemetry(path: str | Path, rows: Sequence[TelemetryRow]) -> None:
+    """Write telemetry.csv with the columns that any row has; positions to 1e-9 degrees, metres to 1 mm.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    columns = known_columns(rows, _REQUIRED, tuple(_BOUNDS))
+    table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
+    write_table(path, columns, table)
+
+
+def ground_amsl_m(rows: Sequence[TelemetryRow]) -> float | None:
+    """Height of the ground above mean sea level, the median of ``alt_amsl_m - height_agl_m``; None if unknown."""
+    pairs = ((row.alt_amsl_m, row.height_agl_m) for row in rows)
+    differences = [alt - height for alt, height in pairs if alt is not None and height is not None]
+    return statistics.median(differences) if differences else None

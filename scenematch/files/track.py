@@ -1,0 +1,210 @@
+"""track.csv: the result of every frame, one row per frame, written while the run proceeds."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from engine.errors import TelemetryError
+from engine.values import Fix, NoFix, Reason
+from scenematch.files.tables import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, CsvRow, cell_text, read_table
+
+__all__ = ["TrackRow", "TrackWriter", "read_track", "track_row", "write_track"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackRow:
+    """One row of track.csv; what is unknown is None. The fields are the columns, in their order.
+
+    Attributes:
+        timestamp_ns: capture time of the frame.
+        frame: name of the frame.
+        status: "fix" or "no_fix".
+        reason: value of :class:`engine.values.Reason` where refused.
+        lat_deg: WGS84 latitude of the camera.
+        lon_deg: WGS84 longitude of the camera.
+        east_m: east of the map's origin.
+        north_m: north of the map's origin.
+        up_m: height in the surface model's datum.
+        sigma_east_m: standard deviation east.
+        sigma_north_m: standard deviation north.
+        covariance_en_m2: covariance of east and north.
+        score: NCC, or of matched points the ratio of inliers.
+        method: "ncc", "sift" or "learned".
+        window_width_px: width of the map window that was searched.
+        window_height_px: height of the map window that was searched.
+        latency_ms: from the frame's arrival to its result.
+        deadline_met: whether the result came within the budget; None without a budget.
+    """
+
+    timestamp_ns: int | None
+    frame: str
+    status: str
+    reason: str | None = None
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    east_m: float | None = None
+    north_m: float | None = None
+    up_m: float | None = None
+    sigma_east_m: float | None = None
+    sigma_north_m: float | None = None
+    covariance_en_m2: float | None = None
+    score: float | None = None
+    method: str | None = None
+    window_width_px: int | None = None
+    window_height_px: int | None = None
+    latency_ms: float | None = None
+    deadline_met: bool | None = None
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the frame has a position fix."""
+        return self.status == "fix"
+
+
+COLUMNS = tuple(f.name for f in fields(TrackRow))
+"""The header of track.csv."""
+_POSITION = ("lat_deg", "lon_deg", "east_m", "north_m", "sigma_east_m", "sigma_north_m", "covariance_en_m2")
+_DECIMALS = {"lat_deg": 9, "lon_deg": 9, "covariance_en_m2": 6} | dict.fromkeys(
+    ("east_m", "north_m", "up_m", "latency_ms"), 3
+)
+
+
+def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadline_met: bool | None) -> TrackRow:
+    """The row of one frame's result.
+
+    Args:
+        name: name of the frame.
+        result: the fix or the refusal.
+        latency_ms: time from the frame's arrival to its result.
+        deadline_met: whether that was within the budget; None without a budget.
+    """
+    window = result.window
+    row = TrackRow(
+        timestamp_ns=result.timestamp_ns,
+        frame=name,
+        status="no_fix" if isinstance(result, NoFix) else "fix",
+        score=None if result.score is None else float(result.score),
+        method=result.method,
+        window_width_px=None if window is None else window.width_px,
+        window_height_px=None if window is None else window.height_px,
+        latency_ms=latency_ms,
+        deadline_met=deadline_met,
+    )
+    if isinstance(result, NoFix):
+        return replace(row, reason=result.reason.value)
+    covariance = result.covariance_m2
+    return replace(
+        row,
+        lat_deg=float(result.lat_deg),
+        lon_deg=float(result.lon_deg),
+        east_m=float(result.east_m),
+        north_m=float(result.north_m),
+        up_m=None if result.up_m is None else float(result.up_m),
+        sigma_east_m=math.sqrt(covariance[0, 0]),
+        sigma_north_m=math.sqrt(covariance[1, 1]),
+        covariance_en_m2=float(covariance[0, 1]),
+    )
+
+
+class TrackWriter:
+    """Appends rows to track.csv and flushes each, so that an interrupted run keeps its rows.
+
+    Example:
+        >>> with TrackWriter("out/track.csv") as track:  # doctest: +SKIP
+        ...     track.write(track_row(name, result, latency_ms=12.0, deadline_met=True))
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self._file: TextIO = self.path.open("w", encoding="utf-8", newline="")
+        except OSError as error:
+            raise TelemetryError(f"{path}: cannot be written: {error.strerror or error}") from None
+        self._csv = csv.writer(self._file, lineterminator="\n")
+        self._append(COLUMNS)
+
+    def write(self, row: TrackRow) -> None:
+        """Append one row."""
+        self._append([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in COLUMNS])
+
+    def _append(self, cells: Iterable[str]) -> None:
+        try:
+            self._csv.writerow(cells)
+            self._file.flush()
+        except OSError as error:
+            raise TelemetryError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+
+    def close(self) -> None:
+        """Close the file; safe to call twice."""
+        self._file.close()
+
+    def __enter__(self) -> TrackWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def write_track(path: str | Path, rows: Iterable[TrackRow]) -> None:
+    """Write a complete track.csv: degrees to 9 decimals, metres to 3, sigmas and scores to 4.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    with TrackWriter(path) as writer:
+        for row in rows:
+            writer.write(row)
+
+
+def read_track(path: str | Path) -> list[TrackRow]:
+    """Read track.csv; a run that was interrupted before its first frame has no rows.
+
+    Raises:
+        TelemetryError: the file cannot be read, or a row is invalid: the message has line and column.
+    """
+    return [_row(csv_row) for csv_row in read_table(path, COLUMNS)]
+
+
+def _row(csv_row: CsvRow) -> TrackRow:
+    status, reason = csv_row.text("status"), csv_row.values["reason"] or None
+    if status not in ("fix", "no_fix"):
+        raise csv_row.error("status", "fix or no_fix")
+    if reason is not None and reason not in {known.value for known in Reason}:
+        raise csv_row.error("reason", "a known reason or nothing")
+    if csv_row.values["deadline_met"] not in ("", "true", "false"):
+        raise csv_row.error("deadline_met", "true, false or nothing")
+    for column in _POSITION:
+        if status == "fix" and not csv_row.values[column]:
+            raise csv_row.error(column, "a number, as the row is a fix")
+    met = {"true": True, "false": False}.get(csv_row.values["deadline_met"])
+    return TrackRow(
+        timestamp_ns=csv_row.integer("timestamp_ns"),
+        frame=csv_row.text("frame"),
+        status=status,
+        reason=reason,
+        lat_deg=csv_row.number("lat_deg", QUARTER_TURN),
+        lon_deg=csv_row.number("lon_deg", LONGITUDE),
+        east_m=csv_row.number("east_m"),
+        north_m=csv_row.number("north_m"),
+        up_m=csv_row.number("up_m"),
+        sigma_east_m=csv_row.number("sigma_east_m", NOT_NEGATIVE),
+        sigma_north_m=csv_row.number("sigma_north_m", NOT_NEGATIVE),
+        covariance_en_m2=csv_row.number("covariance_en_m2"),
+        score=csv_row.number("score"),
+        method=csv_row.values["method"] or None,
+        window_width_px=csv_row.integer("window_width_px"),
+        window_height_px=csv_row.integer("window_height_px"),
+        latency_ms=csv_row.number("latency_ms", NOT_NEGATIVE),
+        deadline_met=met,
+    )

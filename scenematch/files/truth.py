@@ -1,0 +1,127 @@
+"""truth.csv: the true position, height and attitude of the vehicle, at times of its own."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Sequence
+from pathlib import Path
+
+from engine.errors import TelemetryError
+from engine.geo import wrap_difference_deg, wrap_heading_deg
+from engine.values import Truth
+from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
+from scenematch.files.tables import (
+    ANY,
+    HALF_TURN,
+    HEADING,
+    LONGITUDE,
+    QUARTER_TURN,
+    cell_text,
+    known_columns,
+    read_table,
+    write_table,
+)
+from scenematch.files.telemetry import TelemetryRow
+
+__all__ = ["Truth", "interpolate_truth", "read_truth", "write_truth"]
+
+MAX_TRUTH_GAP_NS = 5_000_000_000
+"""Largest interval between two rows that is interpolated."""
+
+_REQUIRED = ("timestamp_ns", "lat_deg", "lon_deg")
+_OPTIONAL = {
+    "alt_amsl_m": ANY,
+    "height_agl_m": ANY,
+    "roll_deg": HALF_TURN,
+    "pitch_deg": QUARTER_TURN,
+    "heading_deg": HEADING,
+}
+_DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), 5)
+
+
+def read_truth(path: str | Path) -> list[Truth]:
+    """Read truth.csv; headings are normalised to [0, 360).
+
+    Raises:
+        TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
+    """
+    rows: list[Truth] = []
+    csv_rows = list(read_table(path, _REQUIRED, (*STAMP_COLUMNS[1:], *_OPTIONAL), instead=OTHER_STAMPS))
+    for csv_row, stamp_ns in zip(csv_rows, read_stamps(csv_rows).ns, strict=True):
+        values = {name: csv_row.number(name, bounds) for name, bounds in _OPTIONAL.items()}
+        if values["heading_deg"] is not None:
+            values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
+        lat_deg, lon_deg = csv_row.required("lat_deg", QUARTER_TURN), csv_row.required("lon_deg", LONGITUDE)
+        rows.append(Truth(timestamp_ns=stamp_ns, lat_deg=lat_deg, lon_deg=lon_deg, **values))
+    if not rows:
+        raise TelemetryError(f"{path}: expected rows of truth, got a header and no rows")
+    return rows
+
+
+def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
+    """Write truth.csv with the columns that any row has: positions to 1e-9 degrees, angles to 1e-5.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    columns = known_columns(rows, _REQUIRED, tuple(_OPTIONAL))
+    table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
+    write_table(path, columns, table)
+
+
+def truth_from_telemetry(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
+    """A row of telemetry as truth, with another position and its stamp shifted by ``shift_ns``."""
+    return Truth(
+        timestamp_ns=row.timestamp_ns + shift_ns,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_amsl_m=row.alt_amsl_m,
+        height_agl_m=row.height_agl_m,
+        roll_deg=row.roll_deg,
+        pitch_deg=row.pitch_deg,
+        heading_deg=row.heading_deg,
+    )
+
+
+def interpolate_truth(
+    rows: Sequence[Truth], timestamp_ns: int, max_gap_ns: int = MAX_TRUTH_GAP_NS
+) -> Truth | None:
+    """Interpolate truth linearly at a time; headings and longitudes along the shorter arc.
+
+    Args:
+        rows: truth in the order of time.
+        timestamp_ns: the time, on the same clock.
+        max_gap_ns: largest interval between two rows that is interpolated.
+
+    Returns:
+        The truth, with None for what either neighbour lacks; None outside the rows and in a gap.
+    """
+    after = bisect.bisect_left(rows, timestamp_ns, key=lambda row: row.timestamp_ns)
+    if after < len(rows) and rows[after].timestamp_ns == timestamp_ns:
+        return rows[after]
+    if after in (0, len(rows)):
+        return None
+    a, b = rows[after - 1], rows[after]
+    gap_ns = b.timestamp_ns - a.timestamp_ns
+    if gap_ns > max_gap_ns:
+        return None
+    fraction = (timestamp_ns - a.timestamp_ns) / gap_ns
+    heading_deg = _between_angles(a.heading_deg, b.heading_deg, fraction)
+    return Truth(
+        timestamp_ns=timestamp_ns,
+        lat_deg=a.lat_deg + fraction * (b.lat_deg - a.lat_deg),
+        lon_deg=a.lon_deg + fraction * wrap_difference_deg(b.lon_deg - a.lon_deg),
+        alt_amsl_m=_between(a.alt_amsl_m, b.alt_amsl_m, fraction),
+        height_agl_m=_between(a.height_agl_m, b.height_agl_m, fraction),
+        roll_deg=_between(a.roll_deg, b.roll_deg, fraction),
+        pitch_deg=_between(a.pitch_deg, b.pitch_deg, fraction),
+        heading_deg=None if heading_deg is None else wrap_heading_deg(heading_deg),
+    )
+
+
+def _between(a: float | None, b: float | None, fraction: float) -> float | None:
+    return None if a is None or b is None else a + fraction * (b - a)
+
+
+def _between_angles(a_deg: float | None, b_deg: float | None, fraction: float) -> float | None:
+    return None if a_deg is None or b_deg is None else a_deg + fraction * wrap_difference_deg(b_deg - a_deg)

@@ -1,0 +1,35 @@
+"""Velocities that another odometry states: whether they count, and how accurate they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from engine.options import AssumedErrors
+
+_MIN_SIGMA_MPS, _MAX_SIGMA_MPS = 0.1, 5.0  # covariances of odometry are often too small; beyond this it is lost
+_MAX_SPEED_MPS = 150.0
+
+
+def velocity_sigma_mps(velocity_mps: ArrayLike, variances_m2ps2: Sequence[float], *, turned: bool) -> float | None:
+    """One standard deviation per axis of a velocity, or 0 where it is not stated.
+
+    Args:
+        velocity_mps: (3,) along any axes.
+        variances_m2ps2: (3,) along the same; not stated where one is not finite or none is above 0.
+        turned: whether it is turned to east and north by the vehicle's heading, whose error adds to it.
+
+    Returns:
+        None where the velocity does not count: not finite, of an absurd size, or of an unbounded variance.
+    """
+    speed_mps = float(np.linalg.norm(np.asarray(velocity_mps, np.float64)))
+    # What is not finite compares as false.
+    if not speed_mps <= _MAX_SPEED_MPS or any(variance > _MAX_SIGMA_MPS**2 for variance in variances_m2ps2):
+        return None
+    if not all(math.isfinite(variance) for variance in variances_m2ps2) or max(variances_m2ps2) <= 0.0:
+        return 0.0
+    turned_mps = math.radians(AssumedErrors().heading_deg) * speed_mps if turned else 0.0
+    return max(math.hypot(math.sqrt(max(variances_m2ps2)), turned_mps), _MIN_SIGMA_MPS)

@@ -1,0 +1,72 @@
+"""Consistency of a track with the telemetry's velocity: what can be said of successive fixes without truth.
+
+Convention:
+    A step is from one fix to the next. It is off by the distance between the displacement of its fixes and the
+    integral of the velocity. An offset that stays the same does not show, of the map above all, and fixes that
+    contradict the velocity were refused before: this is no measure of accuracy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import LocalFrame
+from scenematch.files.telemetry import TelemetryRow
+from scenematch.files.track import TrackRow
+
+Array = NDArray[np.float64]
+
+MAX_STEP_S = 5.0
+"""Longest step that is counted: beyond, the velocity's own error is most of it."""
+
+
+def motion_consistency(
+    rows: Sequence[TrackRow], telemetry: Sequence[TelemetryRow] | None, frame: LocalFrame
+) -> dict[str, Any] | None:
+    """How far the steps between successive fixes are off the telemetry's velocity.
+
+    Args:
+        rows: the track.
+        telemetry: one row per row of the track, or None where it is not known.
+        frame: origin of east and north.
+
+    Returns:
+        JSON values: ``steps`` (their number), ``interval_s`` (their median), ``median_m``, ``p95_m`` and
+        ``max_m``; None where no step has a velocity at all of its frames.
+    """
+    if not telemetry or [row.timestamp_ns for row in rows] != [row.timestamp_ns for row in telemetry]:
+        return None
+    time_s, velocity_mps = _velocity(telemetry)
+    fixed = [k for k, row in enumerate(rows) if row.fixed]
+    places = [(rows[k].lat_deg, rows[k].lon_deg) for k in fixed]
+    at_m = frame.enu_from_geodetic(*np.array(places, np.float64).reshape(-1, 2).T)
+    off_m, intervals_s = [], []
+    for n, (begin, end) in enumerate(pairwise(fixed)):
+        interval_s = time_s[end] - time_s[begin]
+        span = slice(begin, end + 1)
+        off = at_m[n + 1] - at_m[n] - np.trapezoid(velocity_mps[span], time_s[span], axis=0)
+        if 0.0 < interval_s <= MAX_STEP_S and np.isfinite(off).all():
+            off_m.append(float(np.hypot(*off)))
+            intervals_s.append(float(interval_s))
+    if not off_m:
+        return None
+    median_m, p95_m = np.percentile(off_m, [50, 95])
+    return {
+        "steps": len(off_m),
+        "interval_s": float(np.median(intervals_s)),
+        "median_m": float(median_m),
+        "p95_m": float(p95_m),
+        "max_m": max(off_m),
+    }
+
+
+def _velocity(telemetry: Sequence[TelemetryRow]) -> tuple[Array, Array]:
+    """(N,) seconds from the first frame, and (N, 2) velocity, NaN where it is unknown."""
+    time_s = np.array([row.timestamp_ns - telemetry[0].timestamp_ns for row in telemetry], np.float64) / 1e9
+    pairs = [(row.east_velocity_mps, row.north_velocity_mps) for row in telemetry]
+    return time_s, np.array([(np.nan, np.nan) if None in pair else pair for pair in pairs], np.float64)

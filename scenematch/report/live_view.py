@@ -1,0 +1,273 @@
+"""The live view: the result of each frame, sent during the flight to the rerun viewer or to a recording.
+
+rerun is optional: this module is imported only where a view is requested. The view matches frames again with a
+matcher of its own, so that it does not affect that of the flight.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from engine.errors import BackendError
+from engine.matching.explanation import Explanation
+from engine.matching.matcher import SceneMatcher
+from engine.navigation.live import Answer
+from engine.navigation.navigator import Navigator
+from engine.navigation.state import NavigatorState
+from engine.values import Fix, Frame, NoFix, Window
+from scenematch.files.notes import frame_note
+from scenematch.files.resampling import UTC_FROM_NS
+from scenematch.files.track import track_row
+from scenematch.report.explain import (
+    SIDE_PX,
+    draw_matches,
+    draw_surface,
+    draw_window,
+    match_again,
+    stretch_contrast,
+    window_pixels,
+)
+from scenematch.report.live_shapes import (
+    FIX_RGB,
+    blueprint,
+    closed_polyline,
+    corners,
+    ellipsoid,
+    jpeg,
+    map_mesh,
+    outline,
+    padded,
+    resized,
+)
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+PICTURES = ("rectified", "window", "window/found", "window/fix", "surface", "surface/peak", "matches")
+"""Image entities that a frame may lack; they are cleared where it does."""
+PLACES = ("world/ellipse", "world/window", "world/seen")
+"""World entities that a frame may lack, in metres east, north and up of the map's origin."""
+ALWAYS = ("frame", "state", "plots/latency_ms", "log")
+"""Entities of every frame."""
+FIXED = ("world/fixes", "plots/sigma_m")
+"""Entities of every frame that has a fix."""
+
+STATE_RGB = {
+    NavigatorState.SEARCHING: (150, 150, 150),
+    NavigatorState.TRACKING: (0, 158, 115),
+    NavigatorState.COASTING: (230, 159, 0),
+    NavigatorState.LOST: (213, 94, 0),
+}
+"""Colours of the navigator's states."""
+
+_FRAME_PX = 960  # longer side of a frame's picture
+_TIMEOUT_S = 2.0
+_SEEN_RGB, _DOUBT_RGB = (240, 228, 66), (213, 94, 0)
+_log = logging.getLogger("scenematch")
+
+
+class LiveView:
+    """A rerun stream of the results of frames; created by :func:`open_live_view`.
+
+    Args:
+        stream: recording stream of rerun.
+        matcher: matcher of the flight; the view creates an equal one.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, matcher: SceneMatcher) -> None:
+        self._stream = stream
+        options = matcher.options
+        self._matcher = SceneMatcher(matcher.site, matcher.camera, matcher.method, matcher.device, options)
+        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.log("world/map", map_mesh(matcher.site), static=True)
+        words, colours = [state.value for state in STATE_RGB], list(STATE_RGB.values())
+        stream.log("state", rr.StateConfiguration(values=words, colors=colours), static=True)
+
+    def show(
+        self,
+        index: int,
+        name: str,
+        frame: Frame,
+        result: Fix | NoFix,
+        state: NavigatorState | None,
+        latency_ms: float,
+    ) -> None:
+        """Send the result of one frame.
+
+        Args:
+            index: index of the frame, ascending.
+            name: name of the frame.
+            frame: the frame as it was matched.
+            result: the fix or the refusal.
+            state: state of the navigator after it; None where the navigator is dead.
+            latency_ms: latency of the answer.
+        """
+        stream = self._stream
+        self._set_time(index, frame.timestamp_ns)
+        word = "dead" if state is None else state.value
+        entities = self._match_entities(name, frame, result, word, latency_ms)
+        for entity in (*PICTURES, *PLACES):
+            stream.log(entity, entities.get(entity) or rr.Clear(recursive=False))
+        image = _pixels(frame)
+        stream.log("frame", jpeg(resized(image, min(_FRAME_PX, max(image.shape[:2])))))
+        stream.log("state", rr.StateChange(state=word))
+        stream.log("plots/latency_ms", rr.Scalars(latency_ms))
+        if result.score is not None:
+            stream.log("plots/score", rr.Scalars(result.score))
+        if isinstance(result, Fix):
+            position_m = self._position_m(result, frame)
+            stream.log("world/fixes", rr.Points3D([position_m], colors=FIX_RGB, radii=rr.Radius.ui_points(3.0)))
+            stream.log("plots/sigma_m", rr.Scalars(result.sigma_m))
+        stream.log("log", rr.TextLog(_line(name, result), level="INFO" if isinstance(result, Fix) else "WARN"))
+
+    def close(self) -> None:
+        """Flush and end the stream."""
+        try:
+            self._stream.flush(timeout_sec=_TIMEOUT_S)
+        except RuntimeError as error:  # the viewer is gone, or the disk is full: the flight is over anyway
+            _log.warning("the live view is incomplete: %s", error)
+        self._stream.disconnect()
+
+    def _set_time(self, index: int, stamp_ns: int | None) -> None:
+        """Set frame number and capture time; stamps before UTC times are durations since the vehicle's start."""
+        self._stream.reset_time()
+        self._stream.set_time("frame", sequence=index)
+        if stamp_ns is None:
+            return
+        if stamp_ns >= UTC_FROM_NS:
+            self._stream.set_time("capture", timestamp=np.datetime64(stamp_ns, "ns"))
+        else:
+            self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
+
+    def _match_entities(
+        self, name: str, frame: Frame, result: Fix | NoFix, state: str, latency_ms: float
+    ) -> dict[str, Any]:
+        """Archetypes of a frame's match, by entity."""
+        site = self._matcher.site
+        seen: dict[str, Any] = {}
+        if isinstance(result, Fix):
+            seen["world/ellipse"] = ellipsoid(self._position_m(result, frame), result.covariance_m2)
+        row = track_row(name, result, latency_ms=latency_ms, deadline_met=None)
+        explained = match_again(self._matcher, frame, row, frame_note(name, result, state))
+        if explained is None:
+            return seen
+        window, found = explained
+        seen["world/window"] = outline(site, corners(window), (255, 255, 255))
+        if found.rectified is not None:
+            seen["rectified"] = jpeg(padded(resized(stretch_contrast(found.rectified), SIDE_PX)))
+        seen |= self._window_entities(window, found, result)
+        if found.surface is not None:
+            surface, peak = draw_surface(found.surface)
+            seen["surface"] = jpeg(padded(surface))
+            seen["surface/peak"] = rr.Points2D([peak], colors=(255, 255, 255), radii=rr.Radius.ui_points(2.0))
+        if found.matches is not None:
+            both = draw_matches(found, found.matches, site, window)
+            seen["matches"] = jpeg(padded(both, width_px=2 * SIDE_PX + 8))
+        return seen
+
+    def _window_entities(self, window: Window, found: Explanation, result: Fix | NoFix) -> dict[str, Any]:
+        """Archetypes of the window with the matched outline and the fix, and of that outline on the ground."""
+        site = self._matcher.site
+        picture, per_px = draw_window(site, window)
+        seen: dict[str, Any] = {"window": jpeg(padded(picture))}
+        if found.outline_px is not None:
+            colour = _SEEN_RGB if isinstance(result, Fix) else _DOUBT_RGB
+            strip = closed_polyline(window_pixels(found.outline_px, window, per_px))
+            seen["window/found"] = rr.LineStrips2D([strip], colors=colour, radii=rr.Radius.ui_points(1.0))
+            seen["world/seen"] = outline(site, found.outline_px, colour)
+        if isinstance(result, Fix):
+            fix_px = window_pixels(np.array(result.map_xy_px), window, per_px)
+            seen["window/fix"] = rr.Points2D([fix_px], colors=FIX_RGB, radii=rr.Radius.ui_points(5.0))
+        return seen
+
+    def _position_m(self, fix: Fix, frame: Frame) -> Array:
+        """(3,) east, north and up of a fix in metres; up by the frame's height where the match has none."""
+        up_m = fix.up_m
+        if up_m is None:
+            up_m = self._matcher.site.ground_at(np.array(fix.map_xy_px)) + (frame.height_agl_m or 0.0)
+        return np.array([fix.east_m, fix.north_m, up_m])
+
+
+class Watcher:
+    """Shows a bridge's answers from a thread of its own: only the newest is kept, and the bridge never waits.
+
+    Args:
+        view: the live view.
+    """
+
+    def __init__(self, view: LiveView) -> None:
+        self._view, self._count = view, 0
+        self._navigator: Navigator | None = None
+        self._waiting: queue.Queue[tuple[int, Answer, NavigatorState | None] | None] = queue.Queue(maxsize=1)
+        self._thread = threading.Thread(target=self._work, name="scenematch-view", daemon=True)
+        self._thread.start()
+
+    def follow(self, navigator: Navigator) -> Navigator:
+        """Read the state from this navigator from now on; returns it."""
+        self._navigator = navigator
+        return navigator
+
+    def __call__(self, answer: Answer) -> None:
+        """Submit the newest answer; one that still waits is dropped."""
+        state = None if self._navigator is None else self._navigator.state
+        with contextlib.suppress(queue.Empty):
+            self._waiting.get_nowait()
+        self._waiting.put_nowait((self._count, answer, state))  # called from one thread at a time
+        self._count += 1
+
+    def close(self) -> None:
+        """Show the last answer and end the view, waiting a few seconds at most."""
+        with contextlib.suppress(queue.Full):
+            self._waiting.put(None, timeout=_TIMEOUT_S)
+        self._thread.join(timeout=_TIMEOUT_S)
+        self._view.close()
+
+    def _work(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            index, answer, state = item
+            try:
+                self._view.show(index, str(index), answer.frame, answer.result, state, answer.age_ms)
+            except Exception:  # the flight continues without the view
+                _log.exception("the live view failed at frame %d", index)
+
+
+def open_live_view(matcher: SceneMatcher, recording: Path | None, address: str | None) -> LiveView:
+    """Open a live view to a recording, to a viewer, or to both.
+
+    Args:
+        matcher: matcher of the flight.
+        recording: a file ``.rrd``, replaced where it exists; None for none.
+        address: HOST:PORT of a rerun viewer; None for none.
+
+    Raises:
+        BackendError: the file cannot be written.
+    """
+    sinks = [] if address is None else [rr.GrpcSink(f"rerun+http://{address}/proxy")]
+    stream = rr.RecordingStream("scenematch")
+    try:
+        files = [] if recording is None else [rr.FileSink(str(recording))]
+        stream.set_sinks(*sinks, *files, default_blueprint=blueprint(matcher.site))
+    except RuntimeError as error:
+        raise BackendError(f"recording: {recording} cannot be written: {error}") from None
+    return LiveView(stream, matcher)
+
+
+def _pixels(frame: Frame) -> Image:
+    image = frame.image
+    return np.asarray(image if isinstance(image, np.ndarray) else image.cpu().numpy(), np.uint8)
+
+
+def _line(name: str, result: Fix | NoFix) -> str:
+    """The result of a frame in one line."""
+    if isinstance(result, Fix):
+        return f"{name}: fix, sigma {result.sigma_m:.2f} m, {result.method} {result.score:.2f}, {result.stage}"
+    return f"{name}: refused, {result.reason.value}" + (f": {result.detail}" if result.detail else "")

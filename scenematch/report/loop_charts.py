@@ -1,0 +1,76 @@
+"""What the report shows of a closed loop: the vehicle's distance from its plan, and the estimate it steered by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenematch.files.track import TrackRow
+from scenematch.report.charts import ChartArea, line
+from scenematch.report.loop_record import LoopRecord
+from scenematch.report.page_charts import Chart
+from scenematch.report.page_map import TrackMap, connected
+from scenematch.report.plot_data import TrackPlotData
+from scenematch.report.verdict import metres
+
+Array = NDArray[np.float64]
+
+LOOP_LEGEND = [
+    ("plan", '<path d="M0 7h22" class="line plan"/>'),
+    ("estimate", '<path d="M0 7h22" class="line estimate"/>'),
+]
+"""Of the map, beside that of a track."""
+
+
+def loop_sentence(loop: LoopRecord) -> str:
+    """The verdict on the loop in one sentence."""
+    off = loop.off_plan_m
+    rms_m, estimate_m = (
+        float(np.sqrt(np.mean(values**2))) for values in (off, loop.estimate_error_m[loop.settled])
+    )
+    return (
+        f"Closed loop: steered by the fixes, the vehicle was {metres(rms_m)} RMS and at most "
+        f"{metres(float(off.max()))} from its plan, with an estimate that was {metres(estimate_m)} RMS off."
+    )
+
+
+def loop_marks(track_map: TrackMap, loop: LoopRecord) -> list[str]:
+    """Plan and estimate as lines on the map."""
+    plan, estimate = (connected(track_map, places[:, :2]) for places in (loop.plan_m, loop.estimate_m))
+    return [line(estimate, "estimate"), line(plan, "plan")]
+
+
+def draw_loop_charts(loop: LoopRecord, rows: Sequence[TrackRow], plot_data: TrackPlotData) -> list[Chart]:
+    """Distance from the plan, and the estimate's error with its sigma, on the time axis of the track's charts.
+
+    Args:
+        loop: the samples.
+        rows: the track, with its stamps.
+        plot_data: plot data of the track.
+    """
+    start_ns = rows[0].timestamp_ns
+    if start_ns is None:
+        return []
+    time = (loop.timestamp_ns - start_ns) / 1e9
+    limits = (float(plot_data.time[0]), float(plot_data.time[-1]))
+    settled = loop.settled  # the initial uncertainty would set the scale
+    plan = ChartArea(limits, (0.0, 1.1 * max(0.1, float(loop.off_plan_m.max()))))
+    top = 1.1 * max(0.1, float(loop.estimate_error_m[settled].max()), float(3.0 * loop.sigma_m[settled].max()))
+    estimate = ChartArea(limits, (0.0, top))
+    zero = np.zeros(len(time))
+    inside = (time >= limits[0]) & (time <= limits[1])
+    sick = np.where(loop.healthy, np.nan, top)
+    estimate_marks = [
+        estimate.band(time[inside], zero[inside], sick[inside], "unhealthy"),
+        estimate.band(time[inside], zero[inside], 3.0 * loop.sigma_m[inside], "sigma-band"),
+        estimate.line(time[inside], loop.estimate_error_m[inside], "estimate"),
+    ]
+    off = "Distance of the vehicle from its plan (m)"
+    error = "Error of the estimate (m), on three of its sigmas; red: no recent fix"
+    label = plot_data.time_label
+    return [
+        (off, plan.svg(off, label, [plan.line(time[inside], loop.off_plan_m[inside], "plan")], timed=True)),
+        (error, estimate.svg(error, label, estimate_marks, timed=True)),
+    ]

@@ -1,0 +1,203 @@
+"""The map of a report: the part that was flown over, in colour, with tracks, truth and error ellipses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.orthomap import OrthoMap
+from engine.values import Window
+from engine.window import level_crop
+from scenematch.report.charts import crosses, dots, line, ticks
+from scenematch.report.explain import jpeg_data_uri
+from scenematch.report.plot_data import TrackPlotData
+
+Array = NDArray[np.float64]
+
+_MAX_MAP_PX = 1500  # longer side as drawn
+_MAP_BYTES = 900_000
+_MARGIN_SHARE, _MARGIN_PX = 0.12, 40.0
+_ASPECTS = (0.62, 0.95)  # range of height over width, as far as the map allows
+_MAX_ELLIPSES = 40
+_SIGMAS = 3.0
+_MAX_STEP_M = 60.0  # between positions that a line connects, unless the median step is large
+
+
+@dataclass(frozen=True, slots=True)
+class TrackMap:
+    """The part of the map that the report draws.
+
+    Attributes:
+        site: the map.
+        window: the part that is drawn, in full-resolution pixels.
+        level: pyramid level from which it is drawn.
+    """
+
+    site: OrthoMap
+    window: Window
+    level: int
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """SVG view box in pixels of the level: x, y, width and height."""
+        scale = 2.0**self.level
+        return (0.0, 0.0, round(self.window.width_px / scale, 1), round(self.window.height_px / scale, 1))
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Width and height on the ground in metres."""
+        return (
+            self.window.width_px * self.site.gsd_m_per_px,
+            self.window.height_px * self.site.gsd_m_per_px,
+        )
+
+    def drawing_xy(self, en_m: Array) -> Array:
+        """East and north (..., 2) in metres as x and y (..., 2) of the drawing."""
+        corner = np.array([self.window.x0, self.window.y0]) - 0.5
+        return np.asarray((self.site.pixel_from_enu(en_m) - corner) / 2.0**self.level, np.float64)
+
+    def rectangle(self, window: Window) -> tuple[float, float, float, float]:
+        """A window of the map in units of the drawing: x, y, width and height."""
+        x, y = ((a - b) / 2.0**self.level for a, b in ((window.x0, self.window.x0), (window.y0, self.window.y0)))
+        return (round(x, 1), round(y, 1), window.width_px / 2.0**self.level, window.height_px / 2.0**self.level)
+
+
+def map_of_tracks(site: OrthoMap, tracks: Sequence[TrackPlotData], view_px: float = 0.0) -> TrackMap:
+    """The part of the map with fixes, refusals and truth, and a margin; the whole map without any of them.
+
+    Args:
+        site: the map.
+        tracks: one, or several that are drawn together.
+        view_px: side of what one frame was matched with; the part is no smaller, however little was flown.
+    """
+    positions_m = np.concatenate([p for data in tracks for p in _positions_m(data)])
+    pixels = site.pixel_from_enu(positions_m[np.isfinite(positions_m).all(axis=1)])
+    size = np.array([site.width_px, site.height_px], np.float64)
+    low, high = np.zeros(2), size
+    if len(pixels):
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        middle, span = (low + high) / 2.0, (high - low) * (1.0 + 2.0 * _MARGIN_SHARE) + 2.0 * _MARGIN_PX
+        span = np.maximum(span, view_px)
+        span = np.maximum(span, [span[1] / _ASPECTS[1], span[0] * _ASPECTS[0]])
+        span = np.minimum(span, size)
+        low = np.clip(middle - span / 2.0, 0.0, size - span)
+        high = low + span
+    x0, y0 = (int(v) for v in low)
+    width, height = (int(v) for v in np.ceil(high) - [x0, y0])
+    level = 0
+    while max(width, height) >> level > _MAX_MAP_PX and level + 1 < site.levels:
+        level += 1
+    return TrackMap(site, Window(x0, y0, width, height), level)
+
+
+def _positions_m(data: TrackPlotData) -> tuple[Array, Array, Array]:
+    return data.errors.fix_en_m, data.errors.truth_en_m, data.refused_en_m
+
+
+def draw_map(track_map: TrackMap, label: str, marks: Sequence[str]) -> str:
+    """The map as SVG, with marks on it, from bottom to top, and a scale bar.
+
+    Args:
+        track_map: the part that is drawn.
+        label: alternative text.
+        marks: SVG elements in units of the drawing.
+    """
+    _, _, width, height = track_map.box
+    ground = (
+        f'<image href="{jpeg_data_uri(_ground(track_map), _MAP_BYTES)}" width="{width:g}" height="{height:g}" '
+    )
+    head = f'<svg class="map" id="map" viewBox="0 0 {width:g} {height:g}" role="img"'
+    head = f'{head} aria-label="{escape(label, quote=True)}">{ground}preserveAspectRatio="none" class="ground"/>'
+    return f"{head}{''.join(marks)}{_scale_bar(track_map)}</svg>"
+
+
+def track_marks(track_map: TrackMap, data: TrackPlotData) -> list[str]:
+    """The marks of one track: path, ellipses, fixes, refusals, fixes beyond three sigmas, the selected frame."""
+    fixes, beyond = track_map.drawing_xy(data.errors.fix_en_m), data.errors.beyond
+    refused = track_map.drawing_xy(data.refused_en_m)
+    _, _, width, height = track_map.box
+    arm = max(width, height) / 170.0
+    kind, path = _path(track_map, data)
+    return [
+        line(path, "halo"),
+        _ellipses(track_map, data),
+        dots(fixes, "under"),
+        dots(fixes[~beyond], "fix"),
+        line(path, kind),
+        crosses(refused, "refused", arm),
+        crosses(fixes[beyond], "beyond", arm),
+        '<rect class="now-window" id="now-window" width="0" height="0"/><path class="dots now" id="now" d=""/>',
+    ]
+
+
+def _ground(track_map: TrackMap) -> NDArray[np.uint8]:
+    """The picture of the map, (h, w, 3) in colour where the map has colours, else (h, w) in grey."""
+    crop = level_crop(track_map.site, track_map.window, track_map.level)
+    valid = track_map.site.valid(crop, track_map.level)
+    _, _, width, height = track_map.box
+    colour = track_map.site.rgb(track_map.window, (max(1, round(height)), max(1, round(width))))
+    picture = track_map.site.gray(crop, track_map.level) if colour is None else colour
+    if valid.shape != picture.shape[:2]:
+        valid = cv2.resize(valid.astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+    picture[~valid] = 238
+    return picture
+
+
+def connected(track_map: TrackMap, positions_m: Array) -> Array:
+    """Positions (N, 2) in units of the drawing; NaN after a step that no line should cross."""
+    step_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+    median_step_m = float(np.nanmedian(step_m)) if np.isfinite(step_m).any() else 0.0
+    points = track_map.drawing_xy(positions_m)
+    points[1:][step_m > max(_MAX_STEP_M, 5.0 * median_step_m)] = np.nan
+    return points
+
+
+def _path(track_map: TrackMap, data: TrackPlotData) -> tuple[str, Array]:
+    """The true path, or without truth that of the fixes: its class, and its points in units of the drawing."""
+    truth = data.errors.truth_en_m
+    kind, positions_m = ("truth", truth) if np.isfinite(truth).any() else ("path", data.errors.fix_en_m)
+    return kind, connected(track_map, positions_m)
+
+
+def _ellipses(track_map: TrackMap, data: TrackPlotData) -> str:
+    """Outlines of three sigmas about some fixes, so far apart that each can be read."""
+    errors = data.errors
+    known = np.flatnonzero(np.isfinite(errors.fix_en_m[:, 0]) & np.isfinite(errors.covariance_en_m2[:, 0, 0]))
+    parts: list[str] = []
+    drawn: list[tuple[float, float, float]] = []  # x, y and the longer half axis
+    scale = 2.0**track_map.level
+    apart = max(track_map.box[2:]) / _MAX_ELLIPSES
+    for i, (x, y) in zip(known, track_map.drawing_xy(errors.fix_en_m[known]).tolist(), strict=True):
+        if any(np.hypot(x - u, y - v) < max(apart, c) for u, v, c in drawn):
+            continue
+        to_px = np.linalg.inv(track_map.site.enu_jacobian(track_map.site.pixel_from_enu(errors.fix_en_m[i])))
+        values, vectors = np.linalg.eigh(to_px @ errors.covariance_en_m2[i] @ to_px.T / scale**2)
+        a, b = _SIGMAS * np.sqrt(np.maximum(values[::-1], 0.0))
+        if any(np.hypot(x - u, y - v) < a + c for u, v, c in drawn):
+            continue
+        drawn.append((x, y, float(a)))
+        angle_deg = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        at = f"translate({x:.1f} {y:.1f}) rotate({angle_deg:.0f})"
+        shape = f'rx="{a:.2f}" ry="{b:.2f}" transform="{at}"/>'
+        parts.append(f'<ellipse class="rim" {shape}<ellipse class="ellipse" {shape}')
+    shown = np.unique(np.round(np.linspace(0, len(parts) - 1, min(len(parts), _MAX_ELLIPSES))).astype(int))
+    return "".join(parts[i] for i in shown)
+
+
+def _scale_bar(track_map: TrackMap) -> str:
+    """A scale bar of a round length, about a fifth of the width."""
+    _, _, width, height = track_map.box
+    unit_m = track_map.site.gsd_m_per_px * 2.0**track_map.level
+    length_m, text = ticks(0.0, width * unit_m, 5)[1]
+    x, y, end = 0.03 * width, height - 0.03 * width, 0.03 * width + length_m / unit_m
+    bar = f'd="M{x:.1f} {y:.1f}H{end:.1f}"'
+    name = f'<text x="{x:.1f}" y="{y - 0.014 * width:.1f}" '
+    return (
+        f'<path class="scale-under" {bar}/><path class="scale-bar" {bar}/>'
+        f'{name}style="--width: {width:g}">{text} m, north up</text>'
+    )

@@ -1,0 +1,136 @@
+"""Figures and tables of the report: key figures, errors by segment, refusals, inputs and versions."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import metadata
+from typing import Any
+
+import cv2
+import numpy as np
+
+from engine.values import Reason
+from scenematch.files.track import TrackRow
+from scenematch.report.explain import SliderFrame
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.page_parts import table
+from scenematch.report.verdict import MEANINGS, metres
+
+_FACTS = {
+    "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
+    "frames": "frames", "every": "one frame in", "image_topic": "image topic", "telemetry": "telemetry",
+    "odometry_topic": "velocity from", "frame_stamps": "frame stamps",
+    "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
+    "device": "device", "start": "start", "budget_ms": "budget (ms)",
+}  # fmt: skip
+
+
+def median_sigma_m(rows: Sequence[TrackRow]) -> float | None:
+    """Median over fixes of the larger stated sigma, in metres; None without fixes."""
+    sigmas = [
+        max(row.sigma_east_m, row.sigma_north_m)
+        for row in rows
+        if row.sigma_east_m is not None and row.sigma_north_m is not None
+    ]
+    return float(np.median(sigmas)) if sigmas else None
+
+
+def draw_tiles(track: FinishedTrack) -> list[tuple[str, str]]:
+    """Label and value of the key figures that are known."""
+    summary = track.summary
+    share = summary["availability"]
+    tiles = [(f"fixed, {summary['fixes']} of {summary['frames']}", "-" if share is None else f"{share:.1%}")]
+    if summary.get("median_m") is not None:
+        tiles += [
+            ("median error", metres(summary["median_m"])),
+            ("95 % of errors below", metres(summary["r95_m"])),
+            ("largest error", metres(summary["max_m"])),
+        ]
+        if summary["nees_mean"] is not None:
+            tiles += [
+                ("within 3 stated sigmas; 98.9 % if consistent", f"{summary['within_3_sigma']:.1%}"),
+                ("within 1 stated sigma; 39.3 % if consistent", f"{summary['within_1_sigma']:.1%}"),
+                ("NEES: 2 is consistent, less cautious, more overconfident", f"{summary['nees_mean']:.2f}"),
+            ]
+    elif (sigma_m := median_sigma_m(track.rows)) is not None:
+        tiles.append(("stated by the fixes, not measured: median sigma", metres(sigma_m)))
+        if (p95_m := summary.get("stated_sigma_p95_m")) is not None:
+            tiles.append(("stated, not measured: 95 % of the sigmas below", metres(p95_m)))
+        if (motion := summary.get("motion_consistency")) is not None:
+            every = f"{motion['steps']} steps of {motion['interval_s']:.2g} s"
+            tiles += [
+                (f"off the telemetry's velocity from fix to fix, median of {every}", metres(motion["median_m"])),
+                ("95 % of these steps below; an offset that stays does not show", metres(motion["p95_m"])),
+            ]
+    if summary.get("height_rms_m") is not None:
+        tiles.append(("RMS error of height", metres(summary["height_rms_m"])))
+    for name, key in (("latency, median", "p50"), ("latency, 95 % below", "p95")):
+        if summary["latency_ms"][key] is not None:
+            tiles.append((name, f"{summary['latency_ms'][key]:.1f} ms"))
+    return tiles
+
+
+def draw_segments(summary: Mapping[str, Any]) -> str:
+    """The table of errors by segment; empty without any."""
+    rows = []
+    for one in summary.get("segments") or ():
+        length = f"{one['length_m']:g} m" if "length_m" in one else f"{one['duration_s']:g} s"
+        rows.append((length, str(one["segments"]), *(metres(one[key]) for key in ("median_m", "p95_m", "max_m"))))
+    if not rows:
+        return ""
+    words = (
+        "How far the displacement between two fixes is off, by their distance along the true path, or in time: "
+        "evo's relative pose error of the positions, all pairs. An offset that stays the same does not show here."
+    )
+    return f'<p class="sub">{words}</p>\n' + table(("segment", "number", "median", "95 % below", "largest"), rows)
+
+
+def draw_refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
+    """Table of reasons, most frequent first, with the detail of one refusal each."""
+    if not track.summary["reasons"]:
+        return "<p>No frame was refused.</p>" if track.rows else "<p>There are no frames.</p>"
+    lines = []
+    for name, count in track.summary["reasons"].items():
+        indices = [i for i, row in enumerate(track.rows) if row.reason == name]
+        known = set(indices)
+        position = next((k for k, item in enumerate(shown) if item.index in known), None)
+        index = indices[0] if position is None else shown[position].index
+        detail = (track.notes[index].detail if track.notes else None) or "-"
+        button = (
+            "" if position is None else f'<button class="goto" type="button" data-goto="{position}">show</button>'
+        )
+        cells = (name.replace("_", " "), MEANINGS[Reason(name)], f"{track.rows[index].frame}: {detail}")
+        text = "".join(f"<td>{escape(cell)}</td>" for cell in cells[:2])
+        text += f'<td class="break">{escape(cells[2])}</td><td>{button}</td>'
+        lines.append(f'<tr><td class="count">{count}</td>{text}</tr>')
+    head = "<th>frames</th><th>reason</th><th>meaning</th><th>for example</th><th></th>"
+    return f'<table class="reasons"><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table>'
+
+
+def draw_inputs(settings: Mapping[str, Any]) -> str:
+    """Inputs and settings, changes from the defaults, and versions."""
+
+    def listed(pairs: Sequence[tuple[str, str]]) -> str:
+        body = "".join(f'<tr><td>{escape(k)}</td><td class="break">{escape(v)}</td></tr>' for k, v in pairs)
+        return f"<table><tbody>{body}</tbody></table>"
+
+    inputs = [(name, "-" if settings.get(key) is None else str(settings[key])) for key, name in _FACTS.items()]
+    if settings.get("heights"):
+        inputs.append(
+            ("heights from", ", ".join(f"{source} ({count})" for source, count in settings["heights"].items()))
+        )
+    changes = [(name, str(value)) for name, value in (settings.get("changed") or {}).items()]
+    changed = listed(changes) if changes else "<p>Nothing.</p>"
+    versions = [
+        ("scenematch", metadata.version("scenematch-engine")),
+        ("torch", metadata.version("torch")),
+        ("OpenCV", cv2.__version__),
+        ("numpy", np.__version__),
+        ("Python", platform.python_version()),
+    ]
+    return (
+        f"<div><h3>Inputs and settings</h3>{listed(inputs)}</div>"
+        f"<div><h3>Changed from the defaults</h3>{changed}<h3>Versions</h3>{listed(versions)}</div>"
+    )

@@ -1,0 +1,178 @@
+"""comparison.html: several finished tracks on one map and one time axis, with their figures in one table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import OptionError
+from scenematch.report.charts import ChartArea, Limits, dots, line
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.metrics import FALSE_SIGMAS
+from scenematch.report.page_charts import Chart, column
+from scenematch.report.page_map import connected, draw_map, map_of_tracks
+from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
+from scenematch.report.page_tables import median_sigma_m
+from scenematch.report.plot_data import TrackPlotData, larger_variance_m2
+from scenematch.report.verdict import metres, verdict_of
+
+Array = NDArray[np.float64]
+
+MAX_RUNS = 6
+"""As many as there are colours that can be told apart."""
+_GRADES = ("bad", "mixed", "open", "good")
+
+
+def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
+    """Write the page; equal inputs give equal bytes.
+
+    Args:
+        path: the file, replaced where it exists.
+        tracks: by the names of their runs, all of them with the same map.
+
+    Raises:
+        OptionError: there are none, or more than :data:`MAX_RUNS`.
+    """
+    if not 1 <= len(tracks) <= MAX_RUNS:
+        raise OptionError(f"runs: expected 1 to {MAX_RUNS}, got {len(tracks)}")
+    data = {name: track.plot_data() for name, track in tracks.items()}
+    first = next(iter(tracks.values()))
+    track_map = map_of_tracks(first.site, list(data.values()))
+    verdicts = {
+        name: verdict_of(track.summary, median_sigma_m(track.rows), track.summary["settings"].get("budget_ms"))
+        for name, track in tracks.items()
+    }
+    truth = next((d.errors.truth_en_m for d in data.values() if np.isfinite(d.errors.truth_en_m).any()), None)
+    true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
+    marks = [line(true_path, "halo"), *_run_marks(data, track_map), line(true_path, "truth")]
+    drawn = draw_map(track_map, f"Map with the tracks of {', '.join(tracks)}.", marks)
+    legend = (
+        [("truth", '<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="truth"/>')] if len(true_path) else []
+    )
+    body = [
+        section("Figures", _figures(tracks)),
+        section("Where", f"{map_with_legend(drawn, track_map, legend)}\n{_switches(tracks)}", "map-section"),
+        section("When", charts_with_axis(_charts(tracks, data), _run_legend(tracks))),
+    ]
+    grades = {verdict.grade for verdict in verdicts.values()}
+    fill_page(
+        path,
+        heading=first.name,
+        subheading=f"{len(tracks)} runs: {', '.join(tracks)}",
+        grade=next(grade for grade in _GRADES if grade in grades),
+        verdict="\n".join(f"<p><b>{escape(n)}</b>: {escape(v.accuracy)}</p>" for n, v in verdicts.items()),
+        body=body,
+        data={"box": track_map.box, "frames": []},
+    )
+
+
+def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
+    """The table of figures of merit, a run a row."""
+    head = ("run", "method", "fixed", "median", "95 % below", "largest", "within 3 sigma", "NEES", "latency 95 %")
+
+    def cells(name: str, track: FinishedTrack) -> tuple[str, ...]:
+        summary = track.summary
+
+        def shown(key: str, form: Any) -> str:
+            return "-" if summary.get(key) is None else str(form(summary[key]))
+
+        p95_ms = summary["latency_ms"]["p95"]
+        return (
+            name,
+            track.method,
+            shown("availability", "{:.1%}".format),
+            *(shown(key, metres) for key in ("median_m", "r95_m", "max_m")),
+            shown("within_3_sigma", "{:.1%}".format),
+            shown("nees_mean", "{:.2f}".format),
+            "-" if p95_ms is None else f"{p95_ms:.1f} ms",
+        )
+
+    return table(head, [cells(name, track) for name, track in tracks.items()])
+
+
+def _run_marks(data: Mapping[str, TrackPlotData], track_map: Any) -> list[str]:
+    """Fixes and path of each run in its colour."""
+    return [
+        f'<g class="run{index}">{line(path, f"r{index} thin")}{dots(path, f"r{index}")}</g>'
+        for index, path in enumerate(connected(track_map, d.errors.fix_en_m) for d in data.values())
+    ]
+
+
+def _switches(tracks: Mapping[str, FinishedTrack]) -> str:
+    """The legend of the runs, each with a box that hides it on map and charts."""
+    items = "".join(
+        f'<li><label><input type="checkbox" data-run="{index}" checked>'
+        f'<svg aria-hidden="true"><path class="dots r{index}" d="M11 7h0"/></svg>{escape(name)}</label></li>'
+        for index, name in enumerate(tracks)
+    )
+    return f'<ul class="legend">{items}</ul>'
+
+
+def _run_legend(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, str]]:
+    return [(name, f'<path class="dots r{index}" d="M11 7h0"/>') for index, name in enumerate(tracks)]
+
+
+def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotData]) -> list[Chart]:
+    """Error, error in sigmas, and latency over time, and the share of frames by error; those with data.
+
+    Those over time are left out where the stamps of a run are missing and those of another are not.
+    """
+    ends = [float(d.time[-1]) for d in data.values() if d.time.size]
+    labels = {d.time_label for d in data.values() if d.time.size}
+    if len(labels) > 1:  # seconds of some runs, and numbers of frames of others, have no common axis
+        found = _cumulative([d.errors.distance_m for d in data.values()])
+        return [] if found is None else [found]
+    if not ends or not max(ends):
+        return []
+    time: Limits = (0.0, max(ends))
+    series = {
+        "Horizontal error (m)": [d.errors.distance_m for d in data.values()],
+        f"Horizontal error, in stated sigmas; {FALSE_SIGMAS:g} is the limit": [
+            np.sqrt(d.errors.normalised_squared_errors) for d in data.values()
+        ],
+        "Stated sigma (m)": [np.sqrt(larger_variance_m2(d.errors.covariance_en_m2)) for d in data.values()],
+        "Latency (ms)": [column(track.rows, "latency_ms") for track in tracks.values()],
+    }
+    (label,) = labels
+    times = [d.time for d in data.values()]
+    charts = [_over_time(what, label, time, times, values) for what, values in series.items()]
+    charts.append(_cumulative(next(iter(series.values()))))
+    return [chart for chart in charts if chart is not None]
+
+
+def _over_time(
+    what: str, label: str, time: Limits, times: Sequence[Array], values: Sequence[Array]
+) -> Chart | None:
+    known = np.concatenate(values)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        return None
+    area = ChartArea(time, (0.0, max(1.2 * float(np.percentile(known, 97)), 0.1)))
+    marks = [
+        f'<g class="run{i}">{area.dots(t, v, f"r{i}")}{area.overflow(t, v, f"over r{i}")}</g>'
+        for i, (t, v) in enumerate(zip(times, values, strict=True))
+    ]
+    return what, area.svg(f"{what} over time", label, marks, timed=True)
+
+
+def _cumulative(errors_m: Sequence[Array]) -> Chart | None:
+    """Share of all frames, refused ones among them, that are answered within so many metres."""
+    known = np.concatenate(errors_m)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        return None
+    top = 1.2 * float(np.percentile(known, 99))
+    area = ChartArea((0.0, top), (0.0, 1.02))
+    marks = []
+    for i, errors in enumerate(errors_m):
+        order = np.sort(errors[np.isfinite(errors) & (errors <= top)])
+        x = np.concatenate([[0.0], np.repeat(order, 2), [top]])
+        y = np.concatenate([[0.0], np.repeat(np.arange(order.size + 1), 2)[1:]]) / max(1, errors.size)
+        marks.append(f'<g class="run{i}">{area.line(x, y, f"r{i}")}</g>')
+    what = "Share of all frames within an error"
+    return what, area.svg(what, "horizontal error (m)", marks, timed=False)

@@ -1,0 +1,130 @@
+"""The verdict on a track in two sentences, and the meaning of each reason for a refusal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from engine.values import Reason
+from scenematch.report.metrics import WRONG_M
+
+MEANINGS = {
+    Reason.NO_TEXTURE: "The picture is almost flat, or covers next to nothing of the map.",
+    Reason.OUTSIDE_MAP: "The window lies outside the map, or on parts of it that hold no data.",
+    Reason.AMBIGUOUS: "Another position matches nearly as well, or the best one lies at the window's edge.",
+    Reason.LOW_SCORE: "The best match may be chance: the frame may not show this part of the map.",
+    Reason.TOO_FEW_MATCHES: "Fewer features were matched than a pose requires.",
+    Reason.BAD_POSE: "No pose explains enough of the matches, or only one that is implausible for a drone.",
+    Reason.INCONSISTENT: "Two methods, or the match and a well-known prediction, contradict each other.",
+    Reason.UNCONFIRMED: "Only the match itself supports the position, and too few other fixes agree yet.",
+    Reason.NO_HEIGHT: "The telemetry gives no height above the ground, which sets the scale of a frame.",
+    Reason.NO_HEADING: "The telemetry gives no heading, without which a frame cannot be rotated.",
+    Reason.MAP_TOO_LARGE: "The position was too uncertain: the part of the map to search is too large.",
+    Reason.TILTED: "A corner of the frame looks so near the horizon that the ground is stretched beyond use.",
+    Reason.LATE: "The answer came after the budget, or could not have come within it.",
+    Reason.FAILED: "The frame could not be used: it repeats the last one, or the worker that matched it died.",
+}
+"""One sentence for each reason; ``docs/integrity.md`` has the rules behind them."""
+
+# Of fixes with a consistent covariance 1 % lie beyond three sigmas, and the mean NEES is 2.
+_BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
+_CAUTIOUS = 2.0  # sigmas so many times the errors are said to be
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The verdict on a track.
+
+    Attributes:
+        grade: "good", "mixed" or "bad"; "open" where there is no truth.
+        accuracy: one sentence on availability and accuracy.
+        latency: one sentence on latency.
+    """
+
+    grade: str
+    accuracy: str
+    latency: str
+
+
+def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
+    """The verdict on a track, after what a diagnosis of the inputs found, where there was one.
+
+    Args:
+        summary: figures of merit by :func:`scenematch.report.metrics.summarise`.
+        sigma_m: median of the sigmas that the fixes state, or None without fixes.
+        budget_ms: latency budget of each frame, or None.
+    """
+    verdict = _judged(summary, sigma_m, budget_ms)
+    found = summary.get("settings", {}).get("diagnosis") or {}
+    said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in found.values()]
+    return replace(verdict, accuracy=" ".join([*said, verdict.accuracy]))
+
+
+def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
+    """The verdict by the figures of merit alone."""
+    frames, fixes = summary["frames"], summary["fixes"]
+    fixed = f"{fixes} of {frames} frames fixed"
+    late = _latency(summary, budget_ms)
+    if not frames:
+        return Verdict("bad", "The track has no frames.", late)
+    if not fixes:
+        text = f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}."
+        return Verdict("bad", text, late)
+    if not summary.get("scored_fixes"):
+        stated = "" if sigma_m is None else f"; half of them state a sigma below {metres(sigma_m)}"
+        text = f"{fixed}{stated}. Without truth their accuracy is unknown, and whether the map is where it says."
+        return Verdict("open", text, late)
+    spread = f"half of the fixes within {metres(summary['median_m'])} of the truth, the worst "
+    spread += f"{metres(summary['max_m'])} off"
+    if summary["scored_fixes"] < fixes:
+        spread += f" ({summary['scored_fixes']} of {fixes} fixes have a truth)"
+    if summary["false_fixes"]:
+        false = _count(summary["false_fixes"], "fix is", "fixes are")
+        text = f"{false} false: beyond three of their own sigmas and more than {WRONG_M:g} m off"
+        return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
+    beyond, nees = summary["beyond_3_sigma"], summary["nees_mean"]
+    if nees is None:
+        return Verdict("mixed", f"{fixed}, without a covariance to judge them by; {spread}.", late)
+    if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or nees > _MOST_NEES:
+        text = f"{beyond} of {summary['scored_fixes']} fixes are off by more than three of their own sigmas"
+        text += f" (mean NEES {nees:.0f}, 2 is expected): something is off by more than it states"
+        return Verdict("bad", f"{text}; {fixed}, {spread}.", late)
+    grade = "good" if fixes >= 0.9 * frames and not summary["deadlines_missed"] else "mixed"
+    within = "all" if not beyond else f"all but {beyond}"
+    text = f"{fixed}, {within} within three of their own sigmas; {spread}.{_caution(nees)}"
+    return Verdict(grade, text, late)
+
+
+def _caution(nees: float) -> str:
+    """A sentence on sigmas that are much larger than the errors; empty where they fit."""
+    factor = math.sqrt(2.0 / max(nees, 1e-6))
+    if factor < _CAUTIOUS:
+        return ""
+    return f" The stated sigmas are cautious: about {factor:.0f} times what the errors show."
+
+
+def _latency(summary: Mapping[str, Any], budget_ms: float | None) -> str:
+    p95_ms, missed = summary["latency_ms"]["p95"], summary["deadlines_missed"]
+    if p95_ms is None:
+        return "No latencies were recorded."
+    latency = f"95 % of the answers took less than {p95_ms:.1f} ms"
+    if budget_ms is None:
+        return f"{latency}; no budget was set."
+    if missed:
+        return f"{_count(missed, 'answer', 'answers')} came after the budget of {budget_ms:g} ms; {latency}."
+    return f"{latency}, all of them within the budget of {budget_ms:g} ms."
+
+
+def _main_reason(summary: Mapping[str, Any]) -> str:
+    return next(iter(summary["reasons"]), "unknown").replace("_", " ")
+
+
+def _count(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
+
+def metres(value: float) -> str:
+    """Format a length: centimetres below 10 m, decimetres below 100 m."""
+    return f"{value:.2f} m" if value < 10.0 else f"{value:.1f} m" if value < 100.0 else f"{value:,.0f} m"

@@ -1,0 +1,116 @@
+"""Measure how late a camera's pictures arrive, by the attitude of the autopilot that it is mounted on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from engine.errors import BackendError, OptionError, TelemetryError, require
+from engine.navigation.lag import Lag, camera_lag, turn_between
+from engine.values import Frame, NoFix, Reason
+from scenematch.bridges.links import parse_connection
+from scenematch.bridges.pictures import CapturedImage, capture
+from scenematch.runs.cameras import CameraFiles
+from scenematch.runs.folders import StrPath
+from scenematch.runs.progress import SILENT, Progress
+
+if TYPE_CHECKING:
+    from scenematch.bridges.mavlink_in import MavlinkTelemetry
+
+_SAMPLE_NS = 20_000_000  # of the attitude
+_SETTLED_NS = 200_000_000  # after which no older attitude arrives
+
+
+class _Idle:
+    """A navigator that has nothing to do: the bridge is opened for its telemetry."""
+
+    def update(self, frame: Frame, prior: object = None, budget: object = None) -> NoFix:
+        return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
+
+
+def measure_camera_delay(
+    connect: str,
+    camera: StrPath | None,
+    camera_source: str,
+    *,
+    hfov_deg: float | None = None,
+    seconds: float = 20.0,
+    mount: str | None = None,
+    firmware: str = "ardupilot",
+    system_id: int = 1,
+    key: StrPath | None = None,
+    listen_anywhere: bool = False,
+    progress: Progress = SILENT,
+) -> Lag:
+    """The time from exposure to grab, while the vehicle is tilted to and fro by hand over a textured ground.
+
+    Args:
+        connect: the autopilot, as of the bridge.
+        camera: calibration; None is by ``hfov_deg``.
+        camera_source: as of the bridge.
+        hfov_deg: horizontal field of view, in place of a calibration.
+        seconds: how long pictures are taken.
+        mount: how the camera is mounted, by name; None is the calibration's.
+        firmware: of the autopilot, "ardupilot" or "px4".
+        system_id: of the vehicle; others are not heard.
+        key: secret of MAVLink's signing; with it unsigned packets are ignored.
+        listen_anywhere: allow udpin on addresses that other machines reach.
+        progress: is shown what to do.
+
+    Raises:
+        OptionError: neither or both of calibration and field of view are given.
+        BackendError: the link cannot be opened.
+        TelemetryError: the camera does not open, or what it shows does not agree with the attitude.
+    """
+    require("pymavlink", "mavlink")
+    from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions
+    from scenematch.bridges.packets import read_key
+
+    if camera is None and hfov_deg is None:
+        raise OptionError("camera: expected a calibration, or `hfov_deg`")
+    calibration = None if camera is None else Path(camera)
+    described = CameraFiles(calibration=calibration, hfov_deg=hfov_deg, mount=mount)
+    model = described.load_live(camera_source, progress=progress)
+    options, secret = MavlinkOptions(firmware=firmware), None if key is None else read_key(Path(key))
+    connection = parse_connection(connect, listen_anywhere=listen_anywhere)
+    try:
+        idle: Any = _Idle()
+        bridge = MavlinkBridge(connection, lambda _: idle, options, system_id=system_id, key=secret)
+    except OSError as error:
+        raise BackendError(f"connect: {connect} cannot be opened: {error.strerror or error}") from None
+    progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")
+    with bridge, closing(capture(camera_source)) as pictures:
+        times_s, turns_rad, attitude = _recorded(bridge.telemetry, pictures, model.focal_px, seconds)
+    if not attitude:
+        raise TelemetryError(f"connect: expected an autopilot that reports its attitude, got none on {connect}")
+    return camera_lag(np.array(times_s), np.array(turns_rad), np.array(attitude), model.mount)
+
+
+def _recorded(
+    telemetry: MavlinkTelemetry, pictures: Iterator[CapturedImage | None], focal_px: float, seconds: float
+) -> tuple[list[float], list[float], list[tuple[float, float, float, float]]]:
+    """Arrival times of pictures, the turns between them, and samples of the attitude."""
+    times_s, turns_rad, attitude, before = [], [], [], None
+    begin_ns = next_ns = time.monotonic_ns()
+    for picture in pictures:
+        now_ns = time.monotonic_ns()
+        while next_ns < now_ns - _SETTLED_NS:
+            state = telemetry.vehicle(next_ns)
+            if state.roll_deg is not None and state.pitch_deg is not None and state.heading_deg is not None:
+                attitude.append((next_ns * 1e-9, state.roll_deg, state.pitch_deg, state.heading_deg))
+            next_ns += _SAMPLE_NS
+        if picture is not None:
+            gray = np.asarray(cv2.cvtColor(picture[0], cv2.COLOR_RGB2GRAY), np.uint8)
+            if before is not None:
+                turns_rad.append(turn_between(before, gray, focal_px))
+            before = gray
+            times_s.append(picture[1] * 1e-9)
+        if (now_ns - begin_ns) * 1e-9 > seconds:
+            break
+    return times_s, turns_rad, attitude

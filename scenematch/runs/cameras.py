@@ -1,0 +1,158 @@
+"""The camera of a run: its calibration, or what else is known of its lens, and how it is mounted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from engine.camera import Camera, mount_rotation
+from engine.errors import CalibrationError, OptionError
+from scenematch.bridges.pictures import first_picture
+from scenematch.files.frames import FrameSource, PictureFolder
+from scenematch.files.photo_camera import photo_camera
+from scenematch.files.ros.bags import is_bag, read_bag_camera
+from scenematch.runs.progress import SILENT, Progress
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraFiles:
+    """What is said of a camera; None where it is not.
+
+    Attributes:
+        calibration: a file of ROS, OpenCV or Kalibr, or a bag that has the calibration.
+        image_topic: of the pictures, where it is a bag with several.
+        hfov_deg: horizontal field of view, in place of a calibration.
+        mount: a key of :data:`engine.camera.MOUNTS`; None is the calibration's, else nadir.
+        camera_pitch_deg: of the optical axis, -90 looks straight down.
+        scale_calibration: whether the calibration is scaled to pictures of another size and the same shape.
+
+    Raises:
+        OptionError: there is a field of view besides a calibration, or a value is out of range, or there is no
+            calibration to scale.
+    """
+
+    calibration: Path | None = None
+    image_topic: str | None = None
+    hfov_deg: float | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
+    scale_calibration: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scale_calibration and self.calibration is None:
+            raise OptionError("scale_calibration: expected with `camera`, a calibration to scale")
+        if self.hfov_deg is not None and self.calibration is not None and not is_bag(self.calibration):
+            raise OptionError("hfov_deg: expected without `camera`, which has its own field of view")
+        if self.hfov_deg is not None and not 0.0 < self.hfov_deg < 180.0:
+            raise OptionError(f"hfov_deg: expected above 0 and below 180, got {self.hfov_deg:g}")
+        self._check_mount()
+
+    def _check_mount(self) -> None:
+        try:
+            mount_rotation(self.mount or "nadir", self.camera_pitch_deg)
+        except CalibrationError as error:
+            raise OptionError(str(error).replace(", or 9 numbers", "")) from None
+
+    @property
+    def has_mount(self) -> bool:
+        """Whether it is said how the camera is mounted."""
+        return self.mount is not None or self.camera_pitch_deg is not None
+
+    def mounted(self, camera: Camera) -> Camera:
+        """The camera as it is mounted."""
+        if not self.has_mount:
+            return camera
+        return replace(camera, mount=mount_rotation(self.mount or "nadir", self.camera_pitch_deg))
+
+    def load(
+        self, frames: FrameSource | None, names: Sequence[str] = (), *, progress: Progress = SILENT
+    ) -> Camera:
+        """The camera of some frames.
+
+        Args:
+            frames: the pictures; None where they are not known before they are taken.
+            names: of those pictures that are used; none is all.
+            progress: receives what a photograph's EXIF said.
+
+        Raises:
+            CalibrationError: the calibration cannot be read, or nothing says what the camera's focal length is.
+            TelemetryError: a picture cannot be read.
+        """
+        if self.hfov_deg is not None and frames is not None:
+            return self.with_field_of_view(frames.read(frames.names[0]).shape)
+        if self.calibration is not None:
+            camera = self._calibrated(self.calibration)
+            if self.scale_calibration and frames is not None:
+                camera = _scaled(camera, frames.read((names or frames.names)[0]).shape, progress)
+            return self.mounted(camera)
+        if not isinstance(frames, PictureFolder):
+            raise CalibrationError("camera: expected a calibration, or `hfov_deg`: only photographs say theirs")
+        try:
+            found = photo_camera([frames.path / name for name in names or frames.names])
+        except CalibrationError as error:
+            raise CalibrationError(f"camera: expected a calibration, or that of photographs: {error}") from None
+        wide_deg = math.degrees(2.0 * math.atan(found.camera.width_px / (2.0 * found.camera.matrix[0, 0])))
+        progress.message(f"camera, by {found.source} of the photographs: {wide_deg:.1f} degrees wide")
+        return self.mounted(found.camera)
+
+    def with_field_of_view(self, shape: tuple[int, ...]) -> Camera:
+        """The camera by ``hfov_deg`` and the shape (H, W, ...) of a picture."""
+        assert self.hfov_deg is not None  # or nobody asks
+        height_px, width_px = shape[:2]
+        return self.mounted(Camera.from_fov(width_px, height_px, self.hfov_deg))
+
+    def load_live(self, camera_source: str, *, progress: Progress = SILENT) -> Camera:
+        """A camera whose pictures are still to come.
+
+        Args:
+            camera_source: as of :func:`scenematch.bridges.pictures.capture`; by ``hfov_deg`` it is opened until
+                its first picture says its size, and closed again.
+            progress: receives what is waited for, and what the camera then is.
+
+        Raises:
+            CalibrationError: the calibration cannot be read, or there is none.
+            TelemetryError: the camera does not open, or gives no picture.
+        """
+        if self.hfov_deg is None:
+            return self.load(None)
+        progress.message(f"waiting for a picture of {camera_source}, whose size is not known")
+        camera = self.with_field_of_view(first_picture(camera_source).shape)
+        progress.message(f"camera: {camera.width_px} x {camera.height_px}, {self.hfov_deg:g} degrees wide")
+        return camera
+
+    def _calibrated(self, path: Path) -> Camera:
+        return read_bag_camera(path, self.image_topic) if is_bag(path) else Camera.load(path)
+
+
+def _scaled(camera: Camera, shape: tuple[int, ...], progress: Progress) -> Camera:
+    height_px, width_px = shape[:2]
+    if (width_px, height_px) == (camera.width_px, camera.height_px):
+        return camera
+    progress.message(
+        f"the calibration for {camera.width_px} x {camera.height_px} is scaled to pictures of "
+        f"{width_px} x {height_px}"
+    )
+    return camera.scaled_to(width_px, height_px)
+
+
+def check_size(camera: Camera, shape: tuple[int, ...]) -> None:
+    """Refuse a picture of another size than the calibration's, with the argument that scales it.
+
+    Raises:
+        CalibrationError: the sizes differ.
+    """
+    try:
+        camera.check_size(shape)
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}; {_way_out(camera, shape)}") from None
+
+
+def _way_out(camera: Camera, shape: tuple[int, ...]) -> str:
+    """What to do about a calibration for another size; one of another shape cannot be scaled."""
+    try:
+        camera.scaled_to(shape[1], shape[0])
+    except CalibrationError:
+        return "their shapes differ: give the calibration of these pictures"
+    return "if the pictures were made smaller or larger as a whole, add `scale_calibration`"

@@ -1,0 +1,250 @@
+"""The closed loop: a simulated vehicle that flies by the engine's fixes, with its folder, track and figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from engine.camera import Camera
+from engine.errors import OptionError, require
+from engine.matching import CLASSICAL
+from engine.matching.matcher import SceneMatcher
+from engine.navigation.state import NavigatorState
+from engine.orthomap import OrthoMap
+from engine.values import Frame, Prior, Truth
+from scenematch.files.flight import write_flight_folder
+from scenematch.files.notes import frame_note, write_notes
+from scenematch.files.track import track_row, write_track
+from scenematch.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
+from scenematch.runs.arguments import check_choice, check_device
+from scenematch.runs.evaluation import redraw
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.inputs import FOLDER_LAYOUT
+from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.record import RunRecord
+from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
+from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
+from scenematch.simulator import FlightStyle, Town, picture_at
+from scenematch.simulator.faults import FAULT_KINDS, Fault
+from scenematch.simulator.flight import NADIR_PITCH_DEG, grid_at
+from scenematch.simulator.light import Image
+from scenematch.simulator.loop import ClosedLoop
+from scenematch.simulator.pilot import plan_rounds
+from scenematch.simulator.quadrotor import State
+from scenematch.simulator.town import EXACT, generator
+from scenematch.simulator.vehicle import START_NS
+
+if TYPE_CHECKING:  # rerun is optional
+    from scenematch.report.live_view import LiveView
+
+FAULT_START_S = 60.0
+"""When a fault begins; in a flight that is shorter than twice that, halfway."""
+_MIN_HALF_SIDE_M = 10.0  # half of a side of the rounds
+_EDGE_M = 6.0  # that a level footprint keeps from the map's edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosedLoopSettings:
+    """How the loop is closed.
+
+    Attributes:
+        minutes: of flight.
+        method: "auto", "ncc" or "sift".
+        fault: what goes wrong: "none", "killed", "shifted" or "frozen".
+        device: where tensors live.
+
+    Raises:
+        OptionError: a word or a number is none of those that are expected.
+        DeviceError: the device is missing.
+    """
+
+    minutes: float = 5.0
+    method: str = "auto"
+    fault: str = "none"
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, CLASSICAL)
+        check_choice("fault", self.fault, FAULT_KINDS)
+        if not 0.1 <= self.minutes <= 120.0:
+            raise OptionError(f"minutes: expected 0.1 to 120, got {self.minutes:g}")
+        check_device(self.device)
+
+    def planned_fault(self) -> Fault:
+        """The fault with its times: ten seconds, but a map that is shifted stays so."""
+        start_s = min(FAULT_START_S, 30.0 * self.minutes)
+        return Fault(kind=self.fault, start_s=start_s, duration_s=math.inf if self.fault == "shifted" else 10.0)
+
+
+def fly_closed_loop(
+    out: StrPath,
+    world: WorldSettings | None = None,
+    loop: ClosedLoopSettings | None = None,
+    *,
+    force: bool = False,
+    live_view: LiveViewTarget = NO_LIVE_VIEW,
+    progress: Progress = SILENT,
+) -> dict[str, Any]:
+    """Fly by the engine's fixes, and write the flight's folder with its track and figures.
+
+    Args:
+        out: the folder.
+        world: what is flown over; None is the first town.
+        loop: how the loop is closed; None is the defaults.
+        force: whether the folder may be there already.
+        live_view: where the live view goes.
+        progress: is shown what the run does.
+
+    Returns:
+        The figures, as loop.json has them.
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the plots, is not installed.
+    """
+    require("matplotlib", "desk")
+    out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
+    if world.camera_pitch_deg != NADIR_PITCH_DEG:
+        raise OptionError(f"camera_pitch_deg: expected none in a closed loop, got {world.camera_pitch_deg:g}")
+    check_folder(out, force)
+    live_view.check(force=force)
+    progress.message("drawing the world")
+    town, camera = world.build(), world.camera()
+    site = town.site()
+    matcher = SceneMatcher(site, camera, loop.method, loop.device)
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
+    flight = plan_closed_loop(town, camera, matcher, world.seed, loop)
+    prepare_folder(out, force, (*FOLDER_OWNED, *LOOP_OWNED))
+    with open_view(matcher, live_view) as view:
+        seconds = 60.0 * loop.minutes
+        count = int(seconds * flight.options.frame_rate_hz)
+        frames = progress.track(_fly(flight, seconds, view), count, "flying")
+        _write_folder(out, frames, flight, town, camera, site)
+    record = _record(out, world, loop, site, town, str(matcher.device))
+    return _write_results(out, flight, record, progress)
+
+
+def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
+    """Track, record, figures of merit, plots and report of a flight that was flown."""
+    flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
+    answers = [(_name(k), answer) for k, answer in enumerate(flown.answers)]
+    rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
+    write_track(out / TRACK, rows)
+    states = [NavigatorState.LOST if answer.state is None else answer.state for _, answer in answers]
+    notes = [frame_note(name, a.result, state.value) for (name, a), state in zip(answers, states, strict=True)]
+    write_notes(out / NOTES, notes)
+    write_loop_csv(out / LOOP, flown)
+    (out / SUMMARY).write_text(json.dumps({"settings": record.facts()}), encoding="utf-8")
+    summary = redraw(out, progress=progress)  # as any finished track, so that evaluate gives the same
+    figures = summarise_loop(flown)
+    figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
+    (out / "loop.json").write_text(
+        json.dumps(figures | {"settings": record.facts()}, indent=2) + "\n", encoding="utf-8"
+    )
+    scene, fault = record.more["scene"], flight.fault
+    day = scene["condition"] or "noon"
+    title = f"closed loop, seed {scene['seed']}, {day}, {record.method}, fault: {fault.kind}"
+    title += f"\ntrue track {figures['plan_rms_m']:.2f} m RMS from the plan"
+    draw_loop(out, flown, title, fault)
+    return figures | {"folder": str(out.resolve())}
+
+
+def plan_closed_loop(
+    town: Town, camera: Camera, matcher: SceneMatcher, seed: int, loop: ClosedLoopSettings
+) -> ClosedLoop:
+    """The flight by its settings, not begun yet: rounds of the town, 150 m above its ground."""
+    site = matcher.site
+    style = FlightStyle()
+    corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
+    reach_m = style.height_agl_m * math.hypot(corner[0], corner[1]) + _EDGE_M
+    half_m = [0.5 * n * site.gsd_m_per_px - reach_m for n in (site.width_px, site.height_px)]
+    if min(half_m) < _MIN_HALF_SIDE_M:
+        sides = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
+        raise OptionError(
+            f"map: expected {2.0 * (reach_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
+        )
+    style = replace(style, height_agl_m=style.height_agl_m + site.ground_m)
+    route = plan_rounds((half_m[0], half_m[1]), 60.0 * loop.minutes, style)
+    rng = generator(seed, 0xCA)
+
+    def view(state: State) -> Image:
+        return picture_at(town, camera, site.frame, state.position_m, state.attitude, rng)
+
+    return ClosedLoop(route, view, matcher, seed=seed, fault=loop.planned_fault())
+
+
+def _name(k: int) -> str:
+    return f"{k:06d}.jpg"
+
+
+def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[Frame]:
+    """The frames of a flight while it is flown, each shown once it is answered."""
+    latency_ms = 1e3 * flight.options.latency_s
+    for k, frame in enumerate(flight.fly(seconds)):
+        if view is not None:
+            answer = flight.flown.answers[-1]
+            view.show(k, _name(k), frame, answer.result, answer.state, latency_ms)
+        yield frame
+
+
+def _write_folder(
+    out: Path, frames: Iterator[Frame], flight: ClosedLoop, town: Town, camera: Camera, site: OrthoMap
+) -> None:
+    """Fly, and write the folder as it goes: pictures, telemetry by the filter, truth, camera and map."""
+    start = flight.flown.start_m
+    lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
+    write_flight_folder(
+        out,
+        frames=((_name(k), frame) for k, frame in enumerate(frames)),
+        truth=_truth_rows(flight, town, site),
+        camera=camera,
+        ortho_rgb=town.ortho,
+        pixel_to_crs=town.pixel_to_crs,
+        crs_epsg=town.crs_epsg,
+        surface_m=town.surface_m,
+        start=Prior(lat_deg=float(lat), lon_deg=float(lon), sigma_m=START_SIGMA_M),
+        georeference_sigma_m=EXACT,
+        slope_sigma_deg=EXACT,
+    )
+
+
+def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Truth]:
+    """Where the vehicle really was, ten times a second; known once it has been flown."""
+    for row in flight.flown.record:
+        east, north, up = (float(v) for v in row.truth.position_m)
+        lat, lon = site.frame.geodetic_from_enu(east, north)
+        attitude = row.truth.attitude
+        yield Truth(
+            timestamp_ns=START_NS + round(row.time_s * 1e9),
+            lat_deg=float(lat),
+            lon_deg=float(lon),
+            alt_amsl_m=town.datum_amsl_m + up,
+            height_agl_m=up - town.world.ground_at(grid_at(town, site.frame, row.truth.position_m)),
+            roll_deg=attitude.roll_deg,
+            pitch_deg=attitude.pitch_deg,
+            heading_deg=attitude.heading_deg,
+        )
+
+
+def _record(
+    out: Path, world: WorldSettings, loop: ClosedLoopSettings, site: OrthoMap, town: Town, device: str
+) -> RunRecord:
+    """What a run was made of, as ``track`` records it, so that ``evaluate`` reads it."""
+    files: dict[str, Any] = {name: str((out / file).resolve()) for name, file in FOLDER_LAYOUT.items()}
+    return RunRecord(
+        **files,
+        method=loop.method,
+        profile="engine",
+        device=device,
+        origin={"lat_deg": site.frame.lat_deg, "lon_deg": site.frame.lon_deg},
+        ground_m=site.ground_m,
+        ground_amsl_m=town.datum_amsl_m + site.ground_m,
+        more={"scene": world.facts(), "closed_loop": {"minutes": loop.minutes, "fault": loop.fault}},
+    )

@@ -1,0 +1,112 @@
+"""Comparing methods, profiles or settings over one flight: a folder a run, one table and one chart of all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from engine.errors import OptionError, require
+from engine.matching import METHODS
+from scenematch.files.logs.readers import open_truth
+from scenematch.files.track import read_track
+from scenematch.report.comparison import draw_comparison
+from scenematch.report.runs_page import MAX_RUNS
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.inputs import FlightFiles, open_inputs
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.reporting import COMPARISON, draw_together
+from scenematch.runs.results import TRACK
+from scenematch.runs.settings import TrackSettings, load_settings
+from scenematch.runs.tracking import track
+
+TABLE, CHART = "table.json", "comparison.png"
+DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
+"""What is compared unless named: the paper's Table I."""
+
+
+def parse_runs(
+    texts: Sequence[str] = (), *, weights: Sequence[StrPath] = (), **overrides: Any
+) -> dict[str, TrackSettings]:
+    """Settings by the name of their run, from METHOD, METHOD/PROFILE or a settings file each.
+
+    Args:
+        texts: one a run; none of them is :data:`DEFAULT_RUNS`.
+        weights: files of the runs by the learned method.
+        overrides: settings that hold for all of them, where not None.
+
+    Raises:
+        OptionError: a text is none of these, or two runs have one name.
+    """
+    texts = texts or DEFAULT_RUNS
+    runs: dict[str, TrackSettings] = {}
+    for text in texts:
+        name, settings = _parse_run(text, weights, overrides)
+        if name in runs:
+            raise OptionError(f"runs: expected runs of different names, got {name!r} twice")
+        runs[name] = settings
+    if weights and not any(settings.method == "learned" for settings in runs.values()):
+        raise OptionError(f"weights: expected them with a run by learned, got {', '.join(runs)}")
+    return runs
+
+
+def _parse_run(text: str, weights: Sequence[StrPath], overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
+    method, slash, profile = text.partition("/")
+    weights = weights if method == "learned" else ()
+    if method in METHODS and not Path(text).is_file():
+        chosen: dict[str, Any] = {"method": method, "profile": profile} if slash else {"method": method}
+        return text.replace("/", "-"), load_settings(None, weights=weights, **overrides, **chosen)
+    if not Path(text).is_file():
+        raise OptionError(
+            f"runs: expected {', '.join(METHODS)}, one of them with /paper, or a settings file, got {text!r}"
+        )
+    return Path(text).stem, load_settings(text, **overrides)
+
+
+def compare(
+    files: FlightFiles,
+    out: StrPath,
+    runs: Mapping[str, TrackSettings] | None = None,
+    *,
+    force: bool = False,
+    progress: Progress = SILENT,
+) -> dict[str, dict[str, Any]]:
+    """Follow the flight once for each run; each has the folder that :func:`scenematch.track` writes.
+
+    The inputs are read and checked against every run's settings before the first run begins and before a folder
+    is created.
+
+    Args:
+        files: of the flight.
+        out: the folder, with one folder a run in it.
+        runs: settings by the name of their run; None is :data:`DEFAULT_RUNS`.
+        force: whether the folders may be there already.
+        progress: is shown what the runs do.
+
+    Returns:
+        The summaries by name, which ``table.json`` holds too.
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the chart, is not installed.
+    """
+    require("matplotlib", "desk")
+    out, runs = Path(out), parse_runs() if runs is None else runs
+    check_folder(out, force)
+    for name in runs:
+        check_folder(out / name, force)
+    inputs = open_inputs(files, list(runs.values()), progress=progress)
+    prepare_folder(out, force, (TABLE, CHART, COMPARISON))
+    results = {
+        name: track(files, out / name, settings, force=force, inputs=inputs, diagnosis=False, progress=progress)
+        for name, settings in runs.items()
+    }
+    (out / TABLE).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    tracks = {name: read_track(out / name / TRACK) for name in runs}
+    path = files.find_truth()
+    first = next(iter(tracks.values()))
+    truth = open_truth(path, first[0].timestamp_ns if first else None) if path is not None else None
+    draw_comparison(out / CHART, tracks, truth)
+    if 2 <= len(runs) <= MAX_RUNS:
+        draw_together(out / COMPARISON, {name: out / name for name in runs}, progress=progress)
+    return results

@@ -1,0 +1,54 @@
+"""The demo: the built-in flight, matched by both methods in both profiles, beside what the paper states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from engine.errors import require
+from scenematch.runs.arguments import check_device
+from scenematch.runs.comparison import CHART, TABLE, compare, parse_runs
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
+
+PAPER_TABLE = {"ncc": (2.4, 40.0), "sift": (2.1, 121.0)}
+"""Table I of the paper: RMS error in metres and execution time in milliseconds."""
+OWNED = (TABLE, CHART, "flight/frames/[0-9]*.jpg")
+
+
+def run_demo(
+    out: StrPath,
+    *,
+    frames: int | None = None,
+    seed: int = 1,
+    device: str = "auto",
+    force: bool = False,
+    progress: Progress = SILENT,
+) -> dict[str, dict[str, Any]]:
+    """Fly and match; the folder holds the flight, and what :func:`scenematch.runs.comparison.compare` writes.
+
+    Args:
+        out: the folder.
+        frames: flies only the first so many; None is all.
+        seed: of town, path, sensors and camera.
+        device: where tensors live.
+        force: whether the folder may be there already.
+        progress: is shown what the runs do.
+
+    Returns:
+        The summaries by the name of their run, such as "ncc-paper".
+
+    Raises:
+        MissingExtraError: matplotlib, which draws the chart, is not installed.
+    """
+    require("matplotlib", "desk")
+    out = Path(out)
+    check_device(device)
+    check_folder(out, force)
+    progress.message("drawing the town and the flight over it")
+    plan = plan_flight(seed, frames=frames)
+    prepare_folder(out, force, OWNED)
+    files = write_flight(out / "flight", plan, progress=progress)
+    return compare(files, out, parse_runs(device=device), force=True, progress=progress)

@@ -1,0 +1,137 @@
+"""Scoring a finished track again, perhaps with another truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from engine.errors import EngineError, OptionError, TelemetryError
+from engine.matching.matcher import SceneMatcher
+from engine.orthomap import OrthoMap
+from scenematch.files.corrections import Corrections
+from scenematch.files.settings import nested, options_from_mapping
+from scenematch.files.track import TrackRow, read_track
+from scenematch.report.metrics import Ground
+from scenematch.report.page_frames import shows_frames
+from scenematch.runs.folders import StrPath
+from scenematch.runs.inputs import FlightFiles, open_map, open_run_truth
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.record import RunRecord, read_record
+from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, write_results
+from scenematch.runs.settings import TrackSettings
+
+
+def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Score a finished track again, and rewrite its summary, figures and page.
+
+    Args:
+        folder: of a finished run.
+        truth: truth.csv, a log or a folder of photographs; None is the one that the run had.
+        progress: is shown what the run does.
+
+    Returns:
+        The summary.
+
+    Raises:
+        TelemetryError: the folder holds no finished track, or no truth is known.
+    """
+    folder = Path(folder)
+    read_track(folder / TRACK)  # what is wrong with it is said first
+    if truth is None and read_record(folder / SUMMARY).truth is None:
+        raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
+    return redraw(folder, truth, progress=progress)
+
+
+def redraw(
+    folder: Path, truth: StrPath | None = None, *, keep_frames: bool = False, progress: Progress = SILENT
+) -> dict[str, Any]:
+    """Write the results of a finished run again, by its own record.
+
+    Args:
+        folder: of the run.
+        truth: in place of the one that the run had.
+        keep_frames: whether a page that shows frames is not to be replaced by one that cannot show them any more.
+        progress: is shown what the run does.
+
+    Returns:
+        The summary.
+
+    Raises:
+        TelemetryError: the folder holds no finished track.
+        OptionError: the page would lose its frames.
+    """
+    rows = read_track(folder / TRACK)
+    record = read_record(folder / SUMMARY)
+    path = record.truth if truth is None else truth
+    start_ns = rows[0].timestamp_ns if rows else None
+    truth_rows = None if path is None else open_run_truth(Path(path), start_ns, progress)
+    site = open_recorded_map(record, progress)
+    ground = Ground(record.ground_m, record.ground_amsl_m)
+    frames = _report_frames(record, rows, site)
+    if frames.flight is None and shows_frames(folder / PAGE):
+        if keep_frames:
+            raise OptionError(
+                f"runs: {folder / PAGE} shows frames, which are lost if it is drawn again; add `force` to do so; "
+                f"{frames.why_missing}"
+            )
+        progress.message(f"{folder / PAGE} loses the frames that it showed: {frames.why_missing}")
+    if path is not None:
+        record = replace(record, truth=str(Path(path).resolve()))
+    return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
+
+
+def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:
+    """The map of a finished run."""
+    return open_map(
+        record.map, record.surface, record.map_sigma_m, bounds=record.map_bounds, crs=record.map_crs,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> ReportFrames:
+    """The flight and the matcher of a finished run, as far as its record and its files still give them."""
+    try:
+        values = {"method": record.method, "profile": record.profile} | dict(record.changed)
+        settings = options_from_mapping(TrackSettings, nested(values))
+        files = recorded_files(record)
+        flight = files.open_flight(settings.telemetry_columns)
+        stamps = [row.timestamp_ns for row in flight.rows]
+        recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
+        if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
+            return ReportFrames(why_missing="the frames or their telemetry are not those of the run any more.")
+        camera, options = files.load_camera(flight), settings.matcher_options()
+        return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, options))
+    except (EngineError, OSError) as error:
+        return ReportFrames(why_missing=f"{error}.")
+
+
+def recorded_files(record: RunRecord) -> FlightFiles:
+    """The files of a finished run.
+
+    Raises:
+        TelemetryError: the record does not name the frames.
+        OptionError: what it names does not go together.
+    """
+    if record.frames is None:
+        raise TelemetryError("the record of the run lacks its frames")
+    return FlightFiles(
+        map=record.map,
+        surface=record.surface,
+        camera=record.camera,
+        frames=record.frames,
+        telemetry=record.telemetry,
+        frame_stamps=record.frame_stamps,
+        log_offset_s=record.log_offset_s or 0.0,
+        image_topic=record.image_topic,
+        odometry_topic=record.odometry_topic,
+        every=record.every or 1,
+        map_sigma_m=record.map_sigma_m,
+        map_bounds=record.map_bounds,
+        map_crs=record.map_crs,
+        hfov_deg=record.hfov_deg,
+        mount=record.mount,
+        camera_pitch_deg=record.camera_pitch_deg,
+        scale_calibration=record.scale_calibration,
+        corrections=Corrections.from_facts(record.corrections),
+    )

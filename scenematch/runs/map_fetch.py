@@ -1,0 +1,366 @@
+"""Fetching a map, and a surface model with it, from servers that the user names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engine.errors import OptionError
+from engine.geo import LocalFrame
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.values import MAX_SIGMA_M
+from scenematch.fetch.client import Client, check_url, shown
+from scenematch.fetch.heights import (
+    GLO30,
+    GLO30_SLOPE_SIGMA_DEG,
+    Heights,
+    files_for,
+    read_part,
+    write_heights,
+)
+from scenematch.fetch.mosaic import FINE_ENOUGH, Bounds, Mosaic, Place, Wanted
+from scenematch.fetch.pictures import fetch_pieces, kept_pieces, piece_file, remove_pieces, write_map
+from scenematch.fetch.services import capabilities, query_value, with_query
+from scenematch.fetch.wms import plan_wms
+from scenematch.fetch.wmts import plan_wmts
+from scenematch.fetch.xyz import is_template, plan_xyz
+from scenematch.files.photos import exif_telemetry
+from scenematch.runs.arguments import check_above, parse_place
+from scenematch.runs.folders import StrPath, check_file
+from scenematch.runs.progress import SILENT, Progress
+
+MAX_TILES = 2000
+SURFACE = "surface.tif"
+"""Name of the surface model among the pieces, until the map is complete."""
+NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"
+_MAX_RADIUS_M = 100_000.0
+GSD_M_PER_PX = 0.5
+_USUAL_HEIGHT_M = 150.0  # of a camera for which a map of that ground sample distance is fine enough
+_MARGIN_M = 50.0  # beyond what photographs saw
+_MUCH_EMPTY = 0.5  # of a map: more is worth a word
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchSettings:
+    """What is fetched, and how; None where not given.
+
+    Attributes:
+        around: "LAT,LON", the middle of the map, or a folder of photographs, the middle of their positions.
+        radius_m: half the side of the square that the map covers at least; None is what the
+            photographs saw, and 50 m.
+        source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
+        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels. None is 0.5, around photographs that were
+            taken from less than 150 m as much less.
+        layer: of a service that has several.
+        crs: of a service that offers several, EPSG:N.
+        image_format: of a service that offers several, such as image/jpeg.
+        tile_px: side of the tiles of a template.
+        map_sigma_m: georeferencing accuracy per axis, which the file states then.
+        attribution, licence: texts that the file states.
+        surface: file or URL of heights, or a template with {lat} and {lon}.
+        surface_datum: vertical datum of its heights, EPSG:N.
+        surface_slope_sigma_deg: slope accuracy over one frame, which the file states then.
+        max_tiles: as many as may be asked for.
+        pause_ms: between requests.
+        timeout_s: without a byte.
+        dry_run: only plan.
+        force: whether the files may be there already.
+    """
+
+    around: str
+    source: str
+    radius_m: float | None = None
+    gsd_m_per_px: float | None = None
+    layer: str | None = None
+    crs: str | None = None
+    image_format: str | None = None
+    tile_px: int = 256
+    map_sigma_m: float | None = None
+    attribution: str | None = None
+    licence: str | None = None
+    surface: str | None = None
+    surface_datum: str | None = None
+    surface_slope_sigma_deg: float | None = None
+    max_tiles: int = MAX_TILES
+    pause_ms: float = 100.0
+    timeout_s: float = 30.0
+    dry_run: bool = False
+    force: bool = False
+
+
+def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT) -> dict[str, Any]:
+    """Fetch a map into one GeoTIFF, and a surface model beside it.
+
+    What has been fetched is kept beside the file until that is complete: the same call goes on later.
+
+    Args:
+        settings: what, and how.
+        out: the map; the surface model is ``NAME-surface.tif`` beside it.
+        progress: is shown how far it is, and what is waited for.
+
+    Returns:
+        What was planned, asked for and written.
+
+    Raises:
+        OptionError: a setting cannot be, more tiles are needed than allowed, or a file is there already.
+        MapError: a server refuses, cannot be reached, or sends something else.
+    """
+    out = Path(out)
+    surface_out = out.with_name(f"{out.stem}-surface.tif")
+    wanted = _checked(settings, progress)
+    for file in (out, surface_out) if settings.surface else (out,):
+        check_file(file, settings.force)
+    progress.message(f"note: {NOTE}")
+    client = Client(settings.pause_ms, settings.timeout_s, progress.message)
+    mosaic = _planned(settings, wanted, client)
+    _check_surface_stays(_surface_files(settings, mosaic), (out, surface_out))
+    _say_what_comes(mosaic, settings, wanted, progress)
+    folder = out.with_name(f"{out.name}.tiles")
+    facts = _plan_facts(settings, mosaic, folder)
+    if settings.dry_run:
+        return facts | {"surface_files": list(map(shown, _surface_files(settings, mosaic))), "dry_run": True}
+    fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    with kept_pieces(folder):
+        surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
+        asked = sum(progress.track(fetch_pieces(mosaic, client, folder), len(mosaic.pieces), "fetching"))
+        written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc), progress)
+        if surface is not None:
+            os.replace(folder / SURFACE, surface_out)
+        remove_pieces(folder)
+    received = {"fetched": asked, "fetched_mb": client.bytes_received / 1e6}
+    return {"file": str(out)} | facts | received | written | _surface_facts(surface, surface_out)
+
+
+def _say_what_comes(mosaic: Mosaic, settings: FetchSettings, wanted: Wanted, progress: Progress) -> None:
+    """What a person should know before the pictures come."""
+    for name, text in mosaic.states.items():
+        progress.message(f"the server states as {name}: {text}")
+    got, asked = mosaic.gsd_m_per_px, wanted.gsd_m_per_px
+    coarser = ", coarser than asked: the server has no finer level" if got > asked * FINE_ENOUGH else ""
+    progress.message(f"{mosaic.kind} level {mosaic.level}: {got:.3g} m/px{coarser}")
+    if settings.map_sigma_m is None:
+        progress.message("the map's accuracy is not stated (`map_sigma_m`): matching will assume 3 m per axis")
+
+
+def _write(mosaic: Mosaic, folder: Path, out: Path, tags: dict[str, object], progress: Progress) -> dict[str, Any]:
+    """Write the map of fetched pieces."""
+    gaps = sum(piece_file(folder, piece).stat().st_size == 0 for piece in mosaic.pieces)
+    nodata_share = write_map(mosaic, folder, out, tags)
+    if nodata_share > _MUCH_EMPTY:
+        progress.message(
+            f"{nodata_share:.0%} of the map is empty: the server had nothing for {gaps} of {len(mosaic.pieces)} "
+            "pieces, or sent transparent ones; is `around` within what it covers?"
+        )
+    return {"gaps": gaps, "nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
+
+
+def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
+    """What is asked for, where the settings can be.
+
+    Raises:
+        OptionError: one cannot.
+        TelemetryError: the folder of photographs cannot be read.
+    """
+    wanted = _wanted(settings, progress)
+    check_above("radius_m", wanted.place.radius_m, 0.0, _MAX_RADIUS_M)
+    check_above("gsd_m_per_px", wanted.gsd_m_per_px, 0.0, 1e3)
+    for name, most in (
+        ("timeout_s", 3600.0),
+        ("map_sigma_m", MAX_SIGMA_M),
+        ("surface_slope_sigma_deg", 45.0),
+    ):
+        check_above(name, getattr(settings, name), 0.0, most)
+    if not 0.0 <= settings.pause_ms <= 60_000.0:
+        raise OptionError(f"pause_ms: expected milliseconds from 0 to 60000, got {settings.pause_ms:g}")
+    if not 16 <= settings.tile_px <= 4096:
+        raise OptionError(f"tile_px: expected 16 to 4096, got {settings.tile_px}")
+    if settings.surface is None and settings.surface_datum is not None:
+        raise OptionError("surface_datum: expected with `surface` only")
+    if settings.surface is None and settings.surface_slope_sigma_deg is not None:
+        raise OptionError("surface_slope_sigma_deg: expected with `surface` only")
+    if is_template(settings.source):
+        for name in ("layer", "crs", "image_format"):
+            if getattr(settings, name) is not None:
+                raise OptionError(f"{name}: expected with a WMS or WMTS only, not with a template of tiles")
+    check_url("source", settings.source)
+    return wanted
+
+
+def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
+    """The place that was named, or that of photographs, and what is asked for there.
+
+    Raises:
+        OptionError: it is no place, or its radius is missing.
+        TelemetryError: the folder cannot be read.
+    """
+    radius_m, gsd_m_per_px = settings.radius_m, settings.gsd_m_per_px
+    if Path(settings.around).is_dir():
+        place, finest_m_per_px = _seen_by_photographs(Path(settings.around))
+        place = place if radius_m is None else replace(place, radius_m=radius_m)
+        gsd_m_per_px = finest_m_per_px if gsd_m_per_px is None else gsd_m_per_px
+        progress.message(
+            f"the photographs' place: {place.lat_deg:.6f},{place.lon_deg:.6f}, radius {place.radius_m:.0f} m; "
+            f"asked for {gsd_m_per_px:.2g} m/px"
+        )
+    elif radius_m is None:
+        raise OptionError("radius_m: expected with LAT,LON; only around photographs it may be left out")
+    else:
+        place = Place(*_place(settings.around), radius_m)
+    return Wanted(
+        place=place,
+        gsd_m_per_px=GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px,
+        max_tiles=settings.max_tiles,
+        layer=settings.layer,
+        crs=settings.crs,
+        image_format=settings.image_format,
+    )
+
+
+def _place(around: str) -> tuple[float, float]:
+    """LAT,LON, in the right order.
+
+    Raises:
+        OptionError: it is no such pair; a name says why not.
+    """
+    try:
+        return parse_place("around", around)
+    except OptionError:
+        if any(part.strip()[:1].isalpha() for part in around.split(",")):
+            raise OptionError(
+                f"around: expected LAT,LON in degrees or a folder of photographs, got {around!r}; names of places "
+                "are not looked up"
+            ) from None
+        raise
+
+
+def _seen_by_photographs(folder: Path) -> tuple[Place, float]:
+    """The square that photographs saw, and the ground sample distance of a map that suits their height.
+
+    Raises:
+        OptionError: they have no positions.
+    """
+    rows = [row for row in exif_telemetry(folder) if row.lat_deg is not None]
+    if not rows:
+        raise OptionError(f"around: expected LAT,LON or photographs with positions, got none in {folder}")
+    lat_deg, lon_deg = (np.array([getattr(row, name) for row in rows]) for name in ("lat_deg", "lon_deg"))
+    frame = LocalFrame(float(lat_deg[0]), float(lon_deg[0]))
+    where = frame.enu_from_geodetic(lat_deg, lon_deg)[..., :2]
+    low, high = where.min(axis=0), where.max(axis=0)
+    middle = frame.geodetic_from_enu(*((low + high) / 2.0))
+    heights_m = [row.height_agl_m for row in rows if row.height_agl_m is not None] or [_USUAL_HEIGHT_M]
+    radius_m = float((high - low).max()) / 2.0 + max(heights_m) + _MARGIN_M
+    finest_m_per_px = min(GSD_M_PER_PX, float(np.median(heights_m)) / _USUAL_HEIGHT_M * GSD_M_PER_PX)
+    return Place(float(middle[0]), float(middle[1]), radius_m), finest_m_per_px
+
+
+def _planned(settings: FetchSettings, wanted: Wanted, client: Client) -> Mosaic:
+    """What is to be asked for; a service is asked for its capabilities first."""
+    url = settings.source
+    if is_template(url):
+        return plan_xyz(url, wanted, settings.tile_px)
+    is_document = url.partition("?")[0].lower().endswith(".xml")
+    service = query_value(url, "service") or ("WMTS" if "wmts" in url.lower() else "WMS")
+    query = {"SERVICE": service.upper(), "REQUEST": "GetCapabilities"}
+    root = capabilities(client, url if is_document else with_query(url, query))
+    return plan_wmts(root, url, wanted) if root.tag.endswith("}Capabilities") else plan_wms(root, url, wanted)
+
+
+def _plan_facts(settings: FetchSettings, mosaic: Mosaic, folder: Path) -> dict[str, Any]:
+    """What is known before the first picture is asked for."""
+    width, height = mosaic.size_px
+    left = [piece for piece in mosaic.pieces if not piece_file(folder, piece).is_file()]
+    piece_mb = mosaic.piece_px[0] * mosaic.piece_px[1] * mosaic.bytes_per_px / 1e6
+    return {
+        "source": shown(settings.source),
+        "kind": mosaic.kind,
+        "level": mosaic.level,
+        "crs": mosaic.crs.to_string(),
+        "gsd_m_per_px": mosaic.gsd_m_per_px,
+        "width_px": width,
+        "height_px": height,
+        "bounds_deg": list(_bounds_deg(mosaic)),
+        "tiles": len(mosaic.pieces),
+        "tiles_to_fetch": len(left),
+        "expected_mb": len(left) * piece_mb,
+        "georeference_sigma_m": settings.map_sigma_m,
+        "attribution": settings.attribution,
+        "licence": settings.licence,
+        "server_states": [f"{name}: {text}" for name, text in mosaic.states.items()],
+        "note": NOTE,
+    }
+
+
+def _bounds_deg(mosaic: Mosaic) -> Bounds:
+    """West, south, east, north of the map in degrees."""
+    from pyproj import Transformer
+
+    found: Bounds = Transformer.from_crs(mosaic.crs, 4326, always_xy=True).transform_bounds(*mosaic.bounds)
+    return found
+
+
+def _map_tags(settings: FetchSettings, mosaic: Mosaic, fetched_utc: str) -> dict[str, object]:
+    """Metadata items of the map: its accuracy, and where it is from."""
+    tags = {
+        GEOREFERENCE_TAG: settings.map_sigma_m,
+        "SOURCE": shown(settings.source),
+        "SOURCE_LEVEL": mosaic.level,
+        "FETCHED_UTC": fetched_utc,
+        "ATTRIBUTION": settings.attribution or mosaic.states.get("Attribution"),
+        "LICENCE": settings.licence,
+        "SERVER_ACCESS_CONSTRAINTS": mosaic.states.get("AccessConstraints"),
+    }
+    return {name: value for name, value in tags.items() if value is not None}
+
+
+# ---------------------------------------------------------------------------------------------- surface model
+
+
+def _surface_files(settings: FetchSettings, mosaic: Mosaic) -> list[str]:
+    return [] if settings.surface is None else files_for(settings.surface, _bounds_deg(mosaic))
+
+
+def _check_surface_stays(files: Sequence[str], outputs: Sequence[Path]) -> None:
+    """Refuse to replace the heights that are read by a part of them, whatever may be replaced.
+
+    Raises:
+        OptionError: a file of heights is one that the fetch writes.
+    """
+    for file in map(Path, files):  # an address is no file that exists
+        for output in outputs:
+            if file.exists() and output.exists() and file.samefile(output):
+                raise OptionError(f"out: {output} is the `surface` that is read; choose another file")
+
+
+def _fetch_surface(
+    settings: FetchSettings, mosaic: Mosaic, client: Client, out: Path, fetched_utc: str
+) -> tuple[Heights, float | None] | None:
+    """Write the surface under the map; its heights, and its slope accuracy where it is known."""
+    if settings.surface is None:
+        return None
+    files = _surface_files(settings, mosaic)
+    heights = read_part(files, mosaic.bounds, mosaic.crs, settings.surface_datum, client)
+    known = GLO30_SLOPE_SIGMA_DEG if any(GLO30 in file for file in files) else None
+    slope_sigma_deg = settings.surface_slope_sigma_deg or known
+    tags = {SLOPE_TAG: slope_sigma_deg, "SOURCE": ", ".join(map(shown, files)), "FETCHED_UTC": fetched_utc}
+    write_heights(heights, out, {name: value for name, value in tags.items() if value is not None})
+    return heights, slope_sigma_deg
+
+
+def _surface_facts(surface: tuple[Heights, float | None] | None, file: Path) -> dict[str, Any]:
+    """What was written of a surface."""
+    if surface is None:
+        return {"surface": None}
+    heights, slope_sigma_deg = surface
+    return {
+        "surface": str(file),
+        "surface_datum": heights.datum,
+        "surface_range_m": [float(np.nanmin(heights.heights_m)), float(np.nanmax(heights.heights_m))],
+        "surface_nodata_share": float(np.isnan(heights.heights_m).mean()),
+        "slope_sigma_deg": slope_sigma_deg,
+    }

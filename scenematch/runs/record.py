@@ -1,0 +1,184 @@
+"""Records: inputs and settings of a finished run, as its summary.json keeps them for later runs over it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from engine.errors import EngineError, TelemetryError
+from scenematch.files.corrections import Corrections
+
+_TEXTS = ("map", "method", "profile")
+_TEXTS_OR_NONE = (
+    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "odometry_topic",
+    "device", "start", "map_bounds", "map_crs", "mount", "surface_datum",
+)  # fmt: skip
+_NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunRecord:
+    """The inputs and settings of a run; paths are absolute, and None is what there was not.
+
+    Attributes:
+        map: file or folder.
+        surface: heights.
+        camera: calibration, or a bag that has it; None was the photographs' EXIF or ``hfov_deg``.
+        frames: folder, video or bag.
+        telemetry: telemetry.csv or a log.
+        truth: truth.csv or a log.
+        frame_stamps: when the frames were taken, where the telemetry is a log.
+        log_offset_s: added to the frames' own stamps, in the same case.
+        image_topic: of the pictures, where the frames are a bag.
+        odometry_topic: that the velocity was taken from, where the telemetry is a bag.
+        every: one frame in so many was used; None is all.
+        map_sigma_m: georeferencing accuracy of the map, where it was given, as are the next five.
+        map_bounds: of a picture, as typed.
+        map_crs: of a map that names none.
+        hfov_deg: horizontal field of view.
+        mount: of the camera, by name.
+        camera_pitch_deg: of the camera.
+        scale_calibration: whether the calibration was scaled to the pictures.
+        corrections: of the telemetry, by name; None without any.
+        heights: frames by the source of their height, where the telemetry is a log or the photographs' own.
+        method: "ncc", "sift", "auto" or "learned".
+        profile: "engine" or "paper".
+        device: where tensors lived.
+        start: where the flight began, as typed.
+        budget_ms: of a frame.
+        changed: settings that are not the defaults, by name.
+        origin: ``lat_deg`` and ``lon_deg`` of the plane of the track.
+        ground_m: height of the ground on the map.
+        ground_amsl_m: the same above the sea, by the telemetry.
+        surface_datum: vertical system of the heights, where the surface is above the sea by its file.
+        attitude: what the fixes said of the telemetry's attitude.
+        diagnosis: where few frames were fixed, what of the inputs does not fit, sentences by cause.
+        more: what else stands in the file, by name.
+
+    Raises:
+        TelemetryError: a value is not of its kind.
+    """
+
+    map: str
+    surface: str | None
+    camera: str | None = None
+    frames: str | None = None
+    telemetry: str | None = None
+    truth: str | None
+    frame_stamps: str | None = None
+    log_offset_s: float | None = None
+    image_topic: str | None = None
+    odometry_topic: str | None = None
+    every: int | None = None
+    map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    hfov_deg: float | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
+    scale_calibration: bool = False
+    corrections: Mapping[str, Any] | None = None
+    heights: Mapping[str, int] = field(default_factory=dict)
+    method: str
+    profile: str
+    device: str | None = None
+    start: str | None = None
+    budget_ms: float | None = None
+    changed: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, float]
+    ground_m: float
+    ground_amsl_m: float | None
+    surface_datum: str | None = None
+    attitude: Mapping[str, Any] | None = None
+    diagnosis: Mapping[str, str] | None = None
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._check(_TEXTS, "a text", _is_text)
+        self._check(_TEXTS_OR_NONE, "a text or null", lambda value: value is None or _is_text(value))
+        self._check(("ground_m",), "a number", _is_number)
+        self._check(_NUMBERS_OR_NONE, "a number or null", lambda value: value is None or _is_number(value))
+        self._check(("every",), "a whole number above 0, or null", _is_count_or_none)
+        self._check(("origin",), "lat_deg and lon_deg on the Earth", _is_place)
+        self._check(("heights",), "counts by source", lambda value: _is_table(value, int))
+        self._check(("changed",), "settings by name", lambda value: _is_table(value, object))
+        self._check(("attitude",), "a table or null", lambda value: value is None or _is_table(value, object))
+        self._check(("diagnosis",), "sentences or null", lambda value: value is None or _is_table(value, str))
+
+        self._check(("scale_calibration",), "true or false", lambda value: isinstance(value, bool))
+        self._check(("corrections",), "corrections of the telemetry or null", _are_corrections)
+
+    def _check(self, names: tuple[str, ...], expected: str, holds: Callable[[object], bool]) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if not holds(value):
+                raise TelemetryError(f"{name}: expected {expected}, got {_shown(value)}")
+
+    def facts(self) -> dict[str, Any]:
+        """The same as JSON holds it."""
+        values = asdict(self)
+        more: dict[str, Any] = values.pop("more")
+        return values | more
+
+
+def read_record(path: Path) -> RunRecord:
+    """The settings in a summary.json.
+
+    Raises:
+        TelemetryError: the file is missing, or is not one that track wrote.
+    """
+    wrong = f"{path}: expected the summary that track writes"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        known = {each.name for each in fields(RunRecord)} - {"more"}
+        more = {name: value for name, value in values.items() if name not in known}
+        return RunRecord(**{name: value for name, value in values.items() if name in known}, more=more)
+    except FileNotFoundError:
+        raise TelemetryError(f"{path}: expected the summary of a finished track, got no such file") from None
+    except TelemetryError as error:
+        raise TelemetryError(f"{wrong}; settings, {error}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise TelemetryError(f"{wrong}, got something else") from None
+
+
+def _are_corrections(value: object) -> bool:
+    if value is None:
+        return True
+    try:
+        Corrections.from_facts(value)
+    except (EngineError, TypeError, AttributeError):
+        return False
+    return True
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and value != "" and "\0" not in value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_count_or_none(value: object) -> bool:
+    return value is None or (isinstance(value, int) and not isinstance(value, bool) and value >= 1)
+
+
+def _is_place(value: object) -> bool:
+    if not isinstance(value, Mapping):
+        return False
+    lat_deg: Any = value.get("lat_deg")
+    lon_deg: Any = value.get("lon_deg")
+    return _is_number(lat_deg) and _is_number(lon_deg) and abs(lat_deg) <= 90.0 and abs(lon_deg) <= 360.0
+
+
+def _is_table(value: object, kind: type) -> bool:
+    return isinstance(value, Mapping) and all(isinstance(each, kind) for each in value.values())
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."

@@ -1,0 +1,103 @@
+"""Reports on finished runs, drawn again: of one run its own page, of several one page on one map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from engine.errors import OptionError
+from engine.orthomap import OrthoMap
+from scenematch.files.logs.readers import open_truth
+from scenematch.files.track import read_track
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.report.runs_page import MAX_RUNS, write_runs_page
+from scenematch.report.segments import segment_errors
+from scenematch.runs.evaluation import open_recorded_map, redraw
+from scenematch.runs.folders import StrPath, check_file
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.record import read_record
+from scenematch.runs.results import PAGE, SUMMARY, TRACK
+
+COMPARISON = "comparison.html"
+"""The page on several runs, where it has no other name."""
+
+
+def report(
+    folders: Sequence[StrPath], out: StrPath | None = None, *, force: bool = False, progress: Progress = SILENT
+) -> Path:
+    """Draw the report on finished runs.
+
+    Args:
+        folders: of one run, whose own page is written again, or of several, drawn on the first one's map.
+        out: the page on several runs; None is ``comparison.html`` in the working directory.
+        force: whether that may be there already; of one run, whether its page may lose frames that are not there
+            any more.
+        progress: is shown what the run does.
+
+    Returns:
+        The page.
+
+    Raises:
+        OptionError: there are too many runs, one of them twice, ``out`` is given with one run or is in no folder,
+            or a page would lose its frames.
+        TelemetryError: a folder holds no finished track.
+    """
+    runs = [Path(folder) for folder in folders]
+    if len(runs) == 1:
+        if out is not None:
+            raise OptionError(f"out: expected none with one run, whose page is {runs[0] / PAGE}")
+        redraw(runs[0], keep_frames=not force, progress=progress)
+        return runs[0] / PAGE
+    page = Path(COMPARISON if out is None else out)
+    check_file(page, force)
+    if not page.parent.is_dir():  # before the runs are drawn
+        raise OptionError(f"out: expected a file in a folder that exists, got {page}")
+    draw_together(page, run_names(runs), progress=progress)
+    return page
+
+
+def run_names(folders: Sequence[Path]) -> dict[str, Path]:
+    """Folders by as much of the end of their path as tells them apart.
+
+    Raises:
+        OptionError: there are fewer than two or too many, or two are the same.
+    """
+    resolved = [folder.resolve() for folder in folders]
+    if not 2 <= len(set(resolved)) == len(resolved) <= MAX_RUNS:
+        raise OptionError(f"runs: expected up to {MAX_RUNS} different folders, got {', '.join(map(str, folders))}")
+    parts = 1
+    while len({path.parts[-parts:] for path in resolved}) < len(resolved):
+        parts += 1
+    return {"/".join(path.parts[-parts:]): folder for path, folder in zip(resolved, folders, strict=True)}
+
+
+def draw_together(page: Path, runs: dict[str, Path], *, progress: Progress = SILENT) -> None:
+    """Write the page on several finished runs.
+
+    Args:
+        page: the file, replaced where it exists.
+        runs: folders by the names of their runs.
+        progress: is shown what the run does.
+    """
+    records = {name: read_record(folder / SUMMARY) for name, folder in runs.items()}
+    first, *others = records
+    for other in others:
+        if records[other].map != records[first].map:
+            progress.message(
+                f"{other} was made with another map, {records[other].map}; it is drawn on that of {first}"
+            )
+    site = open_recorded_map(records[first], progress)
+    write_runs_page(page, {name: _finished(folder, site) for name, folder in runs.items()})
+
+
+def _finished(folder: Path, site: OrthoMap) -> FinishedTrack:
+    """A finished run on a map, its figures computed again."""
+    rows, record = read_track(folder / TRACK), read_record(folder / SUMMARY)
+    start_ns = rows[0].timestamp_ns if rows else None
+    truth = None if record.truth is None else open_truth(Path(record.truth), start_ns)
+    ground = Ground(record.ground_m, record.ground_amsl_m)
+    summary = summarise(rows, truth, frame=site.frame, ground=ground)
+    if truth:
+        summary["segments"] = segment_errors(rows, errors_en_m(rows, truth, site.frame))
+    return FinishedTrack(rows, truth, site, ground, summary | {"settings": record.facts()}, None)

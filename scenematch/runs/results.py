@@ -1,0 +1,130 @@
+"""The results of a run: summary.json, the figures and the report page, in the run's folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from engine.errors import EngineError, MissingExtraError, require
+from engine.matching.matcher import SceneMatcher
+from engine.orthomap import OrthoMap
+from engine.values import Truth
+from scenematch.files.flight import Flight
+from scenematch.files.notes import read_notes
+from scenematch.files.resampling import UTC_FROM_NS
+from scenematch.files.track import TrackRow
+from scenematch.report.consistency import motion_consistency
+from scenematch.report.explain import choose_frames, explain_frames
+from scenematch.report.figures import draw_figures
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.loop_record import read_loop_csv
+from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.report.page import write_page
+from scenematch.report.segments import segment_errors
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.record import RunRecord
+
+TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"
+LOOP = "loop.csv"
+"""Of a closed loop, beside its track."""
+FIGURES = ("path.png", "position.png", "height.png", "error.png")
+OWNED = (TRACK, SUMMARY, NOTES, PAGE, *FIGURES)
+"""The files of an output folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFrames:
+    """The frames and the matcher by which the report shows single frames; or None, and why they are not there."""
+
+    flight: Flight | None = None
+    matcher: SceneMatcher | None = None
+    why_missing: str = "the frames were not kept."
+
+
+def write_results(
+    out: Path,
+    rows: list[TrackRow],
+    truth: list[Truth] | None,
+    site: OrthoMap,
+    ground: Ground,
+    record: RunRecord,
+    frames: ReportFrames,
+    *,
+    report: bool = True,
+    progress: Progress = SILENT,
+) -> dict[str, Any]:
+    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones.
+
+    The figures are left out where matplotlib is not installed, as on a vehicle: no track is lost for them, and
+    older ones stay.
+    """
+    summary = summarise(rows, truth, frame=site.frame, ground=ground)
+    segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
+    telemetry = None if frames.flight is None else frames.flight.rows
+    motion = {"motion_consistency": motion_consistency(rows, telemetry, site.frame)}
+    summary |= segments | motion | {"settings": record.facts()}
+    if summary.get("scored_fixes") == 0 and summary["fixes"]:
+        fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
+        given = [row.timestamp_ns for row in truth or []]
+        progress.message(
+            f"no fix is scored: expected a truth at the times of the fixes, {_span(fixed)}, got {_span(given)} in "
+            f"{record.truth}"
+        )
+    (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if not report:
+        return summary
+    title = f"{record.method} ({record.profile} profile)"
+    try:
+        require("matplotlib", "desk")  # first, or older figures would be lost for nothing
+        for name in FIGURES:
+            (out / name).unlink(missing_ok=True)
+        draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
+    except MissingExtraError as error:
+        progress.message(f"no plots are drawn: {error}")
+    _write_page(out / PAGE, finished_track(out, rows, truth, site, ground, summary, frames), frames)
+    return summary
+
+
+def _span(stamps_ns: list[int]) -> str:
+    """First and last of some stamps, to be read: as dates where they are UTC, else as seconds."""
+    if not stamps_ns:
+        return "none"
+    ends = (min(stamps_ns), max(stamps_ns))
+    if ends[0] >= UTC_FROM_NS:
+        return " to ".join(f"{datetime.fromtimestamp(ns / 1e9, UTC):%Y-%m-%dT%H:%M:%SZ}" for ns in ends)
+    return f"{ends[0] / 1e9:.1f} to {ends[1] / 1e9:.1f} s"
+
+
+def finished_track(
+    out: Path,
+    rows: list[TrackRow],
+    truth: list[Truth] | None,
+    site: OrthoMap,
+    ground: Ground,
+    summary: dict[str, Any],
+    frames: ReportFrames,
+) -> FinishedTrack:
+    """A finished track with what its folder holds beside it."""
+    notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
+    is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be that of another run
+    loop = read_loop_csv(out / LOOP) if is_loop and (out / LOOP).is_file() else None
+    telemetry = None if frames.flight is None else frames.flight.rows
+    return FinishedTrack(rows, truth, site, ground, summary, notes, telemetry, loop)
+
+
+def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
+    """The report, with some frames matched again where that can be done."""
+    if frames.flight is None or frames.matcher is None:
+        return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
+    if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:
+        return write_page(path, track, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
+    errors = track.plot_data().errors
+    chosen = choose_frames(track.rows, errors)
+    try:
+        shown = explain_frames(frames.flight, frames.matcher, track.rows, track.notes, chosen, errors)
+    except EngineError as error:
+        return write_page(path, track, why_not=f"No frames are shown: {error}")
+    return write_page(path, track, shown)

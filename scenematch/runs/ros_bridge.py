@@ -1,0 +1,192 @@
+"""The loop of the ROS bridge: a camera's topic and a vehicle's in, poses, fixes and diagnostics out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from engine.camera import Camera
+from engine.errors import BackendError, OptionError
+from engine.matching.matcher import SceneMatcher
+from engine.runtime.realtime import set_realtime
+from scenematch.bridges.ros import RosBridge, RosNode, RosStatus, RosTopics
+from scenematch.bridges.ros_out import RosOptions
+from scenematch.bridges.vehicle import NedOrigin
+from scenematch.files.ros.messages import camera_from_message, image_from_message
+from scenematch.runs.arguments import parse_position
+from scenematch.runs.cameras import CameraFiles
+from scenematch.runs.checks import check_position
+from scenematch.runs.folders import StrPath
+from scenematch.runs.inputs import open_map
+from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
+from scenematch.runs.mavlink_bridge import BridgeSettings
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.service import running_service, status_reporter
+
+_CAMERA_INFO_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RosSettings:
+    """What a node of ROS hears and publishes.
+
+    Attributes:
+        version: 1 for rospy, 2 for rclpy.
+        map: GeoTIFF, a picture with a world file, or a folder of tiles.
+        surface: surface model, a GeoTIFF of heights.
+        camera: calibration; None takes ``hfov_deg``, else the topic's, of a nadir camera.
+        hfov_deg: horizontal field of view, in place of a calibration; with the size of the first picture.
+        topics: that are heard.
+        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
+        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
+        map_crs: of a map that names none.
+        mount: how the camera is mounted, by name; None is the calibration's.
+        camera_pitch_deg: of the camera, -90 looks straight down.
+        firmware: for whom the poses are, behind MAVROS: "none", "ardupilot" or "px4".
+        origin: of the poses, "LAT,LON"; None is the map's.
+        arguments: for ROS: "NAME:=VALUE" for ROS 1, those from "--ros-args" on for ROS 2.
+
+    Raises:
+        OptionError: the topic of the images has no name, or the arguments are not for this ROS.
+    """
+
+    map: StrPath
+    surface: StrPath | None = None
+    camera: StrPath | None = None
+    hfov_deg: float | None = None
+    topics: RosTopics = field(default_factory=RosTopics)
+    map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    mount: str | None = None
+    camera_pitch_deg: float | None = None
+    version: int = 1
+    firmware: str = "none"
+    origin: str | None = None
+    arguments: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        wrong = [argument for argument in self.arguments if ":=" not in argument]
+        if self.version == 1 and wrong:
+            raise OptionError(f"ros_arguments: expected NAME:=VALUE for ROS 1, got {' '.join(wrong)}")
+        if self.version == 2 and self.arguments and self.arguments[0] != "--ros-args":
+            raise OptionError(f"ros_arguments: expected --ros-args -r NAME:=VALUE, got {self.arguments[0]}")
+        if not self.topics.image:
+            raise OptionError("image_topic: expected a name, got nothing")
+        self.camera_files()
+
+    def camera_files(self) -> CameraFiles:
+        """What is said of the camera."""
+        calibration = None if self.camera is None else Path(self.camera)
+        return CameraFiles(
+            calibration=calibration, hfov_deg=self.hfov_deg, mount=self.mount,
+            camera_pitch_deg=self.camera_pitch_deg,
+        )  # fmt: skip
+
+    def options(self) -> RosOptions:
+        """What is published.
+
+        Raises:
+            OptionError: the firmware or the origin is none.
+        """
+        position = parse_position("origin", self.origin)
+        begin = None if position is None else NedOrigin(position.lat_deg or 0.0, position.lon_deg or 0.0, 0.0)
+        return RosOptions(firmware=self.firmware, origin=begin)
+
+
+def run_ros_bridge(
+    ros: RosSettings,
+    settings: BridgeSettings | None = None,
+    *,
+    node: RosNode | None = None,
+    live_view: LiveViewTarget = NO_LIVE_VIEW,
+    progress: Progress = SILENT,
+) -> RosStatus:
+    """Run the node until ROS or the time ends it.
+
+    Args:
+        ros: what is heard and published.
+        settings: how frames are matched; None is the defaults.
+        node: that hears and publishes; None creates one.
+        live_view: where the live view goes.
+        progress: is shown what the node does.
+
+    Returns:
+        What was done.
+
+    Raises:
+        BackendError: ROS is not installed, or nothing answers.
+        OptionError, MapError, CalibrationError: an argument or a file is not as expected.
+    """
+    live_view.check()
+    settings = settings or BridgeSettings()
+    start, options = parse_position("start", settings.start), ros.options()
+    site = open_map(
+        ros.map, ros.surface, ros.map_sigma_m, bounds=ros.map_bounds, crs=ros.map_crs, progress=progress
+    )
+    check_position("start", start, site, OptionError)
+    check_position("origin", parse_position("origin", ros.origin), site, OptionError)
+    camera = None if ros.camera is None else ros.camera_files().load(None)
+    node = node or _node(ros.version, ros.arguments)
+    camera = camera or _heard_camera(node, ros, progress)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
+
+    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
+        bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
+        progress.message(f"listening to {ros.topics.image}")
+        try:
+            if settings.realtime is not None:  # this thread, too, may hold Python's lock
+                set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
+            report = status_reporter(lambda: bridge.status.line(), progress)
+            with running_service() as beat:
+
+                def every_second() -> None:
+                    bridge.check_input()
+                    beat()
+                    report()
+
+                node.spin(bridge.handlers(ros.topics), every_second, settings.seconds)
+        finally:
+            bridge.close()
+    return bridge.status
+
+
+def _node(version: int, arguments: tuple[str, ...]) -> RosNode:
+    if version == 1:
+        from scenematch.bridges import ros1
+
+        return ros1.Node("scenematch", arguments)
+    if version == 2:
+        from scenematch.bridges import ros2
+
+        return ros2.Node("scenematch", arguments)
+    raise OptionError(f"version: expected 1 or 2, got {version}")
+
+
+def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera:
+    """The camera by its field of view and a picture of it, else the calibration that is published."""
+    described, topics = ros.camera_files(), ros.topics
+    if ros.hfov_deg is None:
+        return described.mounted(_published_camera(node, topics.camera_info, progress))
+    progress.message(f"waiting for a picture on {topics.image}, whose size is not known")
+    message = node.wait_for(topics.image, topics.image_type, _CAMERA_INFO_TIMEOUT_S)
+    if message is None:
+        raise BackendError(
+            f"image_topic: expected a picture on {topics.image} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
+        )
+    return described.with_field_of_view(image_from_message(message).shape)
+
+
+def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:
+    """The calibration that is published on a topic."""
+    if not topic:
+        raise OptionError("camera: expected a calibration, or a topic that has it")
+    progress.message(f"waiting for the calibration on {topic}")
+    message = node.wait_for(topic, "sensor_msgs/msg/CameraInfo", _CAMERA_INFO_TIMEOUT_S)
+    if message is None:
+        raise BackendError(
+            f"camera_info_topic: expected a calibration on {topic} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
+        )
+    return camera_from_message(message)

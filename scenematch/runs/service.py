@@ -1,0 +1,74 @@
+"""What a bridge reports while it runs: to the terminal a line, to systemd also that it is ready, goes on and ends.
+
+Nothing is sent to systemd where it does not ask for it by $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from scenematch.runs.progress import Progress
+
+_STATUS_PERIOD_S = 5.0
+_BEATS = 4  # within the time that the watchdog waits, so that one that is late or lost does not end the bridge
+
+
+@contextmanager
+def running_service() -> Iterator[Callable[[], None]]:
+    """Tell that the service is ready, and when the context ends that it stops.
+
+    Yields:
+        A function for the loop to call each time around: it tells the watchdog that the loop goes on, as often as
+        that waits for it. A loop that hangs does not call it, and systemd starts the service again.
+    """
+    period_s = int(os.environ.get("WATCHDOG_USEC") or 0) * 1e-6 / _BEATS
+    due_s = time.monotonic()
+
+    def beat() -> None:
+        nonlocal due_s
+        if period_s > 0.0 and (now := time.monotonic()) >= due_s:
+            due_s = now + period_s
+            _tell("WATCHDOG=1")
+
+    _tell("READY=1")
+    try:
+        yield beat
+    finally:
+        _tell("STOPPING=1")
+
+
+def status_reporter(line: Callable[[], str], progress: Progress) -> Callable[[], None]:
+    """A function for the loop to call each time around: now and then it shows what the bridge does.
+
+    Args:
+        line: of the bridge's status.
+        progress: is shown it; so is ``systemctl status``.
+    """
+    reported_s = time.monotonic()
+
+    def report() -> None:
+        nonlocal reported_s
+        if (now := time.monotonic()) - reported_s >= _STATUS_PERIOD_S:
+            reported_s = now
+            text = line()
+            progress.message(text)
+            _tell(f"STATUS={text}")
+
+    return report
+
+
+def _tell(state: str) -> None:
+    """Send a line; a manager that does not listen is no reason to stop a bridge."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+        line.setblocking(False)  # a full queue must not stop it either
+        try:
+            line.sendto(state.encode(), "\0" + address[1:] if address[0] == "@" else address)
+        except OSError:
+            return

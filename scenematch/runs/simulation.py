@@ -1,0 +1,151 @@
+"""Simulating a flight: a flight folder with its truth, over a town or the user's map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.values import Prior
+from scenematch.files.flight import write_flight_folder
+from scenematch.runs.arguments import check_choice
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.inputs import FlightFiles
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.results import OWNED
+from scenematch.simulator import CONDITIONS, FlightPlan, FlightStyle, Town, build_town, plan_flight, world_from_map
+from scenematch.simulator.flight import NADIR_PITCH_DEG, paper_camera, reach_m
+from scenematch.simulator.town import EXACT, MAX_RELIEF_M
+
+FOLDER_OWNED = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")
+"""The files of a simulated flight's folder."""
+LOOP_OWNED = ("loop.csv", "loop.json", "loop.png", "loop-path.png", *OWNED)
+"""What a closed loop writes beside them."""
+START_SIGMA_M = 10.0
+MAX_PITCH_DEG = -30.0
+"""Pitch of the camera that looks furthest from the vertical: 60 degrees off it."""
+_HEIGHT_M = FlightStyle().height_agl_m
+_TOWN_PX, _GSD_M_PER_PX = (900, 1000), 0.53
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldSettings:
+    """What is flown over.
+
+    Attributes:
+        seed: of town, path, sensors and camera.
+        condition: light, season and air of the frames; None is noon.
+        relief_m: height of a town's hills.
+        map: the user's own map as the world, in place of a town.
+        surface: heights of that map.
+        camera_pitch_deg: of the camera, -90 straight down, towards the nose: -45 looks 45 degrees ahead of that.
+
+    Raises:
+        OptionError: the arguments do not go together, there is no such condition, the hills are too high, or the
+            camera looks too far from the vertical.
+    """
+
+    seed: int = 1
+    condition: str | None = None
+    relief_m: float = 0.0
+    map: StrPath | None = None
+    surface: StrPath | None = None
+    camera_pitch_deg: float = NADIR_PITCH_DEG
+
+    def __post_init__(self) -> None:
+        if not NADIR_PITCH_DEG <= self.camera_pitch_deg <= MAX_PITCH_DEG:
+            raise OptionError(
+                f"camera_pitch_deg: expected {NADIR_PITCH_DEG:g} (straight down) to {MAX_PITCH_DEG:g}, "
+                f"got {self.camera_pitch_deg:g}"
+            )
+        if self.condition is not None:
+            check_choice("condition", self.condition, tuple(CONDITIONS))
+        if self.surface is not None and self.map is None:
+            raise OptionError(f"surface: expected with `map` only, got {self.surface}")
+        if not 0.0 <= self.relief_m <= MAX_RELIEF_M:
+            raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {self.relief_m:g}")
+        if self.relief_m and self.map is not None:
+            raise OptionError(
+                f"relief_m: expected without `map`, whose surface has its own, got {self.relief_m:g}"
+            )
+
+    def build(self) -> Town:
+        """The world with its map: a town of the seed's, or the user's rasters."""
+        if self.map is not None:
+            return world_from_map(self.map, self.surface, condition=self.condition, seed=self.seed)
+        # An oblique camera sees further, and the flight is as long over as much more of a town.
+        more_m = 2.0 * (reach_m(self.camera(), _HEIGHT_M) - reach_m(paper_camera(), _HEIGHT_M))
+        width_px, height_px = (n + math.ceil(more_m / _GSD_M_PER_PX) for n in _TOWN_PX)
+        return build_town(
+            self.seed,
+            width_px=width_px,
+            height_px=height_px,
+            gsd_m_per_px=_GSD_M_PER_PX,
+            condition=self.condition or "noon",
+            relief_m=self.relief_m,
+        )
+
+    def camera(self) -> Camera:
+        """The paper's camera, turned up by its pitch."""
+        return paper_camera(self.camera_pitch_deg)
+
+    def facts(self) -> dict[str, Any]:
+        """The same as JSON can hold it."""
+        return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
+
+
+def simulate(
+    out: StrPath,
+    world: WorldSettings | None = None,
+    *,
+    frames: int | None = None,
+    force: bool = False,
+    progress: Progress = SILENT,
+) -> dict[str, Any]:
+    """Fly the built-in flight and write its folder.
+
+    Args:
+        out: the folder.
+        world: what is flown over; None is the first town.
+        frames: flies only the first so many; None is all.
+        force: whether the folder may be there already.
+        progress: is shown what the run does.
+
+    Returns:
+        Facts about the flight.
+    """
+    out, world = Path(out), world or WorldSettings()
+    check_folder(out, force)
+    progress.message("drawing the world and the flight over it")
+    plan = plan_flight(world.seed, frames=frames, town=world.build(), camera=world.camera())
+    prepare_folder(out, force, (*FOLDER_OWNED, *LOOP_OWNED))
+    write_flight(out, plan, progress=progress)
+    way_m = float(np.hypot(*np.diff(plan.truth.position_m[:, :2], axis=0).T).sum())
+    seconds = (plan.timestamps_ns[-1] - plan.timestamps_ns[0]) * 1e-9
+    return {"frames": len(plan), "seconds": seconds, "way_m": way_m, **world.facts(), "folder": str(out.resolve())}
+
+
+def write_flight(folder: StrPath, plan: FlightPlan, *, progress: Progress = SILENT) -> FlightFiles:
+    """Put the simulated flight on disk as any other flight is; it is then read back like one."""
+    truth = plan.truth_rows()
+    start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
+    names = [f"{index:06d}.jpg" for index in range(len(plan))]
+    write_flight_folder(
+        folder,
+        frames=progress.track(zip(names, plan.iter_frames(), strict=True), len(plan), "flying"),
+        truth=truth,
+        camera=plan.camera,
+        ortho_rgb=plan.town.ortho,
+        pixel_to_crs=plan.town.pixel_to_crs,
+        crs_epsg=plan.town.crs_epsg,
+        surface_m=plan.town.surface_m,
+        start=start,
+        georeference_sigma_m=EXACT,
+        slope_sigma_deg=EXACT,
+    )
+    return FlightFiles.in_folder(folder)

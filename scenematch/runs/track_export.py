@@ -1,0 +1,105 @@
+"""Exporting a finished track in the formats of other programs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from engine.errors import TelemetryError
+from engine.geo import LocalFrame
+from engine.values import Truth
+from scenematch.files.export import WRITERS, PoseRow, pose_rows, segments, tum_rows
+from scenematch.files.logs.readers import open_truth
+from scenematch.files.notes import read_notes
+from scenematch.files.track import TrackRow, read_track
+from scenematch.report.metrics import Ground, height_pairs_m, truth_per_row
+from scenematch.runs.arguments import check_choice
+from scenematch.runs.folders import StrPath, check_file
+from scenematch.runs.record import read_record
+from scenematch.runs.results import NOTES, SUMMARY, TRACK
+
+
+def export_track(
+    folder: StrPath, kind: str, out: StrPath | None = None, *, truth: StrPath | None = None, force: bool = False
+) -> dict[str, Any]:
+    """Write a track in another format.
+
+    Args:
+        folder: of a finished run.
+        kind: one of :data:`scenematch.files.export.WRITERS`.
+        out: the file; ``track.KIND`` in the folder where None, or ``truth.KIND``.
+        truth: write this instead, where it knows the position at the times of the fixes, about the track's origin.
+        force: whether the file may be there already.
+
+    Returns:
+        What was written; of TUM also how many fixes were left out (:func:`scenematch.files.export.tum_rows`).
+
+    Raises:
+        OptionError: the format is unknown, or the file is there and ``force`` was not given.
+        TelemetryError: the folder holds no track, or the track has no fix.
+    """
+    folder = Path(folder)
+    check_choice("kind", kind, tuple(WRITERS))
+    out = folder / f"{'track' if truth is None else 'truth'}.{kind}" if out is None else Path(out)
+    check_file(out, force)
+    track = read_track(folder / TRACK)
+    if not any(row.fixed for row in track):
+        raise TelemetryError(f"{folder / TRACK}: expected a track with a fix, got {len(track)} rows without")
+    rows = _poses(folder, track) if truth is None else _at_truth(folder, track, Path(truth))
+    parts = segments(rows)
+    text = WRITERS[kind](rows)
+    try:
+        with out.open("w", encoding="utf-8", newline="") as file:
+            file.write(text)
+    except OSError as error:
+        raise TelemetryError(f"{out}: cannot be written: {error.strerror or error}") from None
+    fixes = sum(map(len, parts))
+    facts = {"file": str(out), "format": kind, "fixes": fixes, "segments": len(parts)}
+    return facts | ({"left_out": fixes - len(tum_rows(rows))} if kind == "tum" else {})
+
+
+def _poses(folder: Path, track: list[TrackRow]) -> list[PoseRow]:
+    """The track with what the run noted of the rest of each pose."""
+    notes = read_notes(folder / NOTES) if (folder / NOTES).is_file() else None
+    is_amsl = (folder / SUMMARY).is_file() and read_record(folder / SUMMARY).surface_datum is not None
+    return pose_rows(track, notes, is_amsl=is_amsl)
+
+
+def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
+    """The rows of the fixes, each at the true pose of that time, where the truth knows it.
+
+    Its heights are those that ``summary.json`` compares with the fixes', in the datum of the surface model.
+    """
+    record = read_record(folder / SUMMARY)
+    ground, frame = Ground(record.ground_m, record.ground_amsl_m), LocalFrame(**record.origin)
+    fixes = [row for row in track if row.fixed]
+    truth = open_truth(path, track[0].timestamp_ns)
+    heights_m = height_pairs_m(fixes, truth, ground)[:, 1] + ground.ground_m
+    true_rows = [
+        _true_row(row, at, frame, float(height_m))
+        for row, at, height_m in zip(fixes, truth_per_row(fixes, truth), heights_m, strict=True)
+        if at is not None
+    ]
+    if not true_rows:
+        raise TelemetryError(f"{path}: expected the truth at the moment of a fix, got none")
+    return true_rows
+
+
+def _true_row(row: TrackRow, at: Truth, frame: LocalFrame, up_m: float) -> PoseRow:
+    """The true pose at the time of a fix; a height that is not a number is unknown."""
+    east_m, north_m = map(float, frame.enu_from_geodetic(at.lat_deg, at.lon_deg))
+    return PoseRow(
+        timestamp_ns=row.timestamp_ns,
+        frame=row.frame,
+        status=row.status,
+        lat_deg=at.lat_deg,
+        lon_deg=at.lon_deg,
+        east_m=east_m,
+        north_m=north_m,
+        up_m=up_m if math.isfinite(up_m) else None,
+        alt_amsl_m=at.alt_amsl_m,
+        roll_deg=at.roll_deg,
+        pitch_deg=at.pitch_deg,
+        heading_deg=at.heading_deg,
+    )

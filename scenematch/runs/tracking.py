@@ -1,0 +1,213 @@
+"""Tracking a flight: its frames through the navigator, into track.csv, summary.json, figures and a report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from engine.budget import Budget
+from engine.errors import EngineError, TelemetryError
+from engine.matching.matcher import SceneMatcher
+from engine.navigation.navigator import Navigator
+from engine.options import ACCEPT_ALL
+from engine.values import Fix, NoFix, Prior, Reason
+from scenematch.files.flight import FlightFrame
+from scenematch.files.notes import frame_note, write_notes
+from scenematch.files.settings import changed
+from scenematch.files.telemetry import ground_amsl_m
+from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row
+from scenematch.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
+from scenematch.report.metrics import Ground
+from scenematch.runs.arguments import parse_budget, parse_position
+from scenematch.runs.checking import as_rows, diagnose_flight
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
+from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
+from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.record import RunRecord
+from scenematch.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
+from scenematch.runs.settings import TrackSettings
+
+if TYPE_CHECKING:  # rerun is optional
+    from scenematch.report.live_view import LiveView
+
+# Of the frames: with fewer fixed the inputs are checked, and with few the check is kept even where all fits.
+_CHECKED_SHARE, _FEW_SHARE = 0.9, 0.5
+
+
+def track(
+    files: FlightFiles,
+    out: StrPath,
+    settings: TrackSettings | None = None,
+    *,
+    force: bool = False,
+    report: bool = True,
+    diagnosis: bool = True,
+    live_view: LiveViewTarget = NO_LIVE_VIEW,
+    inputs: FlightInputs | None = None,
+    progress: Progress = SILENT,
+) -> dict[str, Any]:
+    """Follow a flight and write the output folder.
+
+    Everything that can be wrong with the input is found before the output folder is created.
+
+    Args:
+        files: of the flight.
+        out: the folder, created by this run.
+        settings: how it is followed; None is the defaults.
+        force: whether the folder may be there already.
+        report: whether there are figures and a page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
+        diagnosis: whether the inputs are checked where few frames were fixed.
+        live_view: where the live view goes.
+        inputs: what :func:`scenematch.runs.inputs.open_inputs` read of the files, where several runs share it.
+        progress: is shown what the run does.
+
+    Returns:
+        The summary, as summary.json has it.
+
+    Raises:
+        OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is not as expected.
+    """
+    out, settings = Path(out), settings or TrackSettings()
+    check_folder(out, force)
+    live_view.check(force=force)
+    start, budget = parse_position("start", settings.start), parse_budget("budget_ms", settings.budget_ms)
+    inputs = inputs or open_inputs(files, [settings], progress=progress)
+    site, flight = inputs.site, inputs.flight
+    matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings.matcher_options())
+    with progress.task("compiling") as report_compiled:
+        matcher.warmup(report_compiled)
+    prepare_folder(out, force, OWNED)
+    options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
+    navigator = Navigator(matcher, start, budget, options)
+    description = f"{settings.method}, {settings.profile} profile"
+    frames = progress.track(flight, len(flight), description)
+    with open_view(matcher, live_view) as view:
+        attitude = _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
+    ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
+    # From the rows as they stand in the file, so that evaluate gives the same figures.
+    rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
+    record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
+    share = _fixed_share(rows)
+    if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
+        record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
+    return write_results(out, rows, inputs.truth, site, ground, record, shown, report=report, progress=progress)
+
+
+def _fixed_share(rows: Sequence[TrackRow]) -> float:
+    """Which share of the frames was fixed; those that came too late say nothing of the inputs."""
+    answered = [row for row in rows if row.reason != Reason.LATE.value]
+    return sum(row.fixed for row in answered) / len(answered) if answered else 1.0
+
+
+def _diagnosis(
+    files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, share: float, progress: Progress
+) -> dict[str, str] | None:
+    """What of the inputs does not fit; None where that cannot be said, which is no reason to lose a track."""
+    progress.message(f"{share:.0%} of the frames were fixed: looking for what does not fit")
+    try:
+        found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
+    except (EngineError, MemoryError, KeyboardInterrupt):
+        return None
+    if not found.findings and share >= _FEW_SHARE:
+        return None
+    return dict(as_rows(found, corrected=not files.corrections.changes_nothing))
+
+
+def _record(
+    files: FlightFiles,
+    settings: TrackSettings,
+    inputs: FlightInputs,
+    device: str,
+    ground: Ground,
+    attitude: AttitudeCheck | None,
+) -> RunRecord:
+    """What a run was made of, for summary.json."""
+
+    def absolute(path: Path | None) -> str | None:
+        return None if path is None else str(path.resolve())
+
+    return RunRecord(
+        map=str(files.map.resolve()),
+        surface=absolute(files.surface),
+        camera=absolute(files.camera),
+        frames=absolute(files.frames),
+        telemetry=absolute(files.telemetry),
+        truth=absolute(inputs.truth_path),
+        frame_stamps=absolute(files.frame_stamps),
+        log_offset_s=files.log_offset_s if files.has_clock else None,
+        image_topic=files.image_topic,
+        odometry_topic=files.odometry_topic,
+        every=files.every if files.every > 1 else None,
+        map_sigma_m=files.map_sigma_m,
+        map_bounds=files.map_bounds,
+        map_crs=files.map_crs,
+        hfov_deg=files.hfov_deg,
+        mount=files.mount,
+        camera_pitch_deg=files.camera_pitch_deg,
+        scale_calibration=files.scale_calibration,
+        corrections=None if files.corrections.changes_nothing else files.corrections.facts(),
+        heights=dict(inputs.flight.heights),
+        method=settings.method,
+        profile=settings.profile,
+        device=device,
+        start=settings.start,
+        budget_ms=settings.budget_ms,
+        changed=changed(settings),
+        origin={"lat_deg": inputs.site.frame.lat_deg, "lon_deg": inputs.site.frame.lon_deg},
+        ground_m=ground.ground_m,
+        ground_amsl_m=ground.ground_amsl_m,
+        surface_datum=inputs.site.surface_datum,
+        attitude=None if attitude is None else asdict(attitude),
+    )
+
+
+def _follow(
+    frames: Iterable[FlightFrame],
+    navigator: Navigator,
+    out: Path,
+    budget: Budget | None,
+    *,
+    use_priors: bool,
+    view: LiveView | None = None,
+) -> AttitudeCheck | None:
+    """Every frame through the navigator, each row on disk as soon as it is known.
+
+    Args:
+        frames: in their order.
+        navigator: fresh.
+        out: the folder of track.csv and notes.csv.
+        budget: of each frame.
+        use_priors: whether the telemetry's own positions count; a start that was given stands in their place.
+        view: is shown each frame once it is answered.
+
+    Returns:
+        AttitudeCheck | None: what the fixes say of the telemetry's attitude.
+    """
+    attitudes: list[AttitudeRow | None] = []
+    notes = []
+    with TrackWriter(out / TRACK) as writer:
+        for index, item in enumerate(frames):
+            prior = item.prior if use_priors else None
+            begin = time.perf_counter()
+            result = _update(navigator, item, prior)
+            latency_ms = (time.perf_counter() - begin) * 1e3
+            met = None if budget is None else latency_ms <= budget.total_ms
+            writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
+            attitudes.append(attitude_row(item.frame, result))
+            notes.append(frame_note(item.name, result, navigator.state.value))
+            if view is not None:
+                view.show(index, item.name, item.frame, result, navigator.state, latency_ms)
+    write_notes(out / NOTES, notes)
+    return check_attitude([row for row in attitudes if row is not None])
+
+
+def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:
+    """The frame's result; an error in the middle of a flight names its frame, and is no wrong usage."""
+    try:
+        return navigator.update(item.frame, prior)
+    except EngineError as error:
+        raise TelemetryError(f"frame {item.name}: {error}") from error

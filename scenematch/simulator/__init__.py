@@ -1,0 +1,33 @@
+"""The software-in-the-loop flight: a simulated town, the camera over it, the vehicle and its sensors."""
+
+from scenematch.simulator.conditions import CONDITIONS, Condition
+from scenematch.simulator.flight import FlightPlan, SimulatedFlight, TownOptions, picture_at, plan_flight
+from scenematch.simulator.light import LIGHTS, Light
+from scenematch.simulator.optics import ExposureMotion, Optics, take_picture
+from scenematch.simulator.raster_world import world_from_map
+from scenematch.simulator.render import World, render_frame
+from scenematch.simulator.town import Town, build_town
+from scenematch.simulator.vehicle import FlightStyle, Motion, SensorNoise
+
+__all__ = [
+    "CONDITIONS",
+    "LIGHTS",
+    "Condition",
+    "ExposureMotion",
+    "FlightPlan",
+    "FlightStyle",
+    "Light",
+    "Motion",
+    "Optics",
+    "SensorNoise",
+    "SimulatedFlight",
+    "Town",
+    "TownOptions",
+    "World",
+    "build_town",
+    "picture_at",
+    "plan_flight",
+    "render_frame",
+    "take_picture",
+    "world_from_map",
+]

@@ -1,0 +1,338 @@
+"""The built-in flight: the paper's setting over a simulated town, frames with telemetry, and the truth.
+
+Everything comes from one seed; nothing is read or written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.camera import Camera
+from engine.errors import OptionError
+from engine.geo import LocalFrame, wrap_difference_deg
+from engine.values import Attitude, Frame, Truth
+from scenematch.simulator.conditions import Condition
+from scenematch.simulator.light import Image
+from scenematch.simulator.optics import ExposureMotion, Optics, Sensor, take_picture
+from scenematch.simulator.render import transformer
+from scenematch.simulator.town import Town, build_town, generator
+from scenematch.simulator.vehicle import (
+    COURSE_STEP_S,
+    START_NS,
+    FlightStyle,
+    Motion,
+    SensorNoise,
+    fly_waypoints,
+    simulate_telemetry,
+)
+
+Array = NDArray[np.float64]
+
+NADIR_PITCH_DEG = -90.0
+"""Pitch of a camera that looks straight down."""
+EDGE_M = 20.0
+"""Distance of footprints from the map's edge while the camera looks straight down."""
+DRONE_SENSOR = Sensor(
+    gamma=1.1,
+    balance_rgb=(0.96, 1.02, 1.09),
+    haze=0.0,
+    vignette=0.1,
+    exposure_sd=0.015,
+    blur_px=0.45,
+    noise_sd=2.5,
+)
+"""The drone's camera: a cooler white balance and more contrast than the map's."""
+
+
+def grid_at(town: Town, origin: LocalFrame, east_north_m: Array) -> tuple[float, float]:
+    """Easting and northing of a position in the local frame.
+
+    Args:
+        town: whose CRS is meant.
+        origin: of the local frame.
+        east_north_m: (2,) or (3,) east and north in metres; what follows is not read.
+
+    Returns:
+        (easting, northing) in metres in the town's CRS.
+    """
+    lat, lon = origin.geodetic_from_enu(float(east_north_m[0]), float(east_north_m[1]))
+    easting, northing = transformer(town.crs_epsg).transform(float(lon), float(lat))
+    return easting, northing
+
+
+def picture_at(
+    town: Town,
+    camera: Camera,
+    origin: LocalFrame,
+    east_north_up_m: Array,
+    attitude: Attitude,
+    rng: np.random.Generator,
+    *,
+    sensor: Sensor | None = None,
+    optics: Optics | None = None,
+    sway: ExposureMotion | None = None,
+) -> Image:
+    """The picture that a camera at a position delivers.
+
+    Args:
+        town: what it looks at.
+        camera: intrinsics and mount.
+        origin: of the local east-north-up frame.
+        east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
+        attitude: of the body, about true north.
+        rng: of the sensor's noise and exposure.
+        sensor: how light becomes grey levels; None takes the drone's, as it is in the town's condition.
+        optics: exposure time, shutter and gain; None is an ideal camera.
+        sway: motion while the picture is taken.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+
+    Raises:
+        OptionError: the camera looks above the horizon, or is not above the highest roof.
+    """
+    grid, up = grid_at(town, origin, east_north_up_m), float(east_north_up_m[2])
+    sensor = sensor or town.condition.sensor(DRONE_SENSOR)
+    return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, optics=optics, sway=sway)
+
+
+@dataclass(frozen=True)
+class FlightPlan:
+    """A flight before its pictures are drawn.
+
+    Attributes:
+        town: what it flies over.
+        camera: what it looks through.
+        origin: of the local east-north-up frame of its motions: the map's centre; up from the world's height 0.
+        truth: the exact motion, one entry per frame.
+        telemetry: the same as the sensors measure it.
+        timestamps_ns: capture times.
+        seed: of the camera's noise.
+        optics: exposure, shutter and gain; None is an ideal camera.
+        sways: motion while each picture is taken, where the optics show it.
+    """
+
+    town: Town
+    camera: Camera
+    origin: LocalFrame
+    truth: Motion
+    telemetry: Motion
+    timestamps_ns: tuple[int, ...]
+    seed: int
+    optics: Optics | None = None
+    sways: tuple[ExposureMotion, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.timestamps_ns)
+
+    def iter_frames(self) -> Iterator[Frame]:
+        """Draw the frames one after the other, each with its telemetry."""
+        rng = generator(self.seed, 0xCA)
+        for k in range(len(self)):
+            yield self._frame(k, rng)
+
+    def _frame(self, k: int, rng: np.random.Generator) -> Frame:
+        truth, telemetry = self.truth, self.telemetry
+        attitude = Attitude(float(truth.roll_deg[k]), float(truth.pitch_deg[k]), float(truth.heading_deg[k]))
+        position_m, sway = truth.position_m[k], self.sways[k] if self.sways else None
+        return Frame(
+            picture_at(
+                self.town, self.camera, self.origin, position_m, attitude, rng, optics=self.optics, sway=sway
+            ),
+            timestamp_ns=self.timestamps_ns[k],
+            height_agl_m=float(telemetry.position_m[k, 2]) - self._ground_m(k),
+            heading_deg=float(telemetry.heading_deg[k]),
+            roll_deg=float(telemetry.roll_deg[k]),
+            pitch_deg=float(telemetry.pitch_deg[k]),
+            east_velocity_mps=float(telemetry.velocity_mps[k, 0]),
+            north_velocity_mps=float(telemetry.velocity_mps[k, 1]),
+        )
+
+    def _ground_m(self, k: int) -> float:
+        """The bare ground below the vehicle, above the world's height 0."""
+        return self.town.world.ground_at(grid_at(self.town, self.origin, self.truth.position_m[k]))
+
+    def truth_rows(self) -> list[Truth]:
+        """True poses of the camera, one row per frame."""
+        motion = self.truth
+        lat, lon = self.origin.geodetic_from_enu(motion.position_m[:, 0], motion.position_m[:, 1])
+        return [
+            Truth(
+                timestamp_ns=stamp,
+                lat_deg=float(lat[k]),
+                lon_deg=float(lon[k]),
+                alt_amsl_m=self.town.datum_amsl_m + float(motion.position_m[k, 2]),
+                height_agl_m=float(motion.position_m[k, 2]) - self._ground_m(k),
+                roll_deg=float(motion.roll_deg[k]),
+                pitch_deg=float(motion.pitch_deg[k]),
+                heading_deg=float(motion.heading_deg[k]),
+            )
+            for k, stamp in enumerate(self.timestamps_ns)
+        ]
+
+    def draw(self) -> SimulatedFlight:
+        """Draw all pictures at once; :meth:`iter_frames` holds one at a time."""
+        return SimulatedFlight(self.town, self.camera, list(self.iter_frames()), self.truth_rows())
+
+
+@dataclass(frozen=True)
+class SimulatedFlight:
+    """A flight with its pictures drawn.
+
+    Attributes:
+        town: map, surface model and world.
+        camera: what the frames were taken with.
+        frames: pictures with noisy telemetry in them.
+        truth: the exact poses, row for row with the frames.
+    """
+
+    town: Town
+    camera: Camera
+    frames: list[Frame]
+    truth: list[Truth]
+
+
+def paper_camera(pitch_deg: float = NADIR_PITCH_DEG) -> Camera:
+    """The paper's camera, 300 x 300 px with 60 degrees.
+
+    Args:
+        pitch_deg: of its axis against the body's horizontal, as gimbals state it: -90 looks straight down, -45
+            half way up from there towards the nose.
+    """
+    camera = Camera.from_fov(300, 300, 60.0)
+    up = math.radians(pitch_deg - NADIR_PITCH_DEG)
+    turn = np.array([[math.cos(up), 0.0, math.sin(up)], [0.0, 1.0, 0.0], [-math.sin(up), 0.0, math.cos(up)]])
+    return camera if pitch_deg == NADIR_PITCH_DEG else replace(camera, mount=turn @ camera.mount)
+
+
+def reach_m(camera: Camera, height_m: float) -> float:
+    """How far a level camera sees: to the corners of a nadir picture, to the middle of an oblique one, in metres.
+
+    Args:
+        camera: intrinsics and mount.
+        height_m: above the ground.
+    """
+    corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
+    axis = camera.mount[:, 2]
+    return height_m * max(math.hypot(corner[0], corner[1]), math.hypot(axis[0], axis[1]) / float(axis[2]))
+
+
+def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Generator) -> Array:
+    """Corners (5, 2) of the largest rectangle whose level footprints lie on the map, jittered.
+
+    Of an oblique camera it is the middle of the footprint.
+    """
+    half_w, half_h = (0.5 * n * town.gsd_m_per_px for n in (town.ortho.shape[1], town.ortho.shape[0]))
+    reach = reach_m(camera, height_m) + EDGE_M
+    if min(half_w, half_h) - reach < 20.0:
+        raise OptionError(
+            f"town: expected a map larger than {2 * reach + 40:.0f} m for footprints seen from {height_m:.0f} m, "
+            f"got {2 * half_w:.0f} x {2 * half_h:.0f} m"
+        )
+    square = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1], [-0.95, -0.9]]) * (half_w - reach, half_h - reach)
+    return np.asarray(square - np.sign(square) * rng.uniform(0.0, 6.0, square.shape))
+
+
+def _check_frames(frames: int | None, rate_hz: float) -> None:
+    if frames is not None and frames < 1:
+        raise OptionError(f"frames: expected 1 or more, got {frames}")
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
+
+
+def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
+    """Velocity and turn rate at each time, by central differences over one step of the motion."""
+    before, now, after = (motion.at(time_s + step) for step in (-COURSE_STEP_S, 0.0, COURSE_STEP_S))
+
+    def rate(ends: tuple[Array, Array]) -> Array:
+        return wrap_difference_deg(ends[1] - ends[0]) / (2.0 * COURSE_STEP_S)
+
+    angles = ("roll_deg", "pitch_deg", "heading_deg")
+    turns = np.column_stack([rate((getattr(before, name), getattr(after, name))) for name in angles])
+    return tuple(
+        ExposureMotion((float(v[0]), float(v[1]), float(v[2])), (float(w[0]), float(w[1]), float(w[2])))
+        for v, w in zip(now.velocity_mps, turns, strict=True)
+    )
+
+
+class TownOptions(TypedDict, total=False):
+    """Keyword arguments of :func:`plan_flight` about the town that is built, see :func:`build_town`.
+
+    Attributes:
+        condition: day of the frames: light, season and air.
+        map_condition: day of the map.
+        relief_m: height of the hills. The flight keeps its height above the ground where it begins.
+        river: whether one crosses the town.
+        changed: share of the houses, 0 to 1, that differ between the map and the flight.
+    """
+
+    condition: str | Condition
+    map_condition: str | Condition
+    relief_m: float
+    river: bool
+    changed: float
+
+
+def plan_flight(
+    seed: int = 1,
+    *,
+    frames: int | None = None,
+    rate_hz: float = 1.12,
+    noise: SensorNoise | None = None,
+    style: FlightStyle | None = None,
+    town: Town | None = None,
+    camera: Camera | None = None,
+    optics: Optics | None = None,
+    **town_options: Unpack[TownOptions],
+) -> FlightPlan:
+    """Plan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
+
+    Args:
+        seed: of town, path, sensors and camera.
+        frames: how many, from take-off on; None flies to the end (about 150).
+        rate_hz: frames per second.
+        noise: of the telemetry; None takes the defaults, as for the style.
+        style: of flying.
+        town: to fly over; None builds the seed's by ``town_options``.
+        camera: None takes the paper's, 300 x 300 px with 60 degrees.
+        optics: exposure time, shutter and gain of the camera; None is an ideal one.
+        **town_options: see :class:`TownOptions`; without effect where a town is given.
+
+    Raises:
+        OptionError: an argument is out of range, or the map is too small for the height.
+    """
+    _check_frames(frames, rate_hz)
+    style, camera = style or FlightStyle(), camera or paper_camera()
+    town = town or build_town(seed, **town_options)
+    motion, origin = _fly_over(town, camera, style, generator(seed, 0xF1))
+    stamps_ns = _stamps_ns(motion, frames, rate_hz)
+    time_s = np.asarray(stamps_ns * 1e-9, np.float64)
+    truth = motion.at(time_s)
+    telemetry = simulate_telemetry(truth, noise or SensorNoise(), generator(seed, 0x5E))
+    sways = () if optics is None else _sways(motion, time_s)
+    stamps = tuple((START_NS + stamps_ns).tolist())
+    return FlightPlan(town, camera, origin, truth, telemetry, stamps, seed, optics=optics, sways=sways)
+
+
+def _fly_over(
+    town: Town, camera: Camera, style: FlightStyle, rng: np.random.Generator
+) -> tuple[Motion, LocalFrame]:
+    """The motion round the map, up from the world's height 0, and the local frame about the map's centre."""
+    middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
+    lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
+    origin = LocalFrame(lat, lon)
+    motion = fly_waypoints(_waypoints(town, camera, style.height_agl_m, rng), style, rng)
+    motion.position_m[:, 2] += town.world.ground_at(grid_at(town, origin, motion.position_m[0]))
+    return motion, origin
+
+
+def _stamps_ns(motion: Motion, frames: int | None, rate_hz: float) -> NDArray[np.int64]:
+    """Times (N,) of the frames since take-off in nanoseconds."""
+    count = int(motion.time_s[-1] * rate_hz) + 1
+    return np.asarray(np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz), np.int64)

@@ -1,0 +1,394 @@
+"""The closed loop: a simulated vehicle that steers by its filter, whose only positions are the engine's fixes.
+
+What it does when they fail:
+
+- No fix: the filter propagates on the IMU alone, and the vehicle follows its route while the estimate's sigma
+  stays below ``hold_sigma_m``.
+- Above that it holds: it slows down on its route and hovers by the estimate, until fixes have brought the sigma
+  below half of that limit. Then it returns to where it left the route, and flies on.
+- Above ``give_up_sigma_m`` the estimate is too uncertain to hover by: the flight is handed over to the pilot.
+- A fix that contradicts the filter by chi-square is not fused. Where ``max_contradictions`` fixes in a row do so,
+  either the filter or the engine is wrong, and the flight is handed over as well.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import attitude_from_rotation
+from engine.navigation.navigator import Matcher, Navigator
+from engine.navigation.state import NavigatorState
+from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
+from scenematch.simulator.ekf import (
+    START_TILT_DEG,
+    FilterState,
+    fix_chi_square,
+    fuse_fix,
+    fuse_gps,
+    fuse_heading,
+    fuse_height,
+    initial_state,
+)
+from scenematch.simulator.faults import Fault, ShiftedMap
+from scenematch.simulator.history import History
+from scenematch.simulator.pilot import Gains, Pilot, Route, Setpoint
+from scenematch.simulator.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
+from scenematch.simulator.sensors import GpsSample, Instruments, SensorSuite, steps_between
+from scenematch.simulator.vehicle import START_NS
+
+__all__ = [
+    "ClosedLoop",
+    "Fault",
+    "LoopAnswer",
+    "LoopOptions",
+    "LoopResult",
+    "LoopSample",
+    "Mode",
+    "fly_closed_loop",
+]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+RenderCallback = Callable[[State], Image]
+"""Returns the picture that the camera delivers at a state of the vehicle."""
+
+
+class Mode(enum.Enum):
+    """Whether the vehicle follows its route, holds its position, or is handed over to the pilot."""
+
+    FOLLOW = "follow"
+    HOLD = "hold"
+    HANDED_OVER = "handed_over"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopOptions:
+    """How the closed loop is flown.
+
+    Attributes:
+        airframe: of the vehicle.
+        wind: mean and gusts.
+        sensors: on board.
+        gains: of the position controller.
+        frame_rate_hz: of the camera.
+        latency_s: from the capture of a frame to the arrival of its fix.
+        start_sigma_m: standard deviation of the position at the start, per axis.
+        hold_sigma_m: horizontal sigma of the estimate above which the vehicle holds.
+        give_up_sigma_m: horizontal sigma of the estimate above which the flight is handed over.
+        resume_m: largest estimated distance from the route at which the vehicle flies on after a hold.
+        pace_change_per_s: how fast it slows down along its route and speeds up again; 1 is within a second.
+        gate: chi-square of two degrees of freedom, beyond which a fix contradicts the filter.
+        max_contradictions: fixes in a row that contradict the filter, at which the flight is handed over.
+        healthy_s: age of the last fix, beyond its latency, up to which the engine counts as healthy.
+        gps: whether the receiver's positions are fused instead of the engine's fixes.
+
+    Raises:
+        OptionError: a value is not above 0.
+    """
+
+    airframe: Airframe = field(default_factory=Airframe)
+    wind: Wind = field(default_factory=Wind)
+    sensors: SensorSuite = field(default_factory=SensorSuite)
+    gains: Gains = field(default_factory=Gains)
+    frame_rate_hz: float = 5.0
+    latency_s: float = 0.12
+    start_sigma_m: float = 3.0
+    hold_sigma_m: float = 5.0
+    give_up_sigma_m: float = 20.0
+    resume_m: float = 5.0
+    pace_change_per_s: float = 0.25
+    gate: float = 18.4
+    max_contradictions: int = 15
+    healthy_s: float = 1.0
+    gps: bool = False
+
+    def __post_init__(self) -> None:
+        names = ("latency_s", "start_sigma_m", "hold_sigma_m", "give_up_sigma_m", "resume_m")
+        check_positive(self, *names, "pace_change_per_s", "gate", "max_contradictions", "healthy_s")
+        steps_between(self.frame_rate_hz)
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSample:
+    """One row of the flight's record.
+
+    Attributes:
+        time_s: since the start.
+        truth: the true state of the vehicle.
+        estimate: the filter's.
+        plan_m: (3,) position of the setpoint, east, north and up.
+        mode: of the flight.
+        healthy: whether the engine's last fix is recent.
+    """
+
+    time_s: float
+    truth: State
+    estimate: FilterState
+    plan_m: Array
+    mode: Mode
+    healthy: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LoopAnswer:
+    """The engine's answer to one frame.
+
+    Attributes:
+        timestamp_ns: of its capture.
+        truth: the vehicle's true state then.
+        result: of the engine.
+        state: the navigator's after it; None where the engine was killed.
+        arrives_s: when the vehicle receives the answer.
+    """
+
+    timestamp_ns: int
+    truth: State
+    result: Fix | NoFix
+    state: NavigatorState | None
+    arrives_s: float
+
+
+@dataclass
+class LoopResult:
+    """A flight that was flown.
+
+    Attributes:
+        record: ten times a second.
+        answers: the engine's, one per frame.
+        used: timestamps of the fixes that the filter fused.
+        start_m: (3,) the filter's estimate before the start, east, north and up.
+        resets: how often the navigator reset its position.
+    """
+
+    record: list[LoopSample]
+    answers: list[LoopAnswer]
+    used: list[int]
+    start_m: Array
+    resets: int = 0
+
+    @property
+    def plan_error_m(self) -> Array:
+        """(N, 3) truth less plan of every sample, in east, north and up."""
+        return np.array([row.truth.position_m - row.plan_m for row in self.record])
+
+    @property
+    def estimate_error_m(self) -> Array:
+        """(N, 3) estimate less truth of every sample, in east, north and up."""
+        return np.array([row.estimate.position_m - row.truth.position_m for row in self.record])
+
+
+def fly_closed_loop(
+    route: Route,
+    camera: RenderCallback,
+    matcher: Matcher,
+    *,
+    seed: int = 1,
+    seconds: float | None = None,
+    fault: Fault | None = None,
+    options: LoopOptions | None = None,
+) -> LoopResult:
+    """Fly a route by the engine's fixes.
+
+    Args:
+        route: where to; about the origin of the matcher's map, up above its ground.
+        camera: takes the pictures.
+        matcher: matches them; a :class:`engine.matching.matcher.SceneMatcher`, or a stand-in.
+        seed: of wind, vibration and all sensors.
+        seconds: how long at most; None flies as long as the route takes without holding. A flight that is handed
+            over ends there.
+        fault: injected failure.
+        options: settings.
+
+    Raises:
+        OptionError: an option is out of range.
+    """
+    loop = ClosedLoop(route, camera, matcher, seed=seed, fault=fault, options=options)
+    for _ in loop.fly(seconds):
+        pass
+    return loop.flown
+
+
+class ClosedLoop:
+    """A closed-loop flight in progress, frame by frame; the arguments are those of :func:`fly_closed_loop`.
+
+    Attributes:
+        options: as given.
+        fault: as given.
+        flown: the flight so far.
+    """
+
+    def __init__(
+        self,
+        route: Route,
+        camera: RenderCallback,
+        matcher: Matcher,
+        *,
+        seed: int = 1,
+        fault: Fault | None = None,
+        options: LoopOptions | None = None,
+    ) -> None:
+        fault, options = fault or Fault(), options or LoopOptions()
+        air, sensors, start, self._shakes = np.random.default_rng(np.random.SeedSequence([seed, 0xC1])).spawn(4)
+        self._route, self._camera, self.fault, self.options = route, camera, fault, options
+        self._map = ShiftedMap(matcher)
+        self._air, self._pilot = WindField(options.wind, air), Pilot(options.gains)
+        self._instruments = Instruments(options.sensors, sensors)
+        self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
+        keep_s = 1.0 + max(options.latency_s, options.sensors.gps.latency_s)
+        self._history = History(self._initial_estimate(start), options.sensors, keep_s)
+        self._navigator: Navigator | None = self._new_engine()
+        self._clock_s, self._pace, self._plan = 0.0, 1.0, route.at(0.0)
+        self._kicks = deque(route.kicks_s)
+        self._picture: Image | None = None
+        self._pending: deque[LoopAnswer] = deque()
+        self._receiver: deque[GpsSample] = deque()
+        self._contradictions = 0  # in a row
+        self._last_fix_s = -math.inf
+        self._mode = Mode.FOLLOW
+        self.flown = LoopResult([], [], [], self._history.now.position_m)
+
+    def _initial_estimate(self, rng: np.random.Generator) -> FilterState:
+        """At rest, with errors drawn from the filter's own covariance."""
+        sigma, white = self.options.start_sigma_m, rng.standard_normal(5)
+        heading = self._instruments.heading_deg(self._state)
+        attitude = Attitude(START_TILT_DEG * white[3], START_TILT_DEG * white[4], heading)
+        return initial_state(self._state.position_m + sigma * white[:3], sigma, attitude, self.options.sensors)
+
+    def _new_engine(self) -> Navigator:
+        """A navigator that starts from the filter's estimate."""
+        estimate = self._history.now
+        east, north = (float(v) for v in estimate.position_m[:2])
+        return Navigator(self._map, Prior(east_m=east, north_m=north, sigma_m=estimate.sigma_m))
+
+    def fly(self, seconds: float | None = None) -> Iterator[Frame]:
+        """Fly; yields every frame as the engine gets it, after its answer."""
+        every = steps_between(self.options.frame_rate_hz)
+        for k in range(1, round((self._route.duration_s if seconds is None else seconds) / STEP_S) + 1):
+            self._step(k)
+            if k % every == 0:
+                yield self._process_frame()
+            self._receive()
+            self._choose_mode()
+            over = self._mode is Mode.HANDED_OVER
+            if over or k % round(0.1 / STEP_S) == 0:
+                self._record()
+            if over:
+                return
+
+    def _step(self, k: int) -> None:
+        """The ``k``-th step of :data:`scenematch.simulator.quadrotor.STEP_S`."""
+        options, estimate = self.options, self._history.now
+        target = self._plan = self._target()
+        while self._kicks and self._clock_s >= self._kicks[0]:
+            self._kicks.popleft()
+            self._state = shaken(self._state, options.airframe, self._shakes)
+        wanted = self._pilot.steer(target, estimate.position_m, estimate.velocity_mps)
+        self._state, felt = advance(self._state, wanted, target.heading_deg, options.airframe, self._air.next())
+        self._history.advance(self._instruments.imu(felt))
+        self._sense(k)
+
+    def _target(self) -> Setpoint:
+        """The setpoint; while the vehicle holds, the route's clock slows to a stop, and afterwards runs again."""
+        faster = self.options.pace_change_per_s * (1.0 if self._mode is Mode.FOLLOW else -1.0)
+        pace = min(max(self._pace + faster * STEP_S, 0.0), 1.0)
+        change, self._pace = (pace - self._pace) / STEP_S, pace
+        self._clock_s += pace * STEP_S
+        return self._route.at(self._clock_s, pace, change)
+
+    def _sense(self, k: int) -> None:
+        """Read barometer and compass, and the GPS receiver where it is used."""
+        suite, instruments, state = self.options.sensors, self._instruments, self._state
+        now_s = self._history.now.time_s
+        if k % steps_between(suite.barometer.rate_hz) == 0:
+            height_m = instruments.height_m(state)
+            self._history.fuse(partial(fuse_height, height_m=height_m, suite=suite), now_s)
+        if k % steps_between(suite.compass.rate_hz) == 0:
+            heading_deg = instruments.heading_deg(state)
+            self._history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=suite), now_s)
+        if self.options.gps and k % steps_between(suite.gps.rate_hz) == 0:
+            self._receiver.append(instruments.gps(state))
+
+    def _process_frame(self) -> Frame:
+        """Take a picture and match it; the answer arrives after the latency."""
+        time_s, fault = self._state.time_s, self.fault
+        if self._picture is None or not fault.acts("frozen", time_s):
+            self._picture = self._camera(self._state)
+        self._map.shift_m = fault.shift_m if fault.acts("shifted", time_s) else 0.0
+        stamp_ns = START_NS + round(time_s * 1e9)
+        frame = self._frame(self._picture, stamp_ns)
+        result: Fix | NoFix = NoFix(reason=Reason.FAILED, detail="the engine was killed", timestamp_ns=stamp_ns)
+        if fault.acts("killed", time_s):
+            self._navigator = None
+        else:
+            self._navigator = self._navigator or self._new_engine()
+            before = self._navigator.reset_count
+            result = self._navigator.update(frame)
+            self.flown.resets += self._navigator.reset_count - before
+        state = None if self._navigator is None else self._navigator.state
+        answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.options.latency_s)
+        self.flown.answers.append(answer)
+        self._pending.append(answer)
+        return frame
+
+    def _frame(self, picture: Image, stamp_ns: int) -> Frame:
+        """The picture with the filter's estimate at its capture."""
+        estimate = self._history.now
+        roll, pitch, heading = attitude_from_rotation(estimate.enu_from_body)
+        return Frame(
+            picture,
+            timestamp_ns=stamp_ns,
+            height_agl_m=max(float(estimate.position_m[2]) - self._map.site.ground_m, 1.0),
+            heading_deg=heading,
+            roll_deg=roll,
+            pitch_deg=pitch,
+            east_velocity_mps=float(estimate.velocity_mps[0]),
+            north_velocity_mps=float(estimate.velocity_mps[1]),
+        )
+
+    def _receive(self) -> None:
+        """Fuse what has arrived by now, each at its own time."""
+        now_s, options = self._state.time_s, self.options
+        while self._pending and self._pending[0].arrives_s <= now_s + 0.5 * STEP_S:
+            answer = self._pending.popleft()
+            if isinstance(answer.result, Fix) and not options.gps:
+                self._gate(answer.result, answer)
+        while self._receiver and self._receiver[0].time_s + options.sensors.gps.latency_s <= now_s + 0.5 * STEP_S:
+            sample = self._receiver.popleft()
+            self._history.fuse(partial(fuse_gps, sample=sample, suite=options.sensors), sample.time_s)
+
+    def _choose_mode(self) -> None:
+        estimate, options = self._history.now, self.options
+        sigma_m = estimate.sigma_m
+        off_m = float(np.hypot(*(estimate.position_m - self._plan.position_m)[:2]))
+        if self._contradictions >= options.max_contradictions or sigma_m > options.give_up_sigma_m:
+            self._mode = Mode.HANDED_OVER
+        elif sigma_m > options.hold_sigma_m:
+            self._mode = Mode.HOLD
+        elif sigma_m < 0.5 * options.hold_sigma_m and off_m < options.resume_m:
+            self._mode = Mode.FOLLOW
+
+    def _gate(self, fix: Fix, answer: LoopAnswer) -> None:
+        """Fuse a fix that passes the chi-square gate, count any other."""
+        captured_s = answer.truth.time_s
+        self._last_fix_s = captured_s
+        if fix_chi_square(self._history.at(captured_s), fix) > self.options.gate:
+            self._contradictions += 1
+            return
+        self._contradictions = 0
+        self._history.fuse(partial(fuse_fix, fix=fix), captured_s)
+        self.flown.used.append(answer.timestamp_ns)
+
+    def _record(self) -> None:
+        """Add a row to the record."""
+        state, options = self._state, self.options
+        healthy = state.time_s - self._last_fix_s - options.latency_s <= options.healthy_s
+        row = LoopSample(state.time_s, state, self._history.now, self._plan.position_m, self._mode, healthy)
+        self.flown.record.append(row)

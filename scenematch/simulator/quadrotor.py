@@ -1,0 +1,249 @@
+"""A quadrotor in wind: thrust along its body, a second-order attitude response, drag, and its ideal IMU.
+
+Convention:
+    World axes are east-north-up, body axes forward-right-down; ``enu_from_body`` takes the second to the first.
+    A step integrates the acceleration of its beginning over its length, so that an IMU that is integrated in
+    the same way gives the same path.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import OptionError
+from engine.geo import attitude_from_rotation, enu_from_body
+from engine.values import Attitude, check_positive
+from scenematch.simulator.rotations import rotation, rotation_vector
+from scenematch.simulator.vehicle import GRAVITY_MPS2
+
+__all__ = ["Airframe", "IdealImu", "State", "Wind", "WindField", "advance", "hovering"]
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.01
+"""Time step of dynamics, control and IMU."""
+GRAVITY = np.array([0.0, 0.0, -GRAVITY_MPS2])
+_PEAK_OF_SWING = 0.71  # first peak after an impulse over impulse / frequency, at a damping of 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class Airframe:
+    """The vehicle: of the size of the 3DR Iris, whose mass Gazebo's model gives as 1.5 kg.
+
+    Attributes:
+        mass_kg: of the vehicle with its battery.
+        max_thrust_n: of all four rotors.
+        thrust_lag_s: time constant of the rotors.
+        drag_per_s: force of the air per mass and airspeed; 0.1 makes 8.5 m/s cost 5 degrees of tilt.
+        swing_rps: natural frequency of roll and pitch under control, in radians per second.
+        swing_damping: share of critical damping of the same; 0.25 rings for about half a second.
+        yaw_rps: natural frequency of the heading, which is damped critically.
+        max_tilt_deg: largest tilt that the controller commands.
+        shake_deg: largest swing that a start or a stop excites.
+
+    Raises:
+        OptionError: a value is not above 0, or the thrust is below the weight.
+    """
+
+    mass_kg: float = 1.5
+    max_thrust_n: float = 30.0
+    thrust_lag_s: float = 0.05
+    drag_per_s: float = 0.1
+    swing_rps: float = 10.0
+    swing_damping: float = 0.25
+    yaw_rps: float = 3.0
+    max_tilt_deg: float = 25.0
+    shake_deg: float = 7.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, *self.__dataclass_fields__)
+        if self.max_thrust_n <= self.mass_kg * GRAVITY_MPS2:
+            raise OptionError(
+                f"max_thrust_n: expected more than the weight of {self.mass_kg * GRAVITY_MPS2:.1f} N, "
+                f"got {self.max_thrust_n}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wind:
+    """Moving air: a mean and gusts.
+
+    Attributes:
+        mean_east_mps: the air's mean velocity to the east.
+        mean_north_mps: the same to the north.
+        gust_sd_mps: standard deviation of each horizontal component; the vertical one has half of it.
+        gust_time_s: how long a gust lasts: each component is a Gauss-Markov process, which has the spectrum of
+            Dryden's longitudinal gusts (MIL-F-8785C).
+
+    Raises:
+        OptionError: a value is not finite, or ``gust_time_s`` is not above 0.
+    """
+
+    mean_east_mps: float = 2.5
+    mean_north_mps: float = 1.5
+    gust_sd_mps: float = 0.8
+    gust_time_s: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "gust_time_s")
+        if not all(map(math.isfinite, (self.mean_east_mps, self.mean_north_mps, self.gust_sd_mps))):
+            raise OptionError(f"wind: expected finite numbers, got {self}")
+
+
+class WindField:
+    """Wind with gusts, one velocity per :data:`STEP_S`."""
+
+    def __init__(self, wind: Wind, rng: np.random.Generator) -> None:
+        self._mean = np.array([wind.mean_east_mps, wind.mean_north_mps, 0.0])
+        self._sd = wind.gust_sd_mps * np.array([1.0, 1.0, 0.5])
+        self._keep = math.exp(-STEP_S / wind.gust_time_s)
+        self._rng = rng
+        self._gust = self._sd * rng.standard_normal(3)
+
+    def next(self) -> Array:
+        """Velocity of the air in the next step.
+
+        Returns:
+            (3,) m/s to the east, north and up.
+        """
+        kick = math.sqrt(1.0 - self._keep**2) * self._rng.standard_normal(3)
+        self._gust = self._keep * self._gust + self._sd * kick
+        return np.asarray(self._mean + self._gust)
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The vehicle at one time.
+
+    Attributes:
+        time_s: since the start.
+        position_m: (3,) east, north, up.
+        velocity_mps: (3,) east, north, up.
+        enu_from_body: (3, 3) attitude.
+        rates_rps: (3,) turn rates about forward, right and down.
+        thrust_mps2: thrust per mass.
+    """
+
+    time_s: float
+    position_m: Array
+    velocity_mps: Array
+    enu_from_body: Array
+    rates_rps: Array
+    thrust_mps2: float
+
+    @property
+    def attitude(self) -> Attitude:
+        """Roll, pitch and heading."""
+        return Attitude(*attitude_from_rotation(self.enu_from_body))
+
+
+@dataclass(frozen=True, slots=True)
+class IdealImu:
+    """What a perfect IMU measures over one step: (3,) specific force and (3,) turn rates, both in the body."""
+
+    force_mps2: Array
+    rates_rps: Array
+
+
+def hovering(position_m: Array, heading_deg: float) -> State:
+    """The vehicle at rest in still air.
+
+    Args:
+        position_m: (3,) east, north, up.
+        heading_deg: clockwise from north.
+
+    Returns:
+        State: level, at time 0.
+    """
+    attitude = enu_from_body(0.0, 0.0, heading_deg)
+    return State(0.0, np.asarray(position_m, float), np.zeros(3), attitude, np.zeros(3), GRAVITY_MPS2)
+
+
+def aim(acceleration_mps2: Array, heading_deg: float, airframe: Airframe) -> tuple[Array, Array]:
+    """The attitude that gives an acceleration in still air, and the force per mass that it takes.
+
+    A force that would tilt beyond ``max_tilt_deg`` keeps its vertical component and gets a smaller horizontal one;
+    the rotors push up, never down.
+
+    Args:
+        acceleration_mps2: (3,) east, north, up.
+        heading_deg: clockwise from north.
+        airframe: its tilt limit.
+
+    Returns:
+        enu_from_body (3, 3), and the force per mass (3,) in m/s^2.
+    """
+    force = acceleration_mps2 - GRAVITY
+    force[2] = max(force[2], 0.3 * GRAVITY_MPS2)
+    flat, max_flat = math.hypot(force[0], force[1]), force[2] * math.tan(math.radians(airframe.max_tilt_deg))
+    if flat > max_flat:
+        force[:2] *= max_flat / flat
+    down = -force / np.linalg.norm(force)
+    heading = math.radians(heading_deg)
+    right = np.cross(down, (math.sin(heading), math.cos(heading), 0.0))
+    right /= np.linalg.norm(right)
+    return np.column_stack([np.cross(right, down), right, down]), force
+
+
+def advance(
+    state: State, acceleration_mps2: Array, heading_deg: float, airframe: Airframe, air_mps: Array
+) -> tuple[State, IdealImu]:
+    """One step of :data:`STEP_S`.
+
+    Args:
+        state: at its beginning.
+        acceleration_mps2: (3,) that the controller commands.
+        heading_deg: that the controller commands.
+        airframe: of the vehicle.
+        air_mps: (3,) velocity of the air.
+
+    Returns:
+        State: at its end.
+        IdealImu: what an IMU measured in between.
+    """
+    wanted, force = aim(acceleration_mps2, heading_deg, airframe)
+    up = -state.enu_from_body[:, 2]
+    max_thrust = airframe.max_thrust_n / airframe.mass_kg
+    thrust = state.thrust_mps2 + (min(float(force @ up), max_thrust) - state.thrust_mps2) * (
+        1.0 - math.exp(-STEP_S / airframe.thrust_lag_s)
+    )
+    pushed = thrust * up - airframe.drag_per_s * (state.velocity_mps - air_mps)
+    acceleration = pushed + GRAVITY
+    half = state.enu_from_body @ rotation(0.5 * STEP_S * state.rates_rps)
+    return State(
+        next_time_s(state.time_s),
+        state.position_m + STEP_S * state.velocity_mps + 0.5 * STEP_S**2 * acceleration,
+        state.velocity_mps + STEP_S * acceleration,
+        state.enu_from_body @ rotation(STEP_S * state.rates_rps),
+        state.rates_rps + STEP_S * _swing(state, wanted, airframe),
+        thrust,
+    ), IdealImu(half.T @ pushed, state.rates_rps)
+
+
+def next_time_s(time_s: float) -> float:
+    """The time one step later, rounded to a multiple of the step, so that errors do not accumulate."""
+    return (round(time_s / STEP_S) + 1) * STEP_S
+
+
+def _swing(state: State, wanted: Array, airframe: Airframe) -> Array:
+    """Angular acceleration (3,): the controlled attitude is a damped oscillator about the commanded one."""
+    error = rotation_vector(state.enu_from_body.T @ wanted)
+    error[2] = np.clip(error[2], -0.5, 0.5)  # the yaw rate is limited
+    spring = np.array([airframe.swing_rps, airframe.swing_rps, airframe.yaw_rps])
+    damping = np.array([airframe.swing_damping, airframe.swing_damping, 1.0])
+    return np.asarray(spring**2 * error - 2.0 * damping * spring * state.rates_rps)
+
+
+def shaken(state: State, airframe: Airframe, rng: np.random.Generator) -> State:
+    """The vehicle after the impulse of a start or a stop: a swing in roll and pitch, mostly in pitch.
+
+    Its first peak is 0.6 to 1 of ``shake_deg``.
+    """
+    peak = math.radians(airframe.shake_deg) * rng.uniform(0.6, 1.0)
+    direction = rng.uniform(-0.9, 0.9)
+    kick = peak * airframe.swing_rps / _PEAK_OF_SWING * np.array([math.sin(direction), math.cos(direction), 0.0])
+    return replace(state, rates_rps=state.rates_rps + kick)

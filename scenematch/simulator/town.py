@@ -1,0 +1,356 @@
+"""A fictional town: streets, houses, parks and fields from one seed, with its map and surface model.
+
+Convention:
+    Town coordinates (u, v) are those of :mod:`scenematch.simulator.canvas`. Everything is drawn twice as fine as
+    the map.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.errors import OptionError
+from engine.orthomap import OrthoMap
+from scenematch.simulator.blocks import fill_blocks
+from scenematch.simulator.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
+from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name
+from scenematch.simulator.light import Array, Float32, Image, Light, illuminate
+from scenematch.simulator.optics import Sensor
+from scenematch.simulator.render import Glint, World, transformer
+from scenematch.simulator.terrain import draw_river, hills, raise_by_ground
+
+CRS_EPSG = 32633
+"""UTM zone 33 north; the town lies 1.45 degrees east of its central meridian: convergence +1.08 degrees."""
+CENTRE_LAT_DEG, CENTRE_LON_DEG = 48.25, 16.45
+EXACT = 1e-3
+"""Georeferencing accuracy in metres and slope accuracy in degrees of a simulated map: exact, but above 0."""
+GROUND_AMSL_M = 155.0
+"""Height of the flat or lowest ground above mean sea level."""
+MARGIN_M = 40.0
+"""How far the drawn world extends beyond the map, so that a tilted camera still sees a town."""
+MAP_SENSOR = Sensor(
+    gamma=0.92, balance_rgb=(0.97, 0.94, 0.88), haze=8.0, vignette=0.0, exposure_sd=0.0, blur_px=0.55, noise_sd=2.2
+)
+"""The camera of the map's survey: a warmer white balance and less contrast than the drone's."""
+LAMP_M = 6.0
+"""Height of street lamps: what is higher is not lit by them."""
+MAX_RELIEF_M = 80.0
+_EARTH: Colour = (146, 126, 98)
+_CARS: tuple[Colour, ...] = (
+    (236, 236, 236), (40, 42, 46), (150, 154, 158), (132, 44, 44), (58, 72, 104), (206, 206, 200), (90, 92, 96),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Town:
+    """A map, its surface model, and the finer world from which frames are drawn.
+
+    Attributes:
+        ortho: (H, W, 3) RGB orthophoto, another photograph than any frame.
+        surface_m: (H, W) metres above the world's height 0, which is the ground where it is flat.
+        pixel_to_crs: (2, 3) affine of map pixels (x, y), centres at integers, to the CRS.
+        crs_epsg: projected CRS.
+        gsd_m_per_px: map pixel in grid metres.
+        world: what a camera sees on the day of the flight.
+        condition: that day's light, season and air, which are in the world; its noise is the camera's.
+        datum_amsl_m: the world's height 0 above mean sea level.
+    """
+
+    ortho: Image
+    surface_m: Float32
+    pixel_to_crs: Array
+    crs_epsg: int
+    gsd_m_per_px: float
+    world: World
+    condition: Condition = CONDITIONS["noon"]
+    datum_amsl_m: float = GROUND_AMSL_M
+
+    def site(self) -> OrthoMap:
+        """The town's map as the engine takes it, with exact georeferencing and slope accuracy."""
+        gray = np.asarray(cv2.cvtColor(self.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
+        return OrthoMap.from_arrays(
+            gray,
+            self.pixel_to_crs,
+            f"EPSG:{self.crs_epsg}",
+            surface_m=self.surface_m,
+            georeference_sigma_m=EXACT,
+            slope_sigma_deg=EXACT,
+        )
+
+
+def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array, float]]]:
+    """Draw the streets: edges of the blocks along u and v, and every street as (centre line, width)."""
+    rng, reach = canvas.rng, canvas.reach_m
+    edges: list[list[float]] = []
+    for low, high in ((62.0, 112.0), (48.0, 88.0)):
+        at = [-reach + rng.uniform(0, 40)]
+        while at[-1] < reach:
+            at.append(at[-1] + rng.uniform(low, high))
+        edges.append(at)
+    roads = [(np.array([(u, -reach), (u, reach)]), float(rng.choice([7.5, 8.5, 12.5]))) for u in edges[0]]
+    roads += [(np.array([(-reach, v), (reach, v)]), float(rng.choice([7.0, 8.0, 11.0]))) for v in edges[1]]
+    along = np.linspace(-reach, reach, 120)
+    bend = (
+        0.45 * along + 42.0 * np.sin(along / rng.uniform(75.0, 105.0) + rng.uniform(0, 6)) + rng.uniform(-40, 40)
+    )
+    roads.append((np.column_stack([bend, along]), 15.0))
+    crossings = np.zeros(canvas.shape, np.uint8)
+    for extra, colour, material in ((5.0, (148, 145, 138), PAVING), (0.0, (92, 93, 96), ASPHALT)):
+        for line, width in roads:
+            points = [np.rint(canvas.px(line) * 16).astype(np.int32)]
+            thick = round((width + extra) / canvas.gsd)
+            shade = canvas.tint(colour, 5.0)
+            cv2.polylines(canvas.rgb, points, False, shade, thick, cv2.LINE_AA, 4)
+            for raster, value in ((canvas.material, material), (canvas.busy, 255)):
+                cv2.polylines(raster, points, False, (value,), thick, cv2.LINE_8, 4)
+            if material == ASPHALT:
+                one = np.zeros_like(crossings)
+                cv2.polylines(one, points, False, (1,), thick + round(7 / canvas.gsd), cv2.LINE_8, 4)
+                cv2.add(crossings, one, crossings)
+    for line, width in roads:
+        _markings(canvas, line, width, crossings)
+    return edges[0], edges[1], roads
+
+
+def _stations(line: Array, pitch_m: float) -> list[tuple[float, float, float]]:
+    """Positions (u, v) and directions in radians every ``pitch_m`` along a line."""
+    run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.arange(pitch_m / 2, run[-1], pitch_m)
+    u, v = (np.interp(at, run, line[:, k]) for k in (0, 1))
+    angle = np.arctan2(np.gradient(v), np.gradient(u))
+    return list(zip(u.tolist(), v.tolist(), angle.tolist(), strict=True))
+
+
+def _markings(canvas: Canvas, line: Array, width: float, crossings: Image) -> None:
+    """A dashed centre line, zebra crossings where streets meet, and patches of newer asphalt."""
+    white, last = (214, 214, 208), 1.0
+    for u, v, angle in _stations(line, 3.0):
+        count = canvas.value(crossings, u, v)
+        along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+        if count == 1 and round((u * along[0] + v * along[1]) / 3.0) % 2:
+            canvas.rect(u, v, 3.0, 0.22, white, angle)
+        if count > 1 and last == 1 and canvas.rng.random() < 0.75:
+            for stripe in np.arange(-width / 2 + 0.7, width / 2 - 0.3, 1.1):
+                canvas.rect(u + across[0] * stripe, v + across[1] * stripe, 3.2, 0.55, white, angle)
+        if count >= 1 and canvas.rng.random() < 0.05:
+            side = canvas.rng.uniform(-0.3, 0.3) * width
+            size = canvas.rng.uniform(2, 9), canvas.rng.uniform(1.0, 3.5)
+            canvas.rect(u + across[0] * side, v + across[1] * side, *size, canvas.tint((84, 85, 88), 14), angle)
+        last = count
+
+
+def _park_cars(canvas: Canvas, roads: list[tuple[Array, float]]) -> tuple[Image, Image]:
+    """Colours on the day of the map and on the day of the flight: a third of the cars have moved."""
+    rng = canvas.rng
+    slots = []
+    for line, width in roads:
+        for u, v, angle in _stations(line, 6.2):
+            for side in (-1, 1):
+                offset = side * (width / 2 - 1.1)
+                slots.append((u - math.sin(angle) * offset, v + math.cos(angle) * offset, angle))
+    days = (canvas.rgb, canvas.rgb.copy())
+    for u, v, angle in slots:
+        parked, stays, other = rng.random(), rng.random() < 0.67, rng.random()
+        colour, angle = canvas.pick(_CARS), angle + rng.normal(0, 0.02)
+        if canvas.value(canvas.height, u, v) != 0.0 or canvas.value(canvas.material, u, v) != ASPHALT:
+            continue
+        for rgb, there in zip(days, (parked < 0.3, (parked if stays else other) < 0.3), strict=True):
+            if there:
+                canvas.rgb = rgb
+                canvas.rect(u + 0.35, v + 0.35, 4.5, 1.9, (58, 58, 60), angle)
+                canvas.rect(u, v, 4.3, 1.75, colour, angle)
+                canvas.rect(u + 0.5 * math.cos(angle), v + 0.5 * math.sin(angle), 1.0, 1.5, (44, 50, 58), angle)
+    return days
+
+
+def generator(seed: int, stream: int) -> np.random.Generator:
+    """One of the independent random streams of a seed."""
+    if seed < 0:
+        raise OptionError(f"seed: expected 0 or more, got {seed}")
+    return np.random.default_rng([seed, stream])
+
+
+def _shrink(raster: NDArray[Any], times: int) -> NDArray[Any]:
+    """The raster's means over squares of so many pixels."""
+    size = (raster.shape[1] // times, raster.shape[0] // times)
+    return np.asarray(cv2.resize(raster, size, interpolation=cv2.INTER_AREA))
+
+
+def _georeference(width_px: int, height_px: int, gsd: float) -> Array:
+    """Affine (2, 3) of a north-up map about the town's centre, its first pixel on a whole metre of the grid."""
+    easting, northing = transformer(CRS_EPSG).transform(CENTRE_LON_DEG, CENTRE_LAT_DEG)
+    corner = (round(easting - width_px * gsd / 2), round(northing + height_px * gsd / 2))
+    return np.array([[gsd, 0.0, corner[0]], [0.0, -gsd, corner[1]]], dtype=np.float64)
+
+
+def _check_size(width_px: int, height_px: int, gsd: float) -> None:
+    if width_px < 16 or height_px < 16 or not 0.1 <= gsd <= 5.0:
+        got = f"{width_px} x {height_px} at {gsd}"
+        raise OptionError(f"town: expected 16 px or more at 0.1 to 5 m/px, got {got}")
+
+
+def _lamp_light(canvas: Canvas, roads: list[tuple[Array, float]]) -> Float32:
+    """Light (H, W) of lamps in [0, 1], one every 27 m on alternating sides, on what is lower than a lamp."""
+    pools = np.zeros(canvas.shape, np.float32)
+    for line, width in roads:
+        for k, (u, v, angle) in enumerate(_stations(line, 27.0)):
+            aside = (width / 2 + 0.5) * (1 if k % 2 else -1)
+            x, y = np.rint(canvas.px(np.array([[u - math.sin(angle) * aside, v + math.cos(angle) * aside]]))[0])
+            if 0 <= x < pools.shape[1] and 0 <= y < pools.shape[0]:
+                pools[int(y), int(x)] = 1.0
+    sigma = 4.5 / canvas.gsd
+    pools = np.asarray(cv2.GaussianBlur(pools, (0, 0), sigma) * np.float32(2.0 * math.pi * sigma**2))
+    return np.minimum(pools, np.float32(1.0))
+
+
+@dataclass(frozen=True)
+class _Day:
+    """Drawn colours (H, W, 3), heights and materials (H, W) of a town on one day."""
+
+    rgb: Image
+    height_m: Float32
+    material: Image
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A finished canvas, on the day of the map and on that of the flight."""
+
+    canvas: Canvas
+    then: _Day
+    today: _Day
+    ground_m: Float32 | None
+    lamps: Float32
+
+
+def _without(day: _Day, gone: NDArray[np.bool_], ground_m: Float32 | None, rng: np.random.Generator) -> _Day:
+    """The day with bare earth where (H, W) something is gone."""
+    rgb, height, material = day.rgb.copy(), day.height_m.copy(), day.material.copy()
+    count = int(gone.sum())
+    rgb[gone] = np.clip(np.array(_EARTH) * (1.0 + 0.07 * rng.standard_normal((count, 1))), 0, 255)
+    height[gone] = 0.0 if ground_m is None else ground_m[gone]
+    material[gone] = CROP
+    return _Day(rgb, height, material)
+
+
+def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
+    """The town with a share of its houses built or demolished, half each, between the map and the flight."""
+    roofs = (drawn.canvas.material == ROOF).astype(np.uint8)
+    count, labels = cv2.connectedComponents(roofs, connectivity=4)
+    fate = rng.random(count)
+    fate[0] = 1.0  # what is no house
+    new, gone = (fate < changed / 2)[labels], ((fate >= changed / 2) & (fate < changed))[labels]
+    then, today = _without(drawn.then, new, drawn.ground_m, rng), _without(drawn.today, gone, drawn.ground_m, rng)
+    return replace(drawn, then=then, today=today)
+
+
+def _draw(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    gsd: float,
+    light: Light,
+    relief_m: float,
+    river_rng: np.random.Generator | None,
+    hill_rng: np.random.Generator,
+) -> _Drawn:
+    """Streets, blocks and cars on a canvas, and the hills below them."""
+    canvas = Canvas(rng, size, gsd, light)
+    river = None if river_rng is None else draw_river(canvas, river_rng)
+    edges_u, edges_v, roads = _streets(canvas)
+    fill_blocks(canvas, edges_u, edges_v)
+    canvas.texture()
+    then, today = _park_cars(canvas, roads)
+    lamps = _lamp_light(canvas, roads) * (canvas.height < LAMP_M)
+    ground = raise_by_ground(canvas, hills(size, gsd, relief_m, hill_rng), river) if relief_m else None
+    height, material = canvas.height, canvas.material
+    return _Drawn(canvas, _Day(then, height, material), _Day(today, height, material), ground, lamps)
+
+
+def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generator) -> tuple[Image, Float32]:
+    """Colours and heights of a town on a day."""
+    gsd = drawn.canvas.gsd
+    dressed, height = apply_season(day.rgb, day.height_m, day.material, drawn.ground_m, condition, gsd, rng)
+    lamps = drawn.lamps * np.float32(condition.lamps) if condition.lamps else None
+    return illuminate(dressed, height, gsd, condition.light, shade=condition.shade, lamps=lamps), height
+
+
+def _world(drawn: _Drawn, condition: Condition, pixel_to_crs: Array, rng: np.random.Generator) -> World:
+    """What a camera sees of a town on a day."""
+    seen, height = _lit(drawn, drawn.today, condition, rng)
+    sides, material = drawn.canvas.sides, drawn.today.material
+    if condition.shade:  # crowns are drawn as at noon; those of the two first lights stay as published
+        crowns = material == CANOPY
+        sides[crowns, :3] = seen[crowns] // 2
+    glint = Glint(condition.light, (material == WATER).astype(np.uint8)) if condition.shade else None
+    return World(
+        seen, sides, height, pixel_to_crs, CRS_EPSG, ground_m=drawn.ground_m, air=condition.air, glint=glint
+    )
+
+
+def build_town(
+    seed: int = 1,
+    *,
+    width_px: int = 900,
+    height_px: int = 1000,
+    gsd_m_per_px: float = 0.53,
+    condition: str | Condition = "noon",
+    map_condition: str | Condition = "noon",
+    relief_m: float = 0.0,
+    river: bool = False,
+    changed: float = 0.0,
+) -> Town:
+    """A town from a seed; the same seed gives the same bytes.
+
+    Args:
+        seed: of everything random in it.
+        width_px: columns of the map.
+        height_px: rows of the map.
+        gsd_m_per_px: a map pixel in metres on the grid.
+        condition: day of the frames: a name of :data:`scenematch.simulator.CONDITIONS`, or one of your own.
+        map_condition: day of the map, an independent photograph even where it is the same condition.
+        relief_m: height of the hills under the town, from the lowest ground to the highest; 0 is flat.
+        river: whether one crosses the town.
+        changed: share of the houses, 0 to 1, that were built or demolished between the map and the flight.
+
+    Raises:
+        OptionError: an argument is out of range.
+    """
+    _check_size(width_px, height_px, gsd_m_per_px)
+    if not 0.0 <= relief_m <= MAX_RELIEF_M:
+        raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {relief_m}")
+    if not 0.0 <= changed <= 1.0:
+        raise OptionError(f"changed: expected 0 to 1, got {changed}")
+    days = condition_by_name(condition), condition_by_name(map_condition)
+    return _built(seed, (width_px, height_px), gsd_m_per_px, days, (relief_m, river, changed))
+
+
+def _built(
+    seed: int,
+    map_px: tuple[int, int],
+    gsd: float,
+    days: tuple[Condition, Condition],
+    site: tuple[float, bool, float],
+) -> Town:
+    """The town of checked arguments: days of the frames and the map; relief, river and changed share."""
+    (width, height), (today, surveyed), (relief_m, river, changed) = map_px, days, site
+    fine = max(1, round(gsd / 0.265))
+    margin = math.ceil(MARGIN_M / gsd)
+    size = ((height + 2 * margin) * fine, (width + 2 * margin) * fine)
+    rng, water_rng = generator(seed, 0x70), generator(seed, 0x71) if river else None
+    drawn = _draw(rng, size, gsd / fine, today.light, relief_m, water_rng, generator(seed, 0x72))
+    if changed:
+        drawn = _rebuilt(drawn, changed, generator(seed, 0x75))
+    inner = (slice(margin * fine, -margin * fine),) * 2
+    then, heights = _lit(drawn, drawn.then, surveyed, generator(seed, 0x73))
+    ortho, surface = MAP_SENSOR.develop(_shrink(then[inner], fine), rng), _shrink(heights[inner], fine)
+    to_crs = _georeference(width, height, gsd)
+    first = -margin - 0.5 + 0.5 / fine
+    fine_to_crs = np.column_stack([to_crs[:, :2] / fine, to_crs @ (first, first, 1.0)])
+    world = _world(drawn, today, fine_to_crs, generator(seed, 0x74))
+    return Town(ortho, surface, to_crs, CRS_EPSG, gsd, world, today)

@@ -1,0 +1,1417 @@
+"""The MAVLink bridge: bytes as pymavlink makes them, the firmwares' traps, a stand-in autopilot on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import os
+import random
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.quaternion import Quaternion
+
+from engine.camera import mount_rotation
+from engine.errors import OptionError, TelemetryError
+from engine.geo import LocalFrame
+from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
+from scenematch.bridges import mavlink_requests
+from scenematch.bridges.delay_memory import remember_delay
+from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
+from scenematch.bridges.links import Connection, parse_connection
+from scenematch.bridges.mavlink import CONFIRM_COMMAND, MavlinkBridge
+from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
+from scenematch.bridges.mavlink_out import (
+    MESSAGES,
+    FixReport,
+    MavlinkOptions,
+    command_message,
+    fix_message,
+    heartbeat_message,
+    no_position_message,
+    pose_covariance,
+    set_origin_message,
+    timesync_message,
+    withhold_reason,
+)
+from scenematch.bridges.mavlink_requests import AutopilotRequests
+from scenematch.bridges.mavlink_status import MIN_RATE_HZ
+from scenematch.bridges.packets import (
+    AUTOPILOT_COMPONENT,
+    BRIDGE_COMPONENT,
+    PacketDecoder,
+    PacketEncoder,
+    read_key,
+    signing_time,
+)
+from scenematch.bridges.parameters import ParameterOptions, parameter_file
+from scenematch.bridges.pictures import replay
+from scenematch.bridges.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
+from scenematch.cli.app import run as main
+from tests.support.paths import ROOT
+
+GOLDEN = ROOT / "tests" / "golden" / "mavlink"
+ORIGIN = NedOrigin(33.6400000, 72.9900000, 510.0)
+VEHICLE = VehicleState(
+    roll_deg=2.0, pitch_deg=-3.0, heading_deg=270.0, east_velocity_mps=1.0, north_velocity_mps=2.0,
+    up_velocity_mps=0.5, height_agl_m=120.0, alt_amsl_m=630.0, down_m=-120.0,
+)  # fmt: skip
+KINDS = [(firmware, kind) for firmware, kinds in MESSAGES.items() for kind in kinds]
+KEY = bytes(range(32))
+
+
+def fix(sigma_m=0.5, **changes):
+    values = {
+        "timestamp_ns": 1, "lat_deg": 33.6410000, "lon_deg": 72.9920000, "east_m": 0.0, "north_m": 0.0,
+        "up_m": None,
+        "covariance_m2": np.diag([sigma_m**2, (0.8 * sigma_m) ** 2, 1e6]), "attitude": None,
+        "score": 0.9, "method": "ncc",
+        "window": Window(0, 0, 1, 1), "timings": Timings(), "map_xy_px": (0.0, 0.0),
+    }  # fmt: skip
+    return Fix(**(values | changes))
+
+
+def sending(**changes):
+    values = {
+        "fix": fix(), "captured_ns": 12_345_678_901, "age_ms": 80.0, "vehicle": VEHICLE, "origin": ORIGIN,
+        "velocity": GroundVelocity(1.5, -2.5, 0.7), "reset_counter": 3, "unix_ns": 1_700_000_000_123_000_000,
+    }  # fmt: skip
+    return FixReport(**(values | changes))
+
+
+def encoded(message):
+    return PacketEncoder(1).encode(message)
+
+
+# -------------------------------------------------------------------------------------------- what is sent
+
+
+@pytest.mark.parametrize(("firmware", "kind"), KINDS)
+def test_bytes_are_the_golden_ones(firmware, kind):
+    made = encoded(fix_message(sending(), MavlinkOptions(firmware=firmware, message=kind)))
+    golden = bytes.fromhex((GOLDEN / f"{firmware}-{kind}.hex").read_text(encoding="ascii"))
+    assert made.hex() == golden.hex()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("heartbeat", heartbeat_message()),
+        ("timesync-question", timesync_message(12_345_678_901)),
+        ("timesync-answer", timesync_message(12_345_678_901, 5_000_000_007)),
+        ("set_gps_global_origin", set_origin_message(1, ORIGIN, 12_345_678_901)),
+        ("ask-origin", command_message(1, mavlink.MAV_CMD_REQUEST_MESSAGE, 49)),
+        ("ask-attitude", command_message(1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1e6 / 50)),
+    ],
+)
+def test_bytes_of_all_that_is_sent_beside_fixes_are_the_golden_ones(name, message):
+    assert encoded(message).hex() == (GOLDEN / f"{name}.hex").read_text(encoding="ascii").strip()
+
+
+def test_signed_bytes_are_the_golden_ones(monkeypatch):
+    monkeypatch.setattr("scenematch.bridges.packets.signing_time", lambda: 10 * 365 * 86400 * 100_000)
+    made = PacketEncoder(1, KEY).encode(fix_message(sending(), MavlinkOptions()))
+    assert made.hex() == (GOLDEN / "ardupilot-signed.hex").read_text(encoding="ascii").strip()
+
+
+def test_golden_bytes_are_made_without_the_engine(tmp_path):
+    """The generator spells out every field by hand; it knows nothing of the engine."""
+    source = (GOLDEN / "make_golden.py").read_text(encoding="utf-8")
+    assert "engine" not in source
+    subprocess.run([sys.executable, str(GOLDEN / "make_golden.py"), str(tmp_path)], check=True)
+    for made in tmp_path.iterdir():
+        assert made.read_text(encoding="ascii") == (GOLDEN / made.name).read_text(encoding="ascii")
+
+
+@pytest.mark.parametrize(("firmware", "kind"), KINDS)
+def test_stamps_are_of_capture_whenever_it_is_sent(firmware, kind):
+    for age_ms in (0.0, 200.0):
+        m = fix_message(sending(age_ms=age_ms), MavlinkOptions(firmware=firmware, message=kind))
+        stamp_us = m.usec if kind == "vision_position_estimate" else m.time_usec
+        waited_us = m.processing_time if kind == "global_position_sensor" else 0
+        assert stamp_us - waited_us == 12_345_678
+    week_ms = 1_700_000_000_123 - 315_964_800_000 + 18_000
+    m = fix_message(sending(), MavlinkOptions(message="gps_input"))
+    assert m.time_week * 604_800_000 + m.time_week_ms == week_ms
+
+
+def test_ardupilot_finds_the_fix_again_by_its_own_scale():
+    rng = np.random.default_rng(1)
+    scale = 0.011131884502145034  # of ArduPilot's Location, metres per 1e-7 degrees
+    for _ in range(50):
+        origin = NedOrigin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
+        lat, lon = origin.lat_deg + rng.uniform(-0.05, 0.05), origin.lon_deg + rng.uniform(-0.05, 0.05)
+        north, east = north_east_m(lat, lon, origin, "ardupilot")
+        back_lat = origin.lat_deg + north / scale * 1e-7
+        middle = 0.5 * (back_lat + origin.lat_deg)
+        back_lon = origin.lon_deg + east / scale / math.cos(math.radians(middle)) * 1e-7
+        assert back_lat == pytest.approx(lat, abs=1e-9)
+        assert math.remainder(back_lon - lon, 360.0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_px4_finds_the_fix_again_by_its_own_projection():
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        origin = NedOrigin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
+        lat, lon = origin.lat_deg + rng.uniform(-0.05, 0.05), origin.lon_deg + rng.uniform(-0.05, 0.05)
+        north, east = north_east_m(lat, lon, origin, "px4")
+        c = math.hypot(north, east) / 6371000.0  # the inverse of the azimuthal projection
+        lat0 = math.radians(origin.lat_deg)
+        along = north / math.hypot(north, east)
+        back = math.asin(math.cos(c) * math.sin(lat0) + along * math.sin(c) * math.cos(lat0))
+        across = east / math.hypot(north, east) * math.sin(c)
+        turn = math.atan2(across, math.cos(lat0) * math.cos(c) - along * math.sin(lat0) * math.sin(c))
+        assert math.degrees(back) == pytest.approx(lat, abs=1e-9)
+        assert math.remainder(origin.lon_deg + math.degrees(turn) - lon, 360.0) == pytest.approx(0.0, abs=1e-9)
+    assert north_east_m(10.0, 20.0, NedOrigin(10.0, 20.0, 0.0), "px4") == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_both_projections_are_near_the_tangent_plane(firmware):
+    north, east = north_east_m(33.6410, 72.9920, ORIGIN, firmware)
+    truth = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg).enu_from_geodetic(33.6410, 72.9920)
+    assert (east, north) == pytest.approx(tuple(truth), rel=4e-3)
+
+
+def test_the_height_does_not_drown_the_covariance():
+    flat = pose_covariance(fix(sigma_m=0.5))
+    assert len(flat) == 21
+    n, e, d = flat[0], flat[6], flat[11]
+    assert (n, e) == pytest.approx((0.4**2, 0.5**2))
+    newer, older = math.sqrt(n + e + d), (n * n + e * e + d * d) ** (1 / 3)  # how ArduPilot collapses it
+    assert 0.5 <= newer <= math.sqrt(3) * 0.5
+    assert older <= math.sqrt(3) * 0.5
+    turned = fix(covariance_m2=np.array([[4.0, 1.0, 0], [1.0, 9.0, 0], [0, 0, 1e8]]))
+    assert pose_covariance(turned)[:2] == pytest.approx([9.0, 1.0])
+
+
+@pytest.mark.parametrize("message", ["vision_position_estimate", "odometry"])
+def test_attitude_is_in_radians_and_the_same_in_both_forms(message):
+    m = fix_message(sending(), MavlinkOptions(message=message))
+    angles = np.radians([2.0, -3.0, -90.0])
+    if message == "vision_position_estimate":
+        assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
+    else:
+        assert m.q == pytest.approx(list(Quaternion(angles).q))
+
+
+@pytest.mark.parametrize("message", ["vision_position_estimate", "odometry"])
+def test_a_whole_pose_is_sent_with_the_attitude_that_was_measured(message):
+    angles_deg2 = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 0.25]])
+    whole = fix(attitude=Attitude(1.0, 2.0, 300.0), up_m=120.0, attitude_covariance_deg2=angles_deg2)
+    options, angles = MavlinkOptions(message=message), np.radians([1.0, 2.0, -60.0])
+    m, own = fix_message(sending(fix=whole), options), fix_message(sending(), options)
+    held = replace(VEHICLE, holder=Attitude(0.0, -45.0, 90.0))  # by a gimbal, which is not the vehicle's attitude
+    gimbal = fix_message(sending(fix=whole, vehicle=held), options)
+    if message == "vision_position_estimate":
+        assert (m.roll, m.pitch, m.yaw) == pytest.approx(tuple(angles))
+        assert (gimbal.roll, gimbal.pitch, gimbal.yaw) == (own.roll, own.pitch, own.yaw)
+        flat, flat_gimbal, flat_own = m.covariance, gimbal.covariance, own.covariance
+    else:
+        assert m.q == pytest.approx(list(Quaternion(angles).q))
+        assert gimbal.q == own.q
+        assert (m.vx, m.vy, m.vz) == (own.vx, own.vy, own.vz)  # about the autopilot's own axes
+        flat, flat_gimbal, flat_own = m.pose_covariance, gimbal.pose_covariance, own.pose_covariance
+    # Of the upper triangle the last six are roll, pitch and yaw; a degree each is the mount's.
+    expected_deg2 = [1.04, 0.01, 0.0, 1.09, 0.0, 1.25]
+    assert np.array(flat[15:]) * math.degrees(1.0) ** 2 == pytest.approx(expected_deg2)
+    assert flat_gimbal == flat_own
+    assert withhold_reason(sending(fix=replace(whole, attitude_covariance_deg2=angles_deg2 * math.nan)), options)
+
+
+def test_odometry_frames_are_those_that_each_firmware_takes():
+    ardupilot = fix_message(sending(), MavlinkOptions(message="odometry"))
+    assert (ardupilot.frame_id, ardupilot.child_frame_id) == (20, 12)  # LOCAL_FRD, BODY_FRD
+    px4 = fix_message(sending(velocity=None), MavlinkOptions(firmware="px4", message="odometry"))
+    assert (px4.frame_id, px4.child_frame_id) == (1, 12)  # LOCAL_NED, BODY_FRD
+    assert all(map(math.isnan, (px4.vx, px4.vy, px4.vz, px4.velocity_covariance[0])))
+
+
+def test_odometry_velocity_is_that_of_the_body():
+    level = VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=90.0, up_velocity_mps=0.25, down_m=-1.0)
+    m = fix_message(sending(vehicle=level), MavlinkOptions(message="odometry"))
+    assert (m.vx, m.vy, m.vz) == pytest.approx((1.5, 2.5, -0.25))  # facing east: forward is east, right south
+
+
+def test_gps_input_carries_velocity_and_accuracies():
+    m = fix_message(sending(), MavlinkOptions(message="gps_input"))
+    assert (m.vn, m.ve, m.vd) == (-2.5, 1.5, -0.5)
+    assert (m.speed_accuracy, m.horiz_accuracy) == pytest.approx((0.7, 0.5))
+    assert m.ignore_flags == 0
+    assert (m.hdop, m.satellites_visible) == pytest.approx((0.5, 20))
+    poor = fix_message(sending(fix=fix(sigma_m=4.0)), MavlinkOptions(message="gps_input"))
+    assert (poor.hdop, poor.satellites_visible) == pytest.approx((4.0, 2))  # which no arming check passes
+    bare = fix_message(sending(vehicle=VehicleState()), MavlinkOptions(message="gps_input"))
+    assert bare.ignore_flags == mavlink.GPS_INPUT_IGNORE_FLAG_ALT | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
+
+
+@pytest.mark.parametrize(
+    ("changes", "message", "why"),
+    [
+        ({}, "vision_position_estimate", None),
+        ({}, "gps_input", None),
+        ({"fix": fix(sigma_m=10.1)}, "gps_input", "too uncertain"),
+        ({"age_ms": 250.1}, "gps_input", "too old"),
+        ({"origin": None}, "vision_position_estimate", "no origin"),
+        ({"origin": None}, "gps_input", None),
+        ({"vehicle": VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0)}, "odometry", "no height"),
+        ({"vehicle": VehicleState(down_m=-1.0)}, "vision_position_estimate", "no attitude"),
+        ({"velocity": None}, "gps_input", "no velocity"),
+        ({"velocity": None}, "odometry", "no velocity"),
+        ({"velocity": None}, "vision_position_estimate", None),
+        ({"fix": fix(lat_deg=math.nan)}, "gps_input", "not finite"),
+    ],
+)
+def test_what_would_mislead_is_withheld(changes, message, why):
+    assert withhold_reason(sending(**changes), MavlinkOptions(message=message)) == why
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"firmware": "inav"}, {"message": "global_position_sensor"}, {"max_age_ms": 251.0}, {"max_sigma_m": 101.0}],
+)
+def test_options_are_refused_in_one_line(values):
+    with pytest.raises(OptionError, match=next(iter(values))):
+        MavlinkOptions(**values)
+
+
+def test_velocity_is_that_of_the_last_fixes_and_forgets_at_a_reset():
+    by_fixes, still = VelocityFromFixes(), VehicleState()
+    times = np.arange(1.0, 4.0, 0.1)
+    found = [by_fixes.add(fix(east_m=3.0 * t, north_m=-t), round(t * 1e9), 0, still) for t in times]
+    assert found[0] is None
+    assert (found[-1].east_mps, found[-1].north_mps) == pytest.approx((3.0, -1.0))
+    assert found[-1].sigma_mps < 1.0  # what EKF3 asks for before it starts by GPS_INPUT
+    assert by_fixes.add(fix(east_m=500.0), 4_200_000_000, 1, still) is None
+
+
+def test_velocity_holds_at_the_last_fix_while_the_vehicle_brakes():
+    """Its own velocity is wrong by a constant, and only its change is used."""
+    by_fixes = VelocityFromFixes()
+    for t in np.arange(0.0, 3.0, 0.1):
+        own = VehicleState(east_velocity_mps=9.0 - 2.0 * t + 0.7, north_velocity_mps=0.4)
+        found = by_fixes.add(fix(east_m=9.0 * t - t**2), round(1e9 * (1.0 + t)), 0, own)
+    assert (found.east_mps, found.north_mps) == pytest.approx((9.0 - 2.0 * t, 0.0), abs=0.05)
+    assert found.sigma_mps < 0.6
+
+
+# ------------------------------------------------------------------------------------------ what is heard
+
+
+def heard(*messages, start_ns=10_000_000_000):
+    telemetry = MavlinkTelemetry()
+    for i, message in enumerate(messages):
+        telemetry.update(message, start_ns + i * 1_000_000)
+    return telemetry.vehicle(start_ns)
+
+
+def from_camera(message, component=197):
+    """A message as it comes over the wire from another component of the vehicle."""
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=component)
+    return mavlink.MAVLink(None).parse_char(message.pack(sender))
+
+
+def speed_estimate(*ned_mps, variance=math.nan):
+    covariance = [variance, 0, 0, 0, variance, 0, 0, 0, variance]
+    return mavlink.MAVLink_vision_speed_estimate_message(1, *ned_mps, covariance)
+
+
+def odometry(*velocity_mps, frame=mavlink.MAV_FRAME_BODY_FRD, variance=0.04, by=mavlink.MAV_ESTIMATOR_TYPE_VIO,
+             quality=80):  # fmt: skip
+    covariance = [math.nan] * 21
+    covariance[0] = covariance[6] = covariance[11] = variance
+    local, whole = mavlink.MAV_FRAME_LOCAL_FRD, [1.0, 0.0, 0.0, 0.0]
+    return mavlink.MAVLink_odometry_message(
+        1, local, frame, 0, 0, 0, whole, *velocity_mps, 0, 0, 0, [math.nan] * 21, covariance, 0, by, quality
+    )
+
+
+TO_THE_WEST = mavlink.MAVLink_attitude_message(5000, 0, 0, -math.pi / 2, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "east_north_up", "sigma_mps"),
+    [
+        (speed_estimate(3.0, -4.0, 0.5), (-4.0, 3.0, -0.5), None),
+        (speed_estimate(3.0, -4.0, 0.5, variance=0.09), (-4.0, 3.0, -0.5), 0.3),
+        (odometry(2.0, 1.0, 0.0), (-2.0, 1.0, 0.0), math.hypot(0.2, math.radians(1.0) * math.hypot(2.0, 1.0))),
+        (odometry(2.0, 1.0, 0.0, variance=1e-9), (-2.0, 1.0, 0.0), 0.1),
+        (odometry(30.0, 0.0, 0.0, variance=1e-9), (-30.0, 0.0, 0.0), math.radians(1.0) * 30.0),
+        (odometry(2.0, 1.0, -0.25, frame=mavlink.MAV_FRAME_LOCAL_NED, variance=math.nan), (1.0, 2.0, 0.25), None),
+    ],
+)
+def test_a_velocity_by_another_camera_counts_more_than_the_autopilots(message, east_north_up, sigma_mps):
+    own = mavlink.MAVLink_local_position_ned_message(5000, 1, 2, -118.0, 1.5, -2.5, 0.5)
+    vehicle = heard(TO_THE_WEST, own, from_camera(message))
+    velocity = (vehicle.east_velocity_mps, vehicle.north_velocity_mps, vehicle.up_velocity_mps)
+    assert velocity == pytest.approx(east_north_up, abs=1e-6)
+    assert vehicle.velocity_sigma_mps == (None if sigma_mps is None else pytest.approx(sigma_mps))
+    frame = vehicle.frame(np.zeros((2, 2), np.uint8), 0)
+    assert (frame.east_velocity_mps, frame.velocity_sigma_mps) == (velocity[0], vehicle.velocity_sigma_mps)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION), BRIDGE_COMPONENT),
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION), AUTOPILOT_COMPONENT),
+        from_camera(odometry(1.0, 2.0, 3.0), AUTOPILOT_COMPONENT),
+        from_camera(speed_estimate(1.0, 2.0, 3.0), AUTOPILOT_COMPONENT),
+        from_camera(speed_estimate(math.nan, 2.0, 3.0)),
+        from_camera(speed_estimate(1e30, 2.0, 3.0)),
+        from_camera(speed_estimate(1.0, 2.0, 3.0, variance=math.inf)),
+        from_camera(odometry(1.0, 2.0, 3.0, variance=3.4e38)),
+        from_camera(odometry(1.0, 2.0, 3.0, variance=100.0)),
+        from_camera(odometry(1.0, 2.0, 3.0, by=mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT)),
+        from_camera(odometry(1.0, 2.0, 3.0, quality=-1)),
+        from_camera(odometry(1.0, 2.0, 3.0, frame=mavlink.MAV_FRAME_LOCAL_FRD)),
+    ],
+)
+def test_what_is_no_velocity_of_another_camera_is_left_out(message):
+    vehicle = heard(TO_THE_WEST, message)
+    assert (vehicle.east_velocity_mps, vehicle.velocity_sigma_mps) == (None, None)
+
+
+@pytest.mark.parametrize(("bridge", "camera"), [(194, 197), (197, 191), (191, 197)])
+def test_beside_a_camera_with_the_usual_id_the_bridge_takes_another(bridge, camera):
+    """And its own messages, which a router passes back, count for nothing: neither a velocity nor a failure."""
+    telemetry, by = MavlinkTelemetry(bridge_component=bridge), mavlink.MAV_ESTIMATOR_TYPE_VISION
+    for message in (
+        TO_THE_WEST,
+        from_camera(odometry(2.0, 1.0, 0.0, by=by), camera),
+        from_camera(odometry(9.0, 9.0, 9.0, by=by), bridge),
+        from_camera(no_position_message(1), bridge),
+    ):
+        telemetry.update(message, 10_000_000_000)
+    vehicle = telemetry.vehicle(10_000_000_000)
+    assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-2.0, 1.0), abs=1e-6)
+    telemetry.update(from_camera(odometry(0.0, 0.0, 0.0, by=by, quality=-1), camera), 10_000_000_001)
+    assert telemetry.vehicle(10_000_000_000).east_velocity_mps is None
+
+
+def test_a_camera_that_failed_takes_its_last_velocity_back():
+    good, failed = (from_camera(odometry(1.0, 2.0, 3.0, quality=quality)) for quality in (80, -1))
+    assert heard(TO_THE_WEST, good, failed).east_velocity_mps is None
+
+
+def test_an_accuracy_that_is_not_stated_is_not_mixed_with_one_that_is():
+    telemetry = MavlinkTelemetry()
+    for time_ns, variance in ((0, math.nan), (100_000_000, 4.0)):
+        telemetry.update(from_camera(speed_estimate(1.0, 2.0, 3.0, variance=variance)), time_ns)
+    sigmas = [telemetry.vehicle(ms * 1_000_000).velocity_sigma_mps for ms in (0, 1, 99, 100)]
+    assert sigmas == [None, None, 2.0, 2.0]
+
+
+@pytest.mark.parametrize("component", [191, 197, 158, 100])
+def test_velocities_arrive_from_every_component_of_the_vehicle(component):
+    decoder, telemetry = PacketDecoder(1, HANDLED_MESSAGES, is_stream=False), MavlinkTelemetry()
+    for system, message in ((2, speed_estimate(9.0, 9.0, 9.0)), (1, speed_estimate(3.0, -4.0, 0.5)),
+                            (1, TO_THE_WEST)):  # fmt: skip
+        sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        for one in decoder.feed(bytes(message.pack(sender))):
+            telemetry.update(one, 1)
+    vehicle = telemetry.vehicle(1)
+    assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-4.0, 3.0))
+    assert vehicle.heading_deg is None  # of anything else the autopilot alone is heard
+
+
+def test_units_end_at_the_door():
+    vehicle = heard(
+        mavlink.MAVLink_attitude_message(5000, 0.1, -0.2, -math.pi / 2, 0, 0, 0),
+        mavlink.MAVLink_global_position_int_message(5000, 1, 1, 630_000, 120_000, 150, -250, 50, 9000),
+        mavlink.MAVLink_local_position_ned_message(5001, 1, 2, -118.0, 1.5, -2.5, 0.5),
+    )
+    assert (vehicle.roll_deg, vehicle.pitch_deg) == pytest.approx((math.degrees(0.1), math.degrees(-0.2)))
+    assert vehicle.heading_deg == pytest.approx(270.0)
+    east_north_up = (vehicle.east_velocity_mps, vehicle.north_velocity_mps, vehicle.up_velocity_mps)
+    assert east_north_up == pytest.approx((-2.5, 1.5, -0.5))
+    assert (vehicle.alt_amsl_m, vehicle.height_agl_m, vehicle.down_m) == pytest.approx((630.0, 120.0, -118.0))
+
+
+def test_height_is_by_the_rangefinder_then_the_clearance_then_above_home():
+    home = mavlink.MAVLink_global_position_int_message(5000, 1, 1, 0, 90_000, 0, 0, 0, 0)
+    clear = mavlink.MAVLink_altitude_message(5_000_000, 0, 0, 0, 0, -1001.0, 95.0)
+    beam = mavlink.MAVLink_distance_sensor_message(5000, 20, 20000, 10_000, 0, 0, 25, 0)
+    ahead = mavlink.MAVLink_distance_sensor_message(5000, 20, 20000, 10_000, 0, 0, 0, 0)
+    tilted = mavlink.MAVLink_attitude_message(5000, math.radians(60.0), 0, 0, 0, 0, 0)
+    assert heard(home).height_agl_m == pytest.approx(90.0)
+    assert heard(home, clear).height_agl_m == pytest.approx(95.0)
+    assert heard(home, clear, ahead).height_agl_m == pytest.approx(95.0)
+    assert heard(home, clear, beam, tilted).height_agl_m == pytest.approx(50.0)
+
+
+def test_a_rangefinder_without_a_stamp_counts_from_its_arrival():
+    beam = mavlink.MAVLink_rangefinder_message(80.0, 1.0)
+    level = mavlink.MAVLink_attitude_message(5000, 0, 0, 0, 0, 0, 0)
+    assert heard(level, beam).height_agl_m == pytest.approx(80.0)
+    assert heard(level, mavlink.MAVLink_rangefinder_message(0.0, 0.0)).height_agl_m is None
+
+
+def test_the_date_is_the_autopilots_or_where_it_has_none_this_machines():
+    telemetry, unix_us = MavlinkTelemetry(), 1_700_000_000_000_000
+    telemetry.update(mavlink.MAVLink_system_time_message(0, 5000), 10_000_000_000)  # no date before a GPS fix
+    before_ns = time.time_ns()
+    stamp_ns = telemetry.unix_ns(time.monotonic_ns())
+    assert before_ns - 1e8 < stamp_ns < time.time_ns() + 1e8  # this machine's
+    telemetry.update(mavlink.MAVLink_system_time_message(unix_us, 6000), 11_000_000_000)
+    assert telemetry.unix_ns(12_000_000_000) == unix_us * 1000 + 1_000_000_000
+
+
+def test_series_go_the_shorter_way_round_and_grow_stale():
+    series = RecentValues((True,))
+    series.add(0, 350.0)
+    series.add(100_000_000, 10.0)
+    series.add(150_000_000, math.nan)
+    assert series.at(50_000_000)[0] % 360.0 == pytest.approx(0.0)
+    assert series.at(400_000_000) == (10.0,)
+    assert series.at(700_000_000) is None
+    assert series.at(-1) == (350.0,)
+
+
+def test_clock_finds_the_offset_by_timesync_and_without():
+    rng = random.Random(3)
+    offset = 7_000_000_000
+    by_arrival, by_sync = AutopilotClock(), AutopilotClock()
+    for sent in range(10**10, 10**10 + 10**9, 10**7):
+        delay = rng.randrange(1_000_000, 30_000_000)
+        by_arrival.local_ns(sent + offset, sent + delay)
+        by_sync.add_request(sent)
+        by_sync.accept_response(sent, sent + delay // 2 + offset, sent + delay)
+    assert abs(by_arrival.offset_ns - offset) < 3_000_000  # late by the quickest way
+    assert abs(by_sync.offset_ns - offset) < 1_000_000
+    by_sync.accept_response(12345, 0, 10**11)  # nobody asked
+    assert abs(by_sync.offset_ns - offset) < 1_000_000
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 250.0])
+@pytest.mark.parametrize("pitch_deg", [-90.0, -70.0])
+@pytest.mark.parametrize("kind", ["device", "locked", "mount"])
+def test_a_gimbal_turns_the_mount(heading_deg, pitch_deg, kind):
+    """The vehicle rolls by 10 degrees, and a stabilised camera stays where it points, down or 20 degrees ahead."""
+    telemetry, heading = MavlinkTelemetry(mount_rotation("nadir")), math.radians(heading_deg)
+    telemetry.update(mavlink.MAVLink_attitude_message(5, 0.17, 0.0, heading, 0, 0, 0), 10_000_000_000)
+    if kind == "mount":
+        message = mavlink.MAVLink_mount_orientation_message(5, 0.0, pitch_deg, 0.0)
+    else:
+        flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK if kind == "locked" else 32
+        angles = [0.0, math.radians(pitch_deg), heading if kind == "locked" else 0.0]
+        q = [float(v) for v in Quaternion(angles).q]
+        message = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, 5, flags, q, 0, 0, 0, 0)
+    telemetry.update(message, 10_000_000_000)
+    vehicle = telemetry.vehicle(10_000_000_000)
+    frame = vehicle.frame(np.zeros((2, 2), np.uint8), 1)
+    assert (frame.roll_deg, frame.pitch_deg) == pytest.approx((0.0, pitch_deg + 90.0), abs=1e-4)
+    assert math.remainder(frame.heading_deg - heading_deg, 360.0) == pytest.approx(0.0, abs=1e-4)
+    assert vehicle.roll_deg == pytest.approx(math.degrees(0.17))  # that of the messages to the autopilot
+
+
+def test_an_origin_of_zeros_is_none():
+    telemetry = MavlinkTelemetry()
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), 1)
+    assert telemetry.origin is None
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 510000), 1)
+    assert telemetry.origin == NedOrigin(pytest.approx(33.64), pytest.approx(72.99), 510.0)
+
+
+def test_an_autopilot_that_starts_again_is_followed():
+    telemetry = MavlinkTelemetry()
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
+    for ms in range(60_000, 61_000, 10):
+        telemetry.update(mavlink.MAVLink_attitude_message(ms, 0.1, 0, 0, 0, 0, 0), ms * 1_000_000)
+    for ms in range(0, 2000, 10):
+        now = (61_000 + ms) * 1_000_000
+        telemetry.update(mavlink.MAVLink_attitude_message(ms, 0.2, 0, 0, 0, 0, 0), now)
+    assert telemetry.vehicle(now).roll_deg == pytest.approx(math.degrees(0.2))
+    assert telemetry.origin is None
+
+
+def test_a_restart_shows_in_timesync_before_it_shows_in_the_stamps():
+    """Its first answer after the restart is quicker than all before it, and must not pass for a better one."""
+    telemetry, boot_ns = MavlinkTelemetry(), 60_000_000_000
+
+    def ask(now_ns, since_boot_ns, trip_ns):
+        telemetry.add_timesync_request(now_ns)
+        answer = mavlink.MAVLink_timesync_message(since_boot_ns, now_ns)
+        telemetry.update(answer, now_ns + trip_ns)
+
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
+    for k in range(10):
+        ask(k * 500_000_000, boot_ns + k * 500_000_000 + 10_000_000, 20_000_000)
+    assert telemetry.origin is not None
+    ask(5_000_000_000, boot_ns + 5_300_000_000, 600_000_000)  # a slow answer is no restart
+    assert telemetry.origin is not None
+    ask(6_000_000_000, 1_000_000, 2_000_000)
+    assert telemetry.origin is None
+    ask(6_500_000_000, 501_000_000, 2_000_000)
+    telemetry.update(mavlink.MAVLink_attitude_message(550, 0.2, 0, 0, 0, 0, 0), 6_552_000_000)
+    assert telemetry.vehicle(6_549_000_000).roll_deg == pytest.approx(math.degrees(0.2))
+
+
+@pytest.mark.parametrize("step_ms", [-950, -700, -300, -50, 50, 700])
+def test_a_clock_that_is_set_is_followed_from_the_next_answer_on(step_ms):
+    """Less than a restart: the origin stays, and heights are those of their times, though answers took longer."""
+    telemetry, boot_ms = MavlinkTelemetry(), 100_000
+    telemetry.update(mavlink.MAVLink_gps_global_origin_message(336400000, 729900000, 0), 0)
+    for ms in range(10_000, 14_000, 20):
+        at_ns, own_ms = ms * 1_000_000, ms + boot_ms + (step_ms if ms >= 12_000 else 0)
+        if ms % 500 == 0:
+            trip_ns = 4_000_000 if ms < 12_000 else 20_000_000
+            telemetry.add_timesync_request(at_ns)
+            answer = mavlink.MAVLink_timesync_message(own_ms * 1_000_000 + trip_ns // 2, at_ns)
+            telemetry.update(answer, at_ns + trip_ns)
+        telemetry.update(mavlink.MAVLink_local_position_ned_message(own_ms, 0, 0, -ms * 1e-3, 0, 0, 0), at_ns)
+        if ms >= 12_520 - min(step_ms, 0):
+            assert telemetry.vehicle(at_ns - 100_000_000).down_m == pytest.approx(0.1 - ms * 1e-3, abs=0.01)
+    assert telemetry.origin is not None
+
+
+# ------------------------------------------------------------------------------------------------ security
+
+
+def autopilot(key=None, system=1, component=1):
+    made = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    if key is not None:
+        made.signing.secret_key, made.signing.sign_outgoing, made.signing.timestamp = key, True, signing_time()
+    return made
+
+
+def beat(made, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
+    return mavlink.MAVLink_heartbeat_message(2, firmware, 0, 0, 4, 3).pack(made)
+
+
+def decoder(**options):
+    return PacketDecoder(1, HANDLED_MESSAGES, **({"is_stream": True} | options))
+
+
+def test_packets_may_be_cut_anywhere_in_a_stream_but_not_in_datagrams():
+    data = b"noise" + beat(autopilot()) + b"\xfd\x00" + beat(autopilot()) * 2
+    stream = decoder()
+    assert sum(len(stream.feed(data[i : i + 1])) for i in range(len(data))) >= 2
+    datagrams = decoder(is_stream=False)
+    half = len(beat(autopilot())) // 2
+    assert not datagrams.feed(beat(autopilot())[:half])
+    assert len(datagrams.feed(beat(autopilot()))) == 1  # the half before it is forgotten
+
+
+def test_a_datagram_of_noise_is_given_up_soon():
+    noise, datagrams = b"\xfd\x10\x00" * 20_000, decoder(is_stream=False)
+    assert not datagrams.feed(noise)
+    assert datagrams.dropped < 100  # not the 20,000 packets that may begin in it
+    assert len(datagrams.feed(noise[:30] + beat(autopilot()))) == 1
+
+
+def test_strangers_are_not_heard():
+    assert len(decoder().feed(beat(autopilot()))) == 1
+    assert not decoder().feed(beat(autopilot(system=2)))
+    assert not decoder().feed(beat(autopilot(component=190)))
+
+
+def test_with_a_key_only_what_is_rightly_signed_and_new_is_heard():
+    signed = decoder(key=KEY, is_stream=False)
+    other, mine = autopilot(bytes(32)), autopilot(KEY)
+    assert not signed.feed(beat(autopilot()))
+    assert not signed.feed(beat(other))
+    first = beat(mine)
+    assert len(signed.feed(first)) == 1
+    assert not signed.feed(first)  # a replay
+    assert len(signed.feed(beat(mine))) == 1
+    forged = bytearray(beat(mine))
+    forged[-12:-6] = b"\xff" * 6  # a time far ahead must not silence the stream
+    assert not signed.feed(bytes(forged))
+    assert len(signed.feed(beat(mine))) == 1
+    old = autopilot(KEY)
+    old.signing.link_id, old.signing.timestamp = 9, signing_time() - 6_100_000
+    assert not signed.feed(beat(old))
+
+
+def test_what_is_sent_with_a_key_is_signed():
+    packet = PacketEncoder(1, KEY).encode(fix_message(sending(), MavlinkOptions()))
+    reader = mavlink.MAVLink(None)
+    reader.signing.secret_key = KEY
+    assert reader.decode(bytearray(packet)).get_type() == "VISION_POSITION_ESTIMATE"
+    reader.signing.secret_key = bytes(32)
+    with pytest.raises(mavlink.MAVError):
+        reader.decode(bytearray(packet))
+
+
+def test_keys_are_bytes_or_hexadecimal(tmp_path):
+    raw, text, bad = tmp_path / "raw", tmp_path / "text", tmp_path / "bad"
+    raw.write_bytes(KEY)
+    text.write_text(KEY.hex() + "\n", encoding="ascii")
+    bad.write_text("secret", encoding="ascii")
+    assert read_key(raw) == read_key(text) == KEY
+    with pytest.raises(OptionError, match="32 bytes"):
+        read_key(bad)
+
+
+@pytest.mark.slow
+def test_hours_of_traffic_leave_nothing_behind():
+    from bench.live.fuzz_mavlink import growth_bytes
+
+    assert growth_bytes(hours=0.05) < 20_000
+
+
+@pytest.mark.slow
+def test_minutes_of_the_hour_in_which_everything_goes_wrong():
+    from bench.live.bridge_hour import hour
+
+    flown = hour(minutes=1.5, flood_pieces=2000)
+    assert flown["due"] > 200
+    nothing = ("missing", "twice", "foreign", "unwanted")
+    assert {name: flown[name] for name in nothing} == dict.fromkeys(nothing, 0)
+    assert flown["steps"] == flown["resets"]
+    assert flown["reconnections"] == 2
+    assert flown["least_hz"] >= MIN_RATE_HZ
+    assert flown["stamp_off_ms"] < 12.5  # half of what the link may take
+    assert flown["place_off_m"] < 0.01
+    assert flown["heading_off_deg"] < 1.0
+    assert flown["unplaced"] == 0
+
+
+@pytest.mark.slow
+def test_random_and_mutated_packets_harm_nothing():
+    from bench.live.fuzz_mavlink import fuzz
+
+    assert fuzz(count=3000, seed=5).longest_s < 2.0
+
+
+# --------------------------------------------------------------------------------------------- connections
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "udp:127.0.0.1", "udpin:127.0.0.1", "udpin::1", "udpin:127.0.0.1:0", "tcp:host:65536", "udp:", "udp://",
+     "serial:/dev/x:a", "serial:/dev/x", "/dev/x", "tcp:host:１２", "127.0.0.1:14550", "tcp:5760", "udpout:14550"],
+)  # fmt: skip
+def test_bad_connection_strings_are_refused_in_one_line(text):
+    with pytest.raises(OptionError, match=r"connect: expected udpin:HOST:PORT"):
+        parse_connection(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "host", "number"),
+    [
+        ("udp:127.0.0.1:14550", "udpin", "127.0.0.1", 14550),  # pymavlink, MAVProxy
+        ("udp:14550", "udpin", "127.0.0.1", 14550),
+        ("udpin:14550", "udpin", "127.0.0.1", 14550),
+        ("udp://:14540", "udpin", "127.0.0.1", 14540),  # MAVSDK
+        ("udp://127.0.0.1:14540", "udpin", "127.0.0.1", 14540),
+        ("udpin://[::1]:14540", "udpin", "::1", 14540),
+        ("udpout://192.168.1.12:14550", "udpout", "192.168.1.12", 14550),
+        ("tcp:localhost:5760", "tcp", "localhost", 5760),
+        ("tcpout://127.0.0.1:5760", "tcp", "127.0.0.1", 5760),
+        ("serial:/dev/ttyACM0:57600", "serial", "/dev/ttyACM0", 57600),
+        ("serial:///dev/ttyACM0:57600", "serial", "/dev/ttyACM0", 57600),  # MAVSDK
+        ("/dev/ttyACM0,57600", "serial", "/dev/ttyACM0", 57600),  # MAVProxy
+        ("/dev/ttyACM0:57600", "serial", "/dev/ttyACM0", 57600),
+        ("serial:COM3:115200", "serial", "COM3", 115200),
+    ],
+)
+def test_connection_strings_are_read_as_people_type_them(text, kind, host, number):
+    assert parse_connection(text) == Connection(kind, host, number)
+
+
+def test_without_a_host_only_this_machine_is_heard():
+    assert parse_connection("udp:14550").host == "127.0.0.1"
+    assert parse_connection("udp://:14540", listen_anywhere=True).host == "0.0.0.0"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.2", "[::]", "example.org"])
+def test_nothing_listens_off_loopback_unless_told(host):
+    with pytest.raises(OptionError, match="`listen_anywhere`"):
+        parse_connection(f"udpin:{host}:14550")
+    with pytest.raises(OptionError, match="`listen_anywhere`"):
+        parse_connection(f"udp://{host}:14550")
+    assert parse_connection(f"udpin:{host}:14550", listen_anywhere=True).number == 14550
+    assert parse_connection(f"udpout:{host}:14550").kind == "udpout"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
+def test_loopback_is_listened_on(host):
+    assert parse_connection(f"udpin:{host}:14550").kind == "udpin"
+
+
+# ---------------------------------------------------------------------------------------------- parameters
+
+
+def parameters(**options):
+    """Values by name of a parameter file of ArduPilot."""
+    text = parameter_file(ParameterOptions(firmware="ardupilot", **options))
+    return dict(line.split(",") for line in text.splitlines() if not line.startswith("#"))
+
+
+def test_parameter_files():
+    values = parameters(message="vision_position_estimate", delay_ms=120)
+    assert (values["VISO_TYPE"], values["VISO_DELAY_MS"], values["EK3_SRC1_POSXY"]) == ("1", "120", "6")
+    assert values["GPS1_TYPE"] == "0"
+    text = parameter_file(ParameterOptions(firmware="px4", message="global_position_sensor", delay_ms=120))
+    rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
+    assert all(len(row) == 5 and row[:2] == ["1", "1"] and len(row[2]) <= 16 for row in rows)
+    assert ["1", "1", "EKF2_AGP0_CTRL", "1", "6"] in rows
+    assert ["1", "1", "EKF2_AGP0_DELAY", "120", "9"] in rows
+    assert "EKF2_EV_CTRL\t1\t6" in parameter_file(ParameterOptions(firmware="px4", message="odometry"))
+    with pytest.raises(OptionError, match="250"):
+        ParameterOptions(firmware="ardupilot", message="vision_position_estimate", delay_ms=251)
+
+
+def test_a_take_off_with_gnss_leaves_the_receiver_in_the_first_source_set_and_a_switch():
+    values = parameters(message="vision_position_estimate", takeoff="gnss")
+    assert (values["EK3_SRC1_POSXY"], values["EK3_SRC2_POSXY"], values["RC7_OPTION"]) == ("3", "6", "90")
+    assert "GPS1_TYPE" not in values
+    assert {"FS_EKF_ACTION", "FS_EKF_THRESH"} <= set(values)
+    with pytest.raises(OptionError, match="takeoff: expected none for px4"):
+        ParameterOptions(firmware="px4", message="odometry", takeoff="gnss")
+
+
+def test_gps_input_stands_beside_a_receiver_as_the_second():
+    values = parameters(message="gps_input", takeoff="gnss", gps_id=1, delay_ms=30)
+    assert (values["GPS2_TYPE"], values["GPS2_DELAY_MS"]) == ("14", "30")
+    assert values["GPS_AUTO_SWITCH"] == "4"  # by the most satellites it would change over on the ground
+    assert parameters(message="gps_input", delay_ms=0)["GPS1_DELAY_MS"] == "1"  # 0 would mean 200
+    assert fix_message(sending(), MavlinkOptions(message="gps_input", gps_id=1)).gps_id == 1
+    with pytest.raises(OptionError, match="gps_id: expected 1 or more beside a receiver"):
+        ParameterOptions(firmware="ardupilot", message="gps_input", takeoff="gnss")
+    with pytest.raises(OptionError, match="gps_id: expected with gps_input only"):
+        MavlinkOptions(gps_id=1)
+
+
+def test_the_delay_is_what_the_last_bridge_measured(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    words = ["bridge", "mavlink-params", "--force", "--out", str(tmp_path / "x.param")]
+    assert main(words) == 0
+    assert "100 ms" in capsys.readouterr().err
+    remember_delay(33.4)
+    assert main(words) == 0
+    assert "VISO_DELAY_MS,33\n" in (tmp_path / "x.param").read_text(encoding="utf-8")
+
+
+def test_the_command_line_writes_them_and_refuses_in_one_line(tmp_path, capsys):
+    out = tmp_path / "x.param"
+    words = ["bridge", "mavlink-params", "--firmware", "px4", "--out", str(out)]
+    assert main(words) == 0
+    assert "EKF2_AGP0_CTRL" in out.read_text(encoding="utf-8")
+    assert main(words) == 2
+    assert main([*words, "--force", "--message", "gps_input"]) == 2
+    assert "--message: expected one of global_position_sensor, odometry" in capsys.readouterr().err
+    live = ["bridge", "mavlink", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--connect"]
+    assert main([*live, "udpin:0.0.0.0:14550"]) == 2
+    assert main([*live, "nonsense"]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+
+
+# ------------------------------------------------------------------------------------------ in the loop
+
+
+class Standin:
+    """An autopilot on loopback: heartbeats, attitude, positions, TIMESYNC, an origin once it is given one."""
+
+    BOOT_NS = 5_000_000_000
+
+    def __init__(
+        self, port, *, origin=None, key=None, system=1, local=True, receiver=None, flags=None, uptime_ns=BOOT_NS
+    ):
+        self.uptime_ns = uptime_ns  # when it is heard first
+        self.mav = autopilot(key, system=system)
+        self.parser = mavlink.MAVLink(None)
+        self.parser.robust_parsing = True
+        self.parser.signing.secret_key = key
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.connect(("127.0.0.1", port))
+        self.socket.settimeout(0.02)
+        self.local, self.receiver, self.flags, self.armed = local, receiver, flags, False
+        self.origin, self.got, self.silent, self.over = origin, [], False, threading.Event()
+        self.thread = threading.Thread(target=self.run)
+        self.begin_ns = time.monotonic_ns()
+        self.thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.over.set()
+        self.thread.join()
+        self.socket.close()
+
+    def boot_ns(self):
+        return time.monotonic_ns() - self.begin_ns + self.uptime_ns
+
+    def send(self, message):
+        if not self.silent:
+            with contextlib.suppress(ConnectionRefusedError):  # nobody listens yet, or any more
+                self.socket.send(message.pack(self.mav))
+
+    def run(self):
+        tick = 0
+        while not self.over.is_set():
+            ms = self.boot_ns() // 1_000_000
+            if tick % 10 == 0:
+                self.send(mavlink.MAVLink_heartbeat_message(2, 3, 128 if self.armed else 0, 0, 4, 3))
+                self.send(mavlink.MAVLink_timesync_message(0, self.boot_ns()))
+            self.send(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.5, 0, 0, 0))
+            if self.local:
+                self.send(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -100.0, 0, 0, 0))
+            if self.receiver is not None:
+                fix_type, lat_1e7, lon_1e7 = self.receiver
+                more = {"h_acc": 1000}
+                self.send(
+                    mavlink.MAVLink_gps_raw_int_message(0, fix_type, lat_1e7, lon_1e7, 0, 0, 0, 0, 0, 9, **more)
+                )
+            if self.flags is not None:
+                self.send(mavlink.MAVLink_ekf_status_report_message(self.flags, 0, 0, 0, 0, 0))
+            self.send(mavlink.MAVLink_global_position_int_message(ms, 1, 1, 0, 100_000, 0, 0, 0, 0))
+            tick += 1
+            self.listen()
+
+    def listen(self):
+        try:
+            data = self.socket.recv(2048)
+        except OSError:
+            return
+        if self.silent:
+            return
+        for message in self.parser.parse_buffer(data) or []:
+            self.got.append((message, time.monotonic_ns()))
+            kind = message.get_type()
+            if kind == "TIMESYNC" and message.tc1 == 0:
+                self.send(mavlink.MAVLink_timesync_message(self.boot_ns(), message.ts1))
+            if kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
+                self.origin = (message.latitude, message.longitude, message.altitude)
+            if kind in ("COMMAND_LONG", "SET_GPS_GLOBAL_ORIGIN") and self.origin is not None:
+                self.send(mavlink.MAVLink_gps_global_origin_message(*self.origin))
+
+    def of(self, kind):
+        return [(m, at) for m, at in list(self.got) if m.get_type() == kind]
+
+
+class Matched:
+    """A navigator whose every frame is a fix; it re-localises when asked to."""
+
+    def __init__(self):
+        self.reset_count, self.frames, self.result = 0, [], None
+
+    def update(self, frame, prior=None, budget=None):
+        self.frames.append(frame)
+        return self.result or fix(timestamp_ns=frame.timestamp_ns)
+
+
+def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
+    for index in range(2):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.zeros((8, 8), np.uint8))
+    begun_ns = []
+
+    def wait():
+        time.sleep(0.2)
+        begun_ns.append(time.monotonic_ns())
+
+    first, second = (captured_ns for _, captured_ns in replay(tmp_path, None, rate_hz=50.0, wait=wait))
+    assert [first >= at_ns for at_ns in begun_ns] == [True]
+    assert second - first == 20_000_000
+    for index in (2, 3):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((8, 8), index, np.uint8))
+    played = list(replay(tmp_path, None, rate_hz=50.0, every=2))  # one in two, each at its own time
+    assert [picture.max() for picture, _ in played] == [0, 2]
+    assert played[1][1] - played[0][1] == 40_000_000
+
+
+def test_a_flight_that_is_played_is_read_before_its_first_picture_is_asked_for(tmp_path):
+    with pytest.raises(TelemetryError, match="no such"):
+        replay(tmp_path / "none", None, rate_hz=50.0)
+
+
+@pytest.fixture
+def bridge_to():
+    """Makes a bridge that listens on a free port of loopback, and its navigator; closes both."""
+    opened = []
+
+    def make(options=None, **more):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        navigator = Matched()
+        bridge = MavlinkBridge(
+            parse_connection(f"udpin:127.0.0.1:{port}"), lambda _: navigator, options or MavlinkOptions(), **more
+        )
+        opened.append(bridge)
+        return SimpleNamespace(bridge=bridge, navigator=navigator, port=port)
+
+    yield make
+    for bridge in opened:
+        bridge.close()
+
+
+def fly(bridge, until, *, timeout_s=120.0, every_s=0.05):
+    """Pictures at 20 Hz until something holds; their captures."""
+    image, captures, end = np.zeros((4, 4, 3), np.uint8), [], time.monotonic() + timeout_s
+    while not until():
+        assert time.monotonic() < end, bridge.status
+        captures.append(time.monotonic_ns())
+        bridge.submit(image, captures[-1])
+        time.sleep(every_s)
+    return captures
+
+
+def test_fixes_reach_the_autopilot_with_stamps_of_capture(bridge_to):
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        captures = fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 40)
+        got = pilot.of("VISION_POSITION_ESTIMATE")
+    stamps = [m.usec for m, _ in got]
+    assert set(stamps) <= {c // 1000 for c in captures}
+    assert all(b > a for a, b in itertools.pairwise(stamps))
+    north, east = north_east_m(fix().lat_deg, fix().lon_deg, ORIGIN, "ardupilot")
+    m = got[-1][0]
+    assert (m.x, m.y, m.z) == pytest.approx((north, east, -100.0), abs=1e-2)
+    assert m.yaw == pytest.approx(0.5, abs=1e-6)
+    frame = made.navigator.frames[-1]
+    assert frame.heading_deg == pytest.approx(math.degrees(0.5), abs=1e-4)
+    assert frame.height_agl_m == pytest.approx(100.0)
+    # The clock of the stamps is the one that TIMESYNC was answered on.
+    answers = [m for m, _ in pilot.of("TIMESYNC") if m.tc1 != 0]
+    assert answers
+    assert all(captures[0] - 10**10 < m.tc1 < captures[-1] + 10**10 for m in answers)
+
+
+def test_a_packet_that_cannot_be_read_does_not_end_the_reading(bridge_to, monkeypatch, caplog):
+    made = bridge_to()
+    update, faults = made.bridge.telemetry.update, []
+
+    def fail_thrice(message, now_ns):
+        if len(faults) < 3:
+            faults.append(message)
+            raise ValueError("cannot convert float NaN to integer")
+        update(message, now_ns)
+
+    monkeypatch.setattr(made.bridge.telemetry, "update", fail_thrice)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    assert len(faults) == 3
+    assert [record.exc_info[0] for record in caplog.records] == [ValueError]
+
+
+@pytest.mark.parametrize("use", [True, False])
+def test_the_velocity_is_believed_where_it_is_told_to(bridge_to, use):
+    made = bridge_to(use_velocity=use)
+    with Standin(made.port) as pilot:
+        fly(made.bridge, lambda: made.navigator.frames and made.navigator.frames[-1].heading_deg is not None)
+        fly(made.bridge, lambda: pilot.of("TIMESYNC"))
+        fly(made.bridge, lambda: len(made.navigator.frames) > 10)
+    assert (made.navigator.frames[-1].east_velocity_mps is not None) == use
+
+
+@pytest.mark.slow
+def test_fixes_come_at_4_hz_or_more(bridge_to):
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 20, every_s=0.1)
+        got = pilot.of("VISION_POSITION_ESTIMATE")
+    hz = (len(got) - 1) / ((got[-1][1] - got[0][1]) * 1e-9)
+    assert hz >= MIN_RATE_HZ
+
+
+def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_to, monkeypatch):
+    """After 3 s of an autopilot that has had time to find a receiver, here a tenth of it."""
+    monkeypatch.setattr(mavlink_requests, "_ORIGIN_TIMEOUT_NS", 300_000_000)
+    monkeypatch.setattr(mavlink_requests, "_PERIOD_NS", 100_000_000)
+    made = bridge_to(origin=ORIGIN)
+    with Standin(made.port, uptime_ns=30_000_000_000) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        given = pilot.of("SET_GPS_GLOBAL_ORIGIN")
+        assert [(m.latitude, m.longitude, m.altitude) for m, _ in given[:1]] == [(336400000, 729900000, 510000)]
+        assert given[0][1] < pilot.of("VISION_POSITION_ESTIMATE")[0][1]
+    assert made.bridge.status.withheld["no origin"] > 0
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "armed", "receiver", "expected_s"),
+    [
+        (30.0, False, False, 4.0),  # the first request after 3 s
+        (5.0, False, False, 15.0),  # it may find a receiver until 20 s after its start
+        (5.0, True, False, 4.0),  # none is looked for in flight
+        (30.0, False, True, 61.0),  # a receiver may get its fix for a minute
+    ],
+)
+def test_an_origin_is_set_when_no_receiver_will_set_a_better_one(begin_s, armed, receiver, expected_s):
+    """By a clock of the test's own, asked every 0.1 s: how long after the vehicle is first heard."""
+    requests = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False)
+    now_ns = 10**15
+    requests.restart(now_ns)
+    for tenths in range(1000):
+        telemetry = SimpleNamespace(
+            origin=None, has_receiver=receiver, armed=armed, uptime_ms=begin_s * 1000.0 + 100.0 * tenths
+        )
+        sent = requests.due(telemetry, now_ns + tenths * 100_000_000)
+        if any(message.get_type() == "SET_GPS_GLOBAL_ORIGIN" for message in sent):
+            assert tenths / 10.0 == expected_s
+            return
+    pytest.fail("no origin was set in 100 s")
+
+
+def test_an_origin_that_is_lost_is_set_again_only_after_the_wait():
+    requests = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False)
+    requests.restart(0)
+    for second in range(60):
+        known = ORIGIN if second < 40 else None
+        telemetry = SimpleNamespace(origin=known, has_receiver=False, armed=False, uptime_ms=10**6)
+        sent = [message.get_type() for message in requests.due(telemetry, 10**15 + second * 10**9)]
+        assert ("SET_GPS_GLOBAL_ORIGIN" in sent) == (second >= 43)
+
+
+def test_an_origin_that_is_there_is_not_set_again(bridge_to):
+    made = bridge_to(origin=NedOrigin(1.0, 2.0, 3.0))
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 5)
+        assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
+
+
+def test_without_a_position_the_height_above_home_is_sent(bridge_to):
+    """ArduPilot has no local position before the first fix, and must get that fix all the same."""
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000), local=False) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 3)
+        assert pilot.of("VISION_POSITION_ESTIMATE")[-1][0].z == pytest.approx(-100.0)
+        pilot.local = True
+
+
+def test_the_height_goes_on_where_the_local_position_ends():
+    """Home is 20 m above the origin, so that 100 m above home is 120 m above the origin."""
+    telemetry = MavlinkTelemetry()
+    for ms in range(0, 3000, 100):
+        now_ns = 10_000_000_000 + ms * 1_000_000
+        if ms < 1000:
+            telemetry.update(mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -120.0, 0, 0, 0), now_ns)
+        telemetry.update(mavlink.MAVLink_global_position_int_message(ms, 1, 1, 0, 100_000, 0, 0, 0, 0), now_ns)
+    assert telemetry.vehicle(now_ns).down_m == pytest.approx(-120.0)
+
+
+@pytest.mark.parametrize(("flags", "known"), [(831, True), (831 & ~2, False), (831 | 128, False), (167, False)])
+def test_a_velocity_that_the_estimator_does_not_know_is_none(flags, known):
+    telemetry = MavlinkTelemetry()
+    telemetry.update(mavlink.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0), 10_000_000_000)
+    telemetry.update(mavlink.MAVLink_global_position_int_message(5, 1, 1, 0, 9, 0, 0, 0, 0), 10_000_000_000)
+    assert (telemetry.vehicle(10_000_000_000).east_velocity_mps is not None) == known
+
+
+def test_each_firmware_is_asked_for_what_it_has(bridge_to):
+    made = bridge_to()
+    with Standin(made.port) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("COMMAND_LONG")) >= 8)
+        asked = {
+            m.param1 for m, _ in pilot.of("COMMAND_LONG") if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        }
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE not in asked  # "No ap_message for mavlink id 141"
+    assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in asked
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE in REQUESTED_RATES_HZ["px4"]
+
+
+def test_an_autopilot_whose_receiver_may_still_get_a_fix_sets_its_origin_itself(bridge_to, monkeypatch):
+    monkeypatch.setattr(mavlink_requests, "_ORIGIN_TIMEOUT_NS", 300_000_000)
+    monkeypatch.setattr(mavlink_requests, "_RECEIVER_FOUND_MS", Standin.BOOT_NS // 1_000_000 + 1_000)
+    made = bridge_to(origin=ORIGIN)
+    with Standin(made.port, receiver=(1, 0, 0)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("TIMESYNC")) > 6)
+        assert not pilot.of("SET_GPS_GLOBAL_ORIGIN")
+        pilot.receiver = (0, 0, 0)  # there is none after all
+        fly(made.bridge, lambda: pilot.of("SET_GPS_GLOBAL_ORIGIN"))
+
+
+def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(bridge_to):
+    """ArduPilot's check wants a message of visual odometry in the last 0.3 s; its quality says it is no fix."""
+    made = bridge_to()
+    made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("ODOMETRY")) >= 5)
+        assert {m.quality for m, _ in pilot.of("ODOMETRY")} == {-1}
+        pilot.armed = True
+        fly(made.bridge, lambda: made.bridge.telemetry.armed)
+        before = len(pilot.of("ODOMETRY"))
+        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+        assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
+        assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_a_second_receiver_repeats_the_first_until_the_vehicle_is_armed(bridge_to):
+    """ArduPilot's check wants a fix of every receiver, and on the ground a camera sees nothing."""
+    made = bridge_to(MavlinkOptions(message="gps_input", gps_id=1))
+    made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+    with Standin(made.port, receiver=(3, 336400000, 729900000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("GPS_INPUT")) >= 5)
+        repeated = pilot.of("GPS_INPUT")[-1][0]
+        assert (repeated.gps_id, repeated.fix_type, repeated.lat, repeated.lon) == (1, 3, 336400000, 729900000)
+        assert repeated.ignore_flags & mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
+        # The quickest message counts as the one without delay, and must be a fix.
+        assert repeated.time_usec <= time.monotonic_ns() // 1000 - 250_000
+        pilot.armed = True
+        fly(made.bridge, lambda: made.bridge.telemetry.armed)
+        before = len(pilot.of("GPS_INPUT"))
+        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+        assert len(pilot.of("GPS_INPUT")) <= before + 2  # in flight it has a fix where the camera has one
+
+
+def test_the_pilot_is_told_when_fixes_begin_and_stop(bridge_to, monkeypatch):
+    monkeypatch.setattr("scenematch.bridges.notices._STOPPED_S", 1.5)
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("STATUSTEXT"))
+        made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 2)
+        made.navigator.result = None
+        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 3)
+        texts = [m.text for m, _ in pilot.of("STATUSTEXT")]
+    assert texts[0] == texts[2] == "Scenematch: fixes begin"
+    assert re.fullmatch(r"Scenematch: fixes stopped, \d+ refused: no texture", texts[1])
+
+
+def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(bridge_to):
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+        made.navigator.result = fix(east_m=40.0)
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 10)
+        before = len(pilot.of("VISION_POSITION_ESTIMATE"))
+        assert any(m.text.startswith("Scenematch: map doubted, 40 m off") for m, _ in pilot.of("STATUSTEXT"))
+        station = autopilot(system=255, component=190)  # on the vehicle's link, as an autopilot passes it on
+        number = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+        pilot.socket.send(word.pack(station))
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
+        assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(bridge_to):
+    made = bridge_to(component_id=194, use_velocity=False)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        camera, station = autopilot(component=197), autopilot(system=255, component=190)
+        for number in (197, 194):
+            word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+            fly(made.bridge, lambda: pilot.of("HEARTBEAT"))
+            pilot.socket.send(word.pack(station))
+
+        def seen():
+            pilot.socket.send(odometry(2.0, 1.0, 0.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION).pack(camera))
+            frames = made.navigator.frames
+            return frames and frames[-1].east_velocity_mps is not None and pilot.of("COMMAND_ACK")
+
+        fly(made.bridge, seen)
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        assert len(pilot.of("COMMAND_ACK")) == 1
+        for kind in ("HEARTBEAT", "COMMAND_ACK", "VISION_POSITION_ESTIMATE"):
+            assert {(m.get_srcSystem(), m.get_srcComponent()) for m, _ in pilot.of(kind)} == {(1, 194)}
+
+
+@pytest.mark.parametrize("number", ["1", "0", "256"])
+def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
+    given = ["--connect", "udp:14550", "--map", "m.tif", "--frames", "f", "--camera", "c.yaml"]
+    assert main(["bridge", "mavlink", *given, "--component-id", number]) == 2
+    assert f"--component-id: expected 2 to 255, 1 is the autopilot, got {number}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("by_camera", [True, False])
+def test_a_cameras_velocity_arrives_without_the_autopilots(bridge_to, by_camera):
+    made = bridge_to(use_velocity=False)
+    with Standin(made.port) as pilot:
+        sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
+
+        def seen():
+            if by_camera:
+                pilot.socket.send(speed_estimate(3.0, -4.0, 0.5).pack(sender))
+            frames = made.navigator.frames
+            heard = bool(frames) and frames[-1].heading_deg is not None and len(frames) > 10
+            return heard and (not by_camera or frames[-1].east_velocity_mps is not None)
+
+        fly(made.bridge, seen)
+    frame = made.navigator.frames[-1]
+    stated = (frame.east_velocity_mps, frame.north_velocity_mps)
+    assert stated == (pytest.approx((-4.0, 3.0)) if by_camera else (None, None))
+
+
+def test_the_first_fixes_are_held_against_the_receiver(bridge_to):
+    site = SimpleNamespace(frame=LocalFrame(33.64, 72.99))
+    made = bridge_to(site=site)
+    made.navigator.result = fix(east_m=40.0)
+    with Standin(made.port, origin=(336400000, 729900000, 510000), receiver=(3, 336400000, 729900000)) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
+        made.navigator.result = fix(east_m=1.0)
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+
+
+def test_reset_counter_steps_once_per_relocalisation(bridge_to):
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+        made.navigator.reset_count = 1
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].reset_counter == 1)
+        made.navigator.reset_count = 256
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].reset_counter == 0)
+        counters = [m.reset_counter for m, _ in pilot.of("VISION_POSITION_ESTIMATE")]
+    assert [c for i, c in enumerate(counters) if i == 0 or c != counters[i - 1]] == [0, 1, 0]
+
+
+def test_poor_fixes_and_refusals_are_not_sent(bridge_to):
+    made = bridge_to()
+    made.navigator.result = fix(sigma_m=11.0)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("too uncertain", 0) > 3)
+        made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+        fly(made.bridge, lambda: made.bridge.status.refused.get("no_texture", 0) > 3)
+        assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_the_other_firmware_is_not_steered(bridge_to):
+    made = bridge_to(MavlinkOptions(firmware="px4"))
+    with Standin(made.port) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("other firmware", 0) > 3)
+        assert not pilot.of("GLOBAL_POSITION_SENSOR")
+
+
+def test_reconnects_after_silence_and_to_a_new_address(bridge_to, monkeypatch):
+    monkeypatch.setattr("scenematch.bridges.mavlink._SILENCE_NS", 2_000_000_000)
+    made = bridge_to()
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        pilot.silent = True
+        fly(made.bridge, lambda: not made.bridge.connected)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    assert made.bridge.status.reconnections == 1
+
+
+def test_with_a_key_an_unsigned_autopilot_is_not_answered(bridge_to):
+    made = bridge_to(key=KEY)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.dropped > 20)
+        assert not made.bridge.connected
+        assert not pilot.got
+    with Standin(made.port, origin=(336400000, 729900000, 510000), key=KEY) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+
+
+def test_with_a_key_what_is_not_signed_cannot_steer_even_from_the_vehicles_own_address(bridge_to):
+    made = bridge_to(key=KEY)
+    with Standin(made.port, origin=(336400000, 729900000, 510000), key=KEY) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        liar = autopilot()
+        lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(liar) + beat(liar)
+        lies += mavlink.MAVLink_attitude_message(1, 1.0, 1.0, 1.0, 0, 0, 0).pack(liar)
+        before = made.bridge.status.dropped
+        for _ in range(50):
+            pilot.socket.send(lies)
+        fly(made.bridge, lambda: made.bridge.status.dropped >= before + 100)
+        fly(made.bridge, lambda: len(made.navigator.frames) > 5)
+        assert made.navigator.frames[-1].roll_deg == pytest.approx(0.0)
+    assert made.bridge.telemetry.origin.lat_deg == pytest.approx(33.64)
+
+
+@pytest.mark.skipif(not Path("/proc/net/udp").exists(), reason="asks Linux which sockets are open")
+def test_the_open_sockets_are_those_of_loopback(bridge_to):
+    bridge_to()
+    own = {os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if fd_is_there(fd)}
+    addresses = []
+    for table in ("udp", "udp6", "tcp", "tcp6"):
+        rows = [line.split() for line in Path(f"/proc/net/{table}").read_text(encoding="ascii").splitlines()[1:]]
+        addresses += [(table, row[1].split(":")[0]) for row in rows if f"socket:[{row[9]}]" in own]
+    assert addresses
+    assert set(addresses) <= {("udp", "0100007F"), ("tcp", "0100007F")}  # 127.0.0.1, as the kernel writes it
+
+
+def fd_is_there(fd):
+    return os.path.lexists(f"/proc/self/fd/{fd}")
+
+
+def test_a_flood_and_a_stranger_do_not_steer_it(bridge_to):
+    made = bridge_to()
+    rng = random.Random(4)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+        before = len(pilot.of("VISION_POSITION_ESTIMATE"))
+        stranger, flood = autopilot(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        flood.connect(("127.0.0.1", made.port))
+        lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(stranger) + beat(stranger)
+        for _ in range(2000):
+            flood.send(lies if rng.random() < 0.5 else rng.randbytes(300))
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 10)
+        flood.close()
+    assert made.bridge.telemetry.origin.lat_deg == pytest.approx(33.64)
+
+
+def test_tcp_reconnects_after_the_link_drops(monkeypatch):
+    monkeypatch.setattr("scenematch.bridges.mavlink._REOPEN_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(60.0)
+        port = server.getsockname()[1]
+        made = autopilot()
+        with MavlinkBridge(
+            parse_connection(f"tcp:127.0.0.1:{port}"), lambda _: Matched(), MavlinkOptions()
+        ) as bridge:
+            for expected in (0, 1):
+                other, _ = server.accept()
+                with other:
+                    packet = beat(made)
+                    other.sendall(packet[:5])
+                    time.sleep(0.05)
+                    other.sendall(packet[5:])
+                    wait_until(lambda: bridge.connected)
+                    assert other.recv(1) == b"\xfd"
+                    assert bridge.status.reconnections == expected
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pair of serial ports")
+def test_a_serial_port_takes_halves_and_its_loss_is_survived(monkeypatch):
+    import tty
+
+    pytest.importorskip("serial")
+    monkeypatch.setattr("scenematch.bridges.mavlink._REOPEN_S", 0.05)
+    vehicle, port = os.openpty()
+    tty.setraw(vehicle)
+    tty.setraw(port)
+    packet = beat(autopilot())
+    with MavlinkBridge(
+        parse_connection(f"serial:{os.ttyname(port)}:115200"), lambda _: Matched(), MavlinkOptions()
+    ) as bridge:
+        os.write(vehicle, packet[:7])
+        time.sleep(0.05)
+        assert not bridge.connected
+        os.write(vehicle, packet[7:])
+        wait_until(lambda: bridge.connected)
+        assert os.read(vehicle, 1) == b"\xfd"
+        os.close(vehicle)
+        wait_until(lambda: not bridge.connected)
+    os.close(port)
+
+
+def wait_until(holds, timeout_s=60.0):
+    end = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+# ---------------------------------------------------------------------------------------------- the page
+
+
+def test_the_table_of_traps_names_tests_and_code_that_are_there():
+    page = (ROOT / "docs" / "mavlink-measured.md").read_text(encoding="utf-8")
+    rows = [
+        line for line in page.split("## The traps", 1)[1].split("\n## ", 1)[0].splitlines() if "`test_" in line
+    ]
+    assert len(rows) > 12
+    adapters = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py"))
+    here = set(re.findall(r"^def (test_\w+)", adapters, re.MULTILINE))
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "scenematch" / "bridges").rglob("*.py"))
+    words = set(re.findall(r"\w+", code))
+    for row in rows:
+        _, _, where, tests, _ = row.split("|")
+        assert set(re.findall(r"`(test_\w+)`", tests)) <= here, row
+        for name in re.findall(r"`([\w.]+)`", where):
+            assert name.split(".")[-1] in words, name

@@ -1,0 +1,1017 @@
+"""The ROS nodes: messages of both ROS in and out by rosbags' types, REP-103 by hand, and nodes on stand-ins."""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import math
+import sys
+import threading
+import time
+from types import ModuleType, SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from engine.camera import Camera
+from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
+from engine.navigation.live import LiveOptions
+from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
+from scenematch.bridges.ros import OUTPUTS, RosBridge
+from scenematch.bridges.ros_in import RosTelemetry, RosTopics
+from scenematch.bridges.ros_out import FIRMWARES, RosOptions, diagnostics, pose, window_picture
+from scenematch.bridges.vehicle import NedOrigin, VehicleState
+from scenematch.cli.app import run as main
+from scenematch.cli.argument_names import ros_arguments_last
+from scenematch.files.ros.messages import (
+    NO_POSITION,
+    ODOMETRY_TYPES,
+    MessageFactory,
+    attitude_from_message,
+    body_velocity_from_message,
+    camera_from_message,
+    image_from_message,
+    position_from_message,
+    quaternion_xyzw,
+    range_from_message,
+    stamp_ns,
+)
+from tests.support.ground import body_axes
+from tests.support.odometries import odometry_message, twist_message
+from tests.support.towns import drawn_town
+
+STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
+NOW_NS = 1_700_000_000_123_456_789
+
+
+def maker_of(name):
+    return MessageFactory(STORES[name].types.__getitem__, name == "ros1")
+
+
+def wired(name, message):
+    """A message as it comes off the wire."""
+    store, kind = STORES[name], message.__msgtype__
+    if name == "ros1":
+        return store.deserialize_ros1(store.serialize_ros1(message, kind), kind)
+    return store.deserialize_cdr(store.serialize_cdr(message, kind), kind)
+
+
+@pytest.fixture(params=list(STORES))
+def ros(request):
+    return request.param
+
+
+@pytest.fixture
+def maker(ros):
+    return maker_of(ros)
+
+
+# ------------------------------------------------------------------------------------------------- pictures
+
+
+def raw_image(maker, encoding, rows, step, width):
+    message = maker.image(NOW_NS, "camera", np.zeros((len(rows), width), np.uint8))
+    message.encoding, message.step = encoding, step
+    message.data = np.frombuffer(b"".join(rows), np.uint8)
+    return message
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize(
+    ("encoding", "order"),
+    [("rgb8", "rgb"), ("bgr8", "bgr"), ("bgra8", "bgra"), ("rgba8", "rgba"), ("8UC3", "bgr"), ("8UC4", "bgra")],
+)
+def test_colours_of_every_encoding(ros, maker, encoding, order, padding):
+    rgb = np.random.default_rng(2).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    planes = {"r": rgb[:, :, 0], "g": rgb[:, :, 1], "b": rgb[:, :, 2], "a": np.full((5, 7), 255, np.uint8)}
+    pixels = np.stack([planes[c] for c in order], axis=2)
+    rows = [row.tobytes() + b"\xee" * padding for row in pixels]
+    step = len(rows[0])
+    message = wired(ros, raw_image(maker, encoding, rows, step, 7))
+    assert np.array_equal(image_from_message(message), rgb)
+    rows[-1] = rows[-1][: step - padding]  # some drivers leave the last padding out
+    assert np.array_equal(image_from_message(wired(ros, raw_image(maker, encoding, rows, step, 7))), rgb)
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+def test_grey_stays_grey(ros, maker, encoding):
+    grey = np.random.default_rng(2).integers(0, 256, (5, 7), dtype=np.uint8)
+    rows = [row.tobytes() + b"\x00" * 9 for row in grey]
+    picture = image_from_message(wired(ros, raw_image(maker, encoding, rows, 16, 7)))
+    assert np.array_equal(picture, grey)
+    picture[0, 0] ^= 255  # a copy, not the message's own bytes
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+def test_a_mosaic_becomes_the_colours_that_it_was_made_of(ros, maker, encoding):
+    rgb = np.zeros((8, 12, 3), np.uint8) + np.array([200, 120, 40], np.uint8)
+    mosaic = np.zeros(rgb.shape[:2], np.uint8)
+    for k, colour in enumerate(encoding.removeprefix("bayer_")[:4]):
+        row, column = divmod(k, 2)
+        mosaic[row::2, column::2] = rgb[row::2, column::2, "rgb".index(colour)]
+    rows = [row.tobytes() + b"\x00" * 4 for row in mosaic]
+    picture = image_from_message(wired(ros, raw_image(maker, encoding, rows, 16, 12)))
+    assert np.array_equal(picture, rgb)
+
+
+@pytest.mark.parametrize(("encoding", "big"), [("mono16", False), ("mono16", True), ("16UC1", False)])
+def test_deep_pictures_keep_their_contrast(ros, maker, encoding, big):
+    levels = np.linspace(100, 4095, 30 * 40).astype(np.uint16).reshape(30, 40)  # of a camera of 12 bits
+    rows = [row.astype(">u2" if big else "<u2").tobytes() + b"\x00" * 6 for row in levels]
+    message = raw_image(maker, encoding, rows, 86, 40)
+    message.is_bigendian = int(big)
+    picture = image_from_message(wired(ros, message)).astype(float)
+    assert picture.dtype == float
+    assert picture.max() == 255.0
+    assert np.abs(picture - levels / 4095.0 * 255.0).max() < 2.0
+
+
+@pytest.mark.parametrize(
+    "kind", [bytes, bytearray, lambda b: array.array("B", b), lambda b: np.frombuffer(b, np.uint8)]
+)
+def test_bytes_as_rospy_and_rclpy_have_them(maker, kind):
+    message = maker.image(NOW_NS, "", np.zeros((2, 3, 3), np.uint8))
+    message.data = kind(bytes(range(18)))
+    assert image_from_message(message).tobytes() == bytes(range(18))
+
+
+@pytest.mark.parametrize(
+    ("changes", "stated"),
+    [
+        ({"encoding": "32FC1"}, "got '32FC1'"),
+        ({"encoding": "bayer_rggb8", "width": 1, "height": 1}, "2 x 2 pixels of a Bayer mosaic"),
+        ({"encoding": "mono16", "width": 10}, "10 x 4 mono16"),
+        ({"step": 8}, "rows of 8 bytes"),
+        ({"height": 5}, "got 36 bytes"),
+        ({"width": 0}, "0 x 4"),
+        ({"height": 2**31, "step": 2**31}, "got 36 bytes"),
+    ],
+)
+def test_pictures_that_are_none_are_named(maker, changes, stated):
+    message = maker.image(NOW_NS, "", np.zeros((4, 3, 3), np.uint8))
+    for name, value in changes.items():
+        setattr(message, name, value)
+    with pytest.raises(TelemetryError, match=stated):
+        image_from_message(message)
+
+
+@pytest.mark.parametrize("shape", [(6, 9), (6, 9, 3)])
+def test_pictures_go_out_as_they_come_in(ros, maker, shape):
+    picture = np.random.default_rng(4).integers(0, 256, shape, dtype=np.uint8)
+    message = wired(ros, maker.image(NOW_NS, "map", picture[:, ::-1]))
+    assert np.array_equal(image_from_message(message), picture[:, ::-1])
+    assert stamp_ns(message) == NOW_NS
+    assert message.header.frame_id == "map"
+
+
+# --------------------------------------------------------------------------------------------- calibration
+
+
+def test_a_calibration_comes_back(ros, maker):
+    camera = Camera(640, 480, np.array([[500.5, 0, 320.25], [0, 501, 239.5], [0, 0, 1]]), "plumb_bob",
+                    np.array([0.1, -0.2, 1e-3, 2e-3, 0.05]))  # fmt: skip
+    back = camera_from_message(wired(ros, maker.camera_info(NOW_NS, "camera", camera)))
+    assert (back.width_px, back.height_px, back.distortion_model) == (640, 480, "plumb_bob")
+    assert np.array_equal(back.matrix, camera.matrix)
+    assert np.array_equal(back.distortion, camera.distortion)
+
+
+def test_an_ideal_camera_may_state_no_distortion(ros, maker):
+    message = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
+    setattr(message, "D" if ros == "ros1" else "d", np.zeros(0))
+    message.distortion_model = ""
+    assert not camera_from_message(wired(ros, message)).distorts
+
+
+def test_calibrations_that_are_none_are_named(ros, maker):
+    blank = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
+    setattr(blank, "K" if ros == "ros1" else "k", np.zeros(9))
+    with pytest.raises(CalibrationError, match="camera_info"):
+        camera_from_message(blank)
+    binned = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
+    binned.binning_x = 2
+    with pytest.raises(CalibrationError, match="binning"):
+        camera_from_message(binned)
+
+
+# ------------------------------------------------------------------------------------------ REP-103, by hand
+
+
+def random_angles(count=200):
+    rng = np.random.default_rng(7)
+    return [(rng.uniform(-180, 180), rng.uniform(-89, 89), rng.uniform(0, 360)) for _ in range(count)]
+
+
+def test_quaternions_turn_forward_left_up_to_east_north_up():
+    for angles in [*random_angles(), (0, 0, 0), (0, 0, 90), (0, 0, 180), (180, 0, 270), (90, 0, 45)]:
+        turn = Rotation.from_quat(quaternion_xyzw(*angles)).as_matrix()
+        forward, right, down = body_axes(*angles)
+        assert np.allclose(turn, np.stack([forward, -right, -down], axis=1), atol=1e-12)
+
+
+def test_facing_east_is_no_turn_and_north_a_quarter():
+    assert quaternion_xyzw(0, 0, 90) == pytest.approx((0, 0, 0, 1))
+    half = math.sqrt(0.5)
+    assert quaternion_xyzw(0, 0, 0) == pytest.approx((0, 0, half, half))
+
+
+def test_attitudes_come_back(ros, maker):
+    for roll, pitch, heading in random_angles(50):
+        back = attitude_from_message(wired(ros, maker.imu(NOW_NS, "base_link", roll, pitch, heading)))
+        assert back[:2] == pytest.approx((roll, pitch), abs=1e-6)
+        assert math.remainder(back[2] - heading, 360.0) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_imu_without_orientation_says_nothing(maker):
+    message = maker.imu(NOW_NS, "", 1, 2, 3)
+    message.orientation_covariance = np.array([-1.0, *(0.0,) * 8])
+    assert attitude_from_message(message) is None
+    for values in ((0, 0, 0, 0), (0, 0, math.nan, 1), (0, 0, 3, 1)):
+        message = maker.imu(NOW_NS, "", 1, 2, 3)
+        message.orientation = maker.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
+        assert attitude_from_message(message) is None
+
+
+def a_range(maker, range_m):
+    return maker.make("sensor_msgs/msg/Range", header=maker.header(NOW_NS, ""), radiation_type=1,
+                      field_of_view=0.1, min_range=0.5, max_range=50.0, range=range_m)  # fmt: skip
+
+
+@pytest.mark.parametrize(("range_m", "stated"), [(12.0, 12.0), (0.1, None), (60.0, None), (math.inf, None),
+                                               (math.nan, None), (-math.inf, None)])  # fmt: skip
+def test_ranges_beyond_reach_are_unknown(maker, range_m, stated):
+    assert range_from_message(a_range(maker, range_m)) == stated
+
+
+def test_a_range_of_any_sensor_says_nothing(maker):
+    """MAVROS' rangefinder states 0 to 1000 m of every sensor, and one of 50 m reports 50 m from 150."""
+    message = a_range(maker, 50.0)
+    message.min_range, message.max_range = 0.0, 1000.0
+    assert range_from_message(message) is None
+
+
+def test_positions_carry_the_worse_axis(ros, maker):
+    turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    covariance = turn @ np.diag([4.0, 25.0, 9.0]) @ turn.T
+    message = wired(ros, maker.position(NOW_NS, "", 33.5, -72.25, covariance))
+    assert position_from_message(message) == pytest.approx((33.5, -72.25, 5.0))
+    assert math.isnan(message.altitude)
+    message.position_covariance_type = 0
+    assert position_from_message(message) == (33.5, -72.25, None)
+    message.status.status = NO_POSITION
+    assert position_from_message(message) is None
+
+
+# ------------------------------------------------------------------------------------------------ telemetry
+
+
+def test_telemetry_is_that_of_the_capture(maker):
+    heard, step_ns = RosTelemetry(), 100_000_000
+    for k in range(6):
+        time_ns = NOW_NS + k * step_ns
+        heard.imu(maker.imu(time_ns, "", 2.0 * k, -k, 350.0 + 5.0 * k))
+        heard.height(100.0 + k, time_ns)
+        heard.velocity(maker.velocity(time_ns, "", k, -2.0 * k))
+    now = heard.vehicle(NOW_NS + 250_000_000)
+    assert (now.roll_deg, now.pitch_deg) == pytest.approx((5.0, -2.5))
+    assert now.heading_deg == pytest.approx(2.5)
+    assert (now.height_agl_m, now.down_m) == pytest.approx((102.5, -102.5))
+    assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx((2.5, -5.0))
+    heard.compass(20.0, NOW_NS + 250_000_000)
+    assert heard.vehicle(NOW_NS + 250_000_000).heading_deg == pytest.approx(20.0)
+    assert heard.vehicle(NOW_NS + 3_000_000_000) == VehicleState()
+
+
+def test_the_beam_leans_with_the_body(maker):
+    heard = RosTelemetry()
+    heard.imu(maker.imu(NOW_NS, "", 20.0, 30.0, 10.0))
+    heard.height(33.0, NOW_NS)
+    heard.range(a_range(maker, 40.0))
+    _, _, down = body_axes(20.0, 30.0, 10.0)
+    now = heard.vehicle(NOW_NS)
+    assert now.height_agl_m == pytest.approx(-40.0 * down[2], abs=1e-5)
+    assert now.down_m == -33.0
+
+
+def test_a_time_that_goes_back_begins_again():
+    heard = RosTelemetry()
+    heard.height(100.0, NOW_NS)
+    heard.height(50.0, NOW_NS - 500_000_000)  # late, and of no use
+    assert heard.vehicle(NOW_NS).height_agl_m == 100.0
+    heard.height(70.0, NOW_NS - 60_000_000_000)
+    assert heard.vehicle(NOW_NS - 60_000_000_000).height_agl_m == 70.0
+    assert heard.vehicle(NOW_NS).height_agl_m is None
+
+
+@pytest.mark.parametrize("child", ["base_link", "", "odom"])
+def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, child):
+    """Wherever the odometry has its own north, and along whichever of the two frames its twist is."""
+    rng = np.random.default_rng(5)
+    for roll_deg, pitch_deg, heading_deg in random_angles(20):
+        enu_mps, yaw_deg = rng.normal(0.0, 8.0, 3), rng.uniform(-180.0, 180.0)
+        angles = (roll_deg, pitch_deg, heading_deg)
+        message = wired(ros, odometry_message(maker, NOW_NS, angles, enu_mps, yaw_deg=yaw_deg, child=child))
+        heard = RosTelemetry()
+        heard.odometry(message, 0)
+        assert heard.vehicle(NOW_NS).east_velocity_mps is None  # towards nobody knows where
+        heard.imu(maker.imu(NOW_NS, "", *angles))
+        now = heard.vehicle(NOW_NS)
+        assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
+        assert now.velocity_sigma_mps is None  # zeros state nothing
+
+
+@pytest.mark.parametrize(
+    ("variances", "sigma_mps"),
+    [
+        ((0.04, 0.09, 0.01), math.hypot(0.3, math.radians(1.0) * 10.0)),  # the heading is off by a degree
+        ((1e-12, 1e-12, 1e-12), math.radians(1.0) * 10.0),
+        ((0.0, 0.0, 0.0), 0.0),
+        ((-1.0, 9.0, 9.0), 0.0),  # not stated, by its first element
+        ((math.nan, 0.04, 0.04), 0.0),
+        ((0.04, 30.0, 0.04), None),  # lost
+    ],
+)
+def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, sigma_mps):
+    message = odometry_message(maker, NOW_NS, (0.0, 0.0, 90.0), (10.0, 0.0, 0.0), variances=variances)
+    stated = body_velocity_from_message(wired(ros, message))
+    if sigma_mps is None:
+        assert stated is None
+    else:
+        assert stated == pytest.approx((10.0, 0.0, 0.0, sigma_mps), abs=1e-9)
+        heard = RosTelemetry()
+        heard.odometry(message, 0)
+        heard.imu(maker.imu(NOW_NS, "", 0.0, 0.0, 90.0))
+        frame = heard.vehicle(NOW_NS).frame(np.zeros((4, 6), np.uint8), NOW_NS)
+        assert frame.velocity_sigma_mps == (pytest.approx(sigma_mps) if sigma_mps else None)
+
+
+def test_a_velocity_takes_the_place_of_an_odometry_that_is_silent(maker):
+    heard = RosTelemetry()
+    for after_ms in (0, 500, 1000, 1500):
+        time_ns = NOW_NS + after_ms * 1_000_000
+        heard.imu(maker.imu(time_ns, "", 0.0, 0.0, 90.0))
+        heard.velocity(maker.velocity(time_ns, "", 3.0, 4.0))
+        if after_ms <= 500:
+            heard.odometry(odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0)), 0)
+    known = [heard.vehicle(NOW_NS + after_ms * 1_000_000) for after_ms in (500, 900, 1100, 1500)]
+    velocities = [(now.east_velocity_mps, now.north_velocity_mps) for now in known]
+    assert velocities == [pytest.approx(v, abs=1e-9) for v in ((1.0, 0.0), (1.0, 0.0), (3.0, 4.0), (3.0, 4.0))]
+
+
+def test_an_accuracy_that_one_odometry_states_and_the_next_does_not_is_not_mixed(maker):
+    heard, step_ns = RosTelemetry(), 100_000_000
+    for time_ns, variances in ((NOW_NS, (0.04, 0.04, 0.04)), (NOW_NS + step_ns, None)):
+        heard.imu(maker.imu(time_ns, "", 0.0, 0.0, 90.0))
+        message = odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0), variances=variances)
+        heard.odometry(message, 0)
+    stated_mps = math.hypot(0.2, math.radians(1.0))
+    assert heard.vehicle(NOW_NS + step_ns // 4).velocity_sigma_mps == pytest.approx(stated_mps)
+    assert heard.vehicle(NOW_NS + 3 * step_ns // 4).velocity_sigma_mps is None
+
+
+def test_an_odometry_that_says_nothing(maker):
+    angles = (0.0, 0.0, 0.0)
+    for velocity in ((math.nan, 0.0, 0.0), (0.0, 1e4, 0.0)):
+        assert body_velocity_from_message(odometry_message(maker, NOW_NS, angles, velocity)) is None
+    message = odometry_message(maker, NOW_NS, angles, (1.0, 2.0, 3.0), child="odom")
+    message.pose.pose.orientation.w = 5.0  # no turn, which a twist along the pose's frame needs
+    assert body_velocity_from_message(message) is None
+    heard = RosTelemetry()
+    heard.imu(maker.imu(NOW_NS, "", *angles))
+    heard.odometry(odometry_message(maker, 0, angles, (1.0, 2.0, 3.0)), NOW_NS)  # without a stamp it is of now
+    assert heard.vehicle(NOW_NS).north_velocity_mps == pytest.approx(2.0)
+    assert heard.vehicle(NOW_NS + 600_000_000).north_velocity_mps is None
+
+
+@pytest.mark.parametrize(
+    ("variances", "sigma_mps"),
+    [(None, None), ((0.0, 0.0, 0.0), None), ((0.04, 0.09, 0.01), 0.3)],
+)
+@pytest.mark.parametrize("frame", ["base_link", "/base_link", "uav1/base_link"])
+def test_a_twist_by_itself_is_turned_as_an_odometrys(ros, maker, frame, variances, sigma_mps):
+    rng = np.random.default_rng(6)
+    for angles in random_angles(10):
+        enu_mps, heard = rng.normal(0.0, 8.0, 3), RosTelemetry()
+        message = twist_message(maker, NOW_NS, angles, enu_mps, frame=frame, variances=variances)
+        heard.odometry(wired(ros, message), 0)
+        heard.imu(maker.imu(NOW_NS, "", *angles))
+        now = heard.vehicle(NOW_NS)
+        assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
+        turned_mps = math.radians(1.0) * np.linalg.norm(enu_mps)  # the heading is off by a degree
+        stated = None if sigma_mps is None else pytest.approx(math.hypot(sigma_mps, turned_mps))
+        assert now.velocity_sigma_mps == stated
+
+
+@pytest.mark.parametrize("frame", ["", "odom", "map", "base_link_frd", "dvl_link", "base_link/"])
+def test_a_twist_along_other_axes_is_refused(maker, frame):
+    for variances in (None, (0.04, 0.04, 0.04)):
+        level, velocity = (0.0, 0.0, 0.0), (1.0, 2.0, 0.0)
+        message = twist_message(maker, NOW_NS, level, velocity, frame=frame, variances=variances)
+        with pytest.raises(TelemetryError, match=f"a velocity along base_link .*, got one along {frame!r}"):
+            body_velocity_from_message(message)
+
+
+# ---------------------------------------------------------------------------------------------------- poses
+
+
+def a_fix(site, **changes):
+    xy = np.array([site.width_px / 2 + 30.25, site.height_px / 2 - 20.5])
+    east, north = site.enu_from_pixel(xy)
+    lat, lon = site.geodetic_from_pixel(xy)
+    values = {
+        "timestamp_ns": NOW_NS, "lat_deg": float(lat), "lon_deg": float(lon), "east_m": float(east),
+        "north_m": float(north), "up_m": None, "attitude": None, "score": 0.9, "method": "ncc",
+        "covariance_m2": np.array([[0.5, 0.1, 0.02], [0.1, 0.25, 0.03], [0.02, 0.03, 4.0]]),
+        "window": Window(10, 20, 200, 100), "timings": Timings(), "map_xy_px": tuple(map(float, xy)),
+    }  # fmt: skip
+    return Fix(**(values | changes))
+
+
+VEHICLE = VehicleState(roll_deg=2.0, pitch_deg=-3.0, heading_deg=200.0, height_agl_m=120.0, down_m=-118.0)
+
+
+def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
+    fix = a_fix(sim_site)
+    message = wired(ros, pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions()))
+    assert (stamp_ns(message), message.header.frame_id) == (NOW_NS, "map")
+    at, turn = message.pose.pose.position, message.pose.pose.orientation
+    assert (at.x, at.y, at.z) == (fix.east_m, fix.north_m, 118.0)
+    assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx(quaternion_xyzw(2.0, -3.0, 200.0))
+    covariance = np.asarray(message.pose.covariance).reshape(6, 6)
+    assert np.array_equal(covariance[:3, :3], fix.covariance_m2)
+    assert np.array_equal(covariance, covariance.T)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
+    fix = a_fix(sim_site, attitude=Attitude(5.0, 6.0, 77.0), up_m=sim_site.ground_m + 80.0)
+    message = pose(
+        maker, fix, VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0), NOW_NS, sim_site, RosOptions()
+    )
+    turn = message.pose.pose.orientation
+    assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx(quaternion_xyzw(5.0, 6.0, 77.0))
+    assert message.pose.pose.position.z == pytest.approx(80.0)
+
+
+def test_a_whole_pose_has_the_covariance_of_its_attitude_about_east_north_up(maker, sim_site):
+    # Heading east: a roll is a turn about east, a pitch one about north.
+    known = {"attitude": Attitude(0.0, 0.0, 90.0), "attitude_covariance_deg2": np.diag([4.0, 9.0, 16.0])}
+    message = pose(maker, a_fix(sim_site, **known), VEHICLE, NOW_NS, sim_site, RosOptions())
+    turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
+    assert turns_deg2 == pytest.approx(np.diag([5.0, 10.0, 17.0]))  # a degree is the mount's
+    north = known | {"attitude": Attitude(0.0, 0.0, 0.0)}
+    message = pose(maker, a_fix(sim_site, **north), VEHICLE, NOW_NS, sim_site, RosOptions())
+    turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
+    assert turns_deg2 == pytest.approx(np.diag([10.0, 5.0, 17.0]))
+
+
+def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
+    message = pose(maker, a_fix(sim_site), VehicleState(), NOW_NS, sim_site, RosOptions())
+    variances = np.diag(np.asarray(message.pose.covariance).reshape(6, 6))
+    assert variances[2] >= 1e6
+    assert (variances[3:] >= math.pi**2).all()
+    turn = message.pose.pose.orientation
+    assert turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2 == pytest.approx(1.0)
+
+
+def test_the_origin_moves_the_pose(maker, sim_site):
+    fix = a_fix(sim_site)
+    options = RosOptions(origin=NedOrigin(fix.lat_deg, fix.lon_deg, 0.0))
+    at = pose(maker, fix, VEHICLE, NOW_NS, sim_site, options).pose.pose.position
+    assert (at.x, at.y) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_ardupilot_finds_the_fix_again_and_the_height_drowns_nothing(maker, sim_site):
+    fix, origin = a_fix(sim_site), NedOrigin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
+    message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions(firmware="ardupilot", origin=origin))
+    at, scale = (
+        message.pose.pose.position,
+        0.011131884502145034,
+    )  # of ArduPilot's Location, metres per 1e-7 degrees
+    lat_deg = origin.lat_deg + at.y / scale * 1e-7
+    middle = math.radians(0.5 * (lat_deg + origin.lat_deg))
+    assert lat_deg == pytest.approx(fix.lat_deg, abs=1e-9)
+    assert origin.lon_deg + at.x / scale * 1e-7 / math.cos(middle) == pytest.approx(fix.lon_deg, abs=1e-9)
+    covariance = np.asarray(message.pose.covariance).reshape(6, 6)
+    assert np.array_equal(covariance[:2, :2], fix.covariance_m2[:2, :2])
+    assert covariance[2, 2] == pytest.approx(fix.sigma_m**2)
+    assert not covariance[2, :2].any()
+
+
+def test_firmwares_are_named():
+    with pytest.raises(OptionError, match="firmware: expected one of none, ardupilot, px4"):
+        RosOptions(firmware="betaflight")
+    assert FIRMWARES[0] == RosOptions().firmware == "none"
+
+
+def test_the_window_is_shown_with_the_fix_in_it(sim_site):
+    fix = a_fix(sim_site)
+    x, y = (round(v) for v in fix.map_xy_px)
+    window = Window(x - 60, y - 40, 200, 100)
+    shown = window_picture(sim_site, window, fix)
+    assert shown.shape == (100, 200, 3)
+    red = np.argwhere((shown == (255, 0, 0)).all(axis=2))
+    assert np.abs(red.mean(axis=0) - (40, 60)).max() < 1.0
+    plain = window_picture(sim_site, window, None)
+    assert np.array_equal(plain[:, :, 0], sim_site.gray(window))
+    whole = window_picture(sim_site, Window(0, 0, sim_site.width_px, sim_site.height_px), fix)
+    assert max(whole.shape) <= 640
+    share = whole.shape[1] / sim_site.width_px
+    red = np.argwhere((whole == (255, 0, 0)).all(axis=2)).mean(axis=0)
+    assert np.abs(red - np.array([y, x]) * share).max() < 1.5
+
+
+def test_diagnostics_are_pairs_of_text(ros, maker):
+    message = wired(ros, diagnostics(maker, NOW_NS, 1, "no fix: ambiguous", {"reason": "ambiguous"}))
+    (status,) = message.status
+    assert (status.level, status.name, status.message) == (1, "scenematch: position", "no fix: ambiguous")
+    assert [(pair.key, pair.value) for pair in status.values] == [("reason", "ambiguous")]
+
+
+# ----------------------------------------------------------------------------------------------- the bridge
+
+
+class StandIn:
+    """A node that keeps what is published."""
+
+    def __init__(self, maker, wanted=True):
+        self.messages, self.wanted, self.published, self.changed = maker, wanted, [], threading.Condition()
+        self.time_ns = NOW_NS
+
+    def now_ns(self):
+        return self.time_ns
+
+    def publish(self, output, message):
+        with self.changed:
+            self.published.append((output, message))
+            self.changed.notify_all()
+
+    def has_subscribers(self, output):
+        return self.wanted
+
+    def of(self, output):
+        return [message for kind, message in list(self.published) if kind == output]
+
+    def wait_for(self, output, count):
+        with self.changed:
+            assert self.changed.wait_for(lambda: len(self.of(output)) >= count, 60.0), self.published
+
+
+class Answers:
+    """A navigator that answers as it was set up to."""
+
+    def __init__(self, make):
+        self.make, self.frames = make, []
+
+    def update(self, frame, prior=None, budget=None):
+        self.frames.append(frame)
+        return self.make(frame)
+
+
+@contextlib.contextmanager
+def bridge_of(node, site, make, **options):
+    navigator = Answers(make)
+    bridge = RosBridge(node, site, lambda start: navigator, RosOptions(), None, LiveOptions(deadline_ms=60_000))
+    try:
+        yield bridge, navigator
+    finally:
+        bridge.close()
+
+
+def an_image(maker, time_ns, shape=(4, 6)):
+    return maker.image(time_ns, "camera", np.zeros(shape, np.uint8))
+
+
+def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
+    node, captured_ns = StandIn(maker), NOW_NS - 50_000_000
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (
+        bridge,
+        seen,
+    ):
+        bridge.telemetry.imu(maker.imu(captured_ns, "", 1.0, 2.0, 3.0))
+        bridge.on_image(an_image(maker, captured_ns))
+        node.wait_for("window", 1)
+    for output, kind in OUTPUTS.items():
+        (message,) = (wired(ros, m) for m in node.of(output))  # each can be sent
+        assert message.__msgtype__ == kind
+        assert stamp_ns(message) == captured_ns
+    assert seen.frames[0].heading_deg == pytest.approx(3.0)
+    fix, (place,) = a_fix(sim_site), node.of("fix")
+    assert (place.latitude, place.longitude) == (fix.lat_deg, fix.lon_deg)
+    assert np.array_equal(np.reshape(place.position_covariance, (3, 3)), fix.covariance_m2)
+    values = {pair.key: pair.value for pair in node.of("diagnostics")[0].status[0].values}
+    assert float(values["age_ms"]) >= 50.0
+    assert values["fixes"] == "1"
+
+
+def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
+    node = StandIn(maker)
+    refusals = [NoFix(reason=reason, detail="why") for reason in Reason]
+    broken = [a_fix(sim_site, east_m=math.nan), a_fix(sim_site, covariance_m2=np.full((3, 3), np.inf))]
+    answers = iter([*refusals, *broken])
+    with bridge_of(node, sim_site, lambda frame: next(answers)) as (bridge, _):
+        for k in range(len(Reason) + 2):
+            bridge.on_image(an_image(maker, NOW_NS + k))
+            node.wait_for("diagnostics", k + 1)
+        status = bridge.status
+    assert not node.of("pose")
+    assert not node.of("fix")
+    stated = [message.status[0] for message in node.of("diagnostics")]
+    assert [status.level for status in stated] == [1] * len(stated)
+    assert status.refused == {**{reason.value: 1 for reason in Reason}, "not finite": 2}
+    assert {pair.key: pair.value for pair in stated[0].values}["reason"] == next(iter(Reason)).value
+
+
+def test_nobody_looks_at_the_window(maker, sim_site):
+    node = StandIn(maker, wanted=False)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+        bridge.on_image(an_image(maker, NOW_NS))
+        node.wait_for("diagnostics", 1)
+    assert not node.of("window")
+
+
+def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
+    node = StandIn(maker)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+        odd = an_image(maker, NOW_NS)
+        odd.encoding = "32FC1"
+        bridge.on_image(odd)
+        bridge.on_image(an_image(maker, NOW_NS + 1))
+        node.wait_for("diagnostics", 2)  # the odd one's, and the fix's, which is reported when it has been counted
+        bridge.on_image(an_image(maker, NOW_NS))  # older than the last
+        status = bridge.status
+    first = node.of("diagnostics")[0].status[0]
+    assert (first.level, "32FC1" in first.message) == (2, True)
+    assert (status.unusable, status.counts.submitted, status.fixes) == (2, 1, 1)
+
+
+def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, sim_site):
+    node = StandIn(maker)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        for k, time_ns in enumerate((0, NOW_NS + 1, NOW_NS - 60_000_000_000)):
+            node.time_ns = time_ns or NOW_NS
+            bridge.on_image(an_image(maker, time_ns))
+            node.wait_for("pose", k + 1)
+        status = bridge.status
+    assert [frame.timestamp_ns for frame in seen.frames] == [NOW_NS, NOW_NS + 1, NOW_NS - 60_000_000_000]
+    assert (status.restarts, status.counts.submitted, status.counts.answered) == (1, 3, 3)
+
+
+def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, sim_site, caplog):
+    node, level = StandIn(maker), (0.0, 0.0, 0.0)
+    topics = RosTopics(odometry="/vio/twist", odometry_type="TwistWithCovarianceStamped")
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        _, heard = bridge.handlers(topics)["/vio/twist"]
+        bridge.on_imu(maker.imu(NOW_NS, "", *level))
+        for k, frame in enumerate(("odom", "odom", "base_link")):
+            message = twist_message(maker, NOW_NS, level, (1.0, 2.0, 0.0), frame=frame, variances=(0.04,) * 3)
+            heard(wired(ros, message))
+            bridge.on_image(an_image(maker, NOW_NS - 3 + k))
+            node.wait_for("diagnostics", k + 1)
+    stated = [{pair.key: pair.value for pair in message.status[0].values} for message in node.of("diagnostics")]
+    assert [each.get("odometry", "") != "" for each in stated] == [True, True, False]
+    assert "along base_link (forward-left-up), got one along 'odom'" in stated[0]["odometry"]
+    assert [each["velocity"] for each in stated] == ["unknown", "unknown", "known"]
+    assert caplog.text.count("an odometry cannot be used: frame_id: expected") == 1
+    assert seen.frames[2].north_velocity_mps == pytest.approx(2.0)
+
+
+def a_compressed(maker, time_ns, picture):
+    _, data = cv2.imencode(".png", picture)
+    return maker.make("sensor_msgs/msg/CompressedImage", header=maker.header(time_ns, ""), format="png", data=data)
+
+
+def test_compressed_pictures_are_live_too(ros, maker, sim_site):
+    node, picture = StandIn(maker), np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        handlers = bridge.handlers(RosTopics(image="/camera/image_raw/compressed"))
+        kind, handler = handlers["/camera/image_raw/compressed"]
+        message = wired(ros, a_compressed(maker, NOW_NS, picture))
+        assert message.__msgtype__ == kind
+        handler(message)
+        node.wait_for("pose", 1)
+    assert np.array_equal(seen.frames[0].image, picture)
+
+
+def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
+    node, after_ns = StandIn(maker), NOW_NS + 40_000_000
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+        bridge.on_imu(maker.imu(NOW_NS - 60_000_000, "", 0.0, -6.0, 0.0))
+        bridge.on_image(an_image(maker, NOW_NS))
+        assert bridge.status.counts.submitted == 0
+        bridge.on_imu(maker.imu(after_ns, "", 0.0, 4.0, 0.0))
+        node.wait_for("pose", 1)
+        assert seen.frames[0].pitch_deg == pytest.approx(0.0, abs=1e-6)
+        bridge.on_image(an_image(maker, after_ns + 1))  # no attitude follows: it goes on as it is
+        node.wait_for("pose", 2)
+        bridge.on_image(an_image(maker, after_ns + 1_000_000_000))  # attitudes have ended: none is waited for
+        assert bridge.status.counts.submitted == 3
+
+
+def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
+    """A simulator at a tenth of the real speed, and one that runs away."""
+    node, answers = StandIn(maker), threading.Event()
+
+    def slowly(frame):
+        answers.wait(60.0)
+        return a_fix(sim_site)
+
+    bridge = RosBridge(
+        node, sim_site, lambda start: Answers(slowly), RosOptions(), None, LiveOptions(deadline_ms=50)
+    )
+    try:
+        bridge.on_image(an_image(maker, NOW_NS))
+        time.sleep(0.2)
+        answers.set()  # 200 ms here, none there
+        node.wait_for("pose", 1)
+        answers.clear()
+        bridge.on_image(an_image(maker, NOW_NS + 1))
+        node.time_ns = NOW_NS + 60_000_000
+        node.wait_for("diagnostics", 2)
+        answers.set()
+    finally:
+        bridge.close()
+    assert bridge.status.refused == {"late": 1}
+
+
+def test_silence_is_told(maker, sim_site, monkeypatch):
+    node = StandIn(maker)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+        bridge.check_input()
+        assert not node.of("diagnostics")
+        later = time.monotonic() + 5.0
+        monkeypatch.setattr("scenematch.bridges.ros.time.monotonic", lambda: later)
+        bridge.check_input()
+    assert "no picture for" in node.of("diagnostics")[0].status[0].message
+
+
+def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
+    node = StandIn(maker)
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+        handlers = bridge.handlers(RosTopics(compass="", velocity=""))
+        kinds = {topic: kind for topic, (kind, _) in handlers.items()}
+        handlers[RosTopics().height][1](maker.float64(42.0))
+        assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
+        instead = bridge.handlers(RosTopics(odometry="/vio/odometry"))
+        by_type = {
+            name: bridge.handlers(RosTopics(odometry="/vio", odometry_type=name)) for name in ODOMETRY_TYPES
+        }
+    assert "" not in kinds
+    assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
+    assert instead["/vio/odometry"][0] == "nav_msgs/msg/Odometry"
+    assert {name: by_type[name]["/vio"][0] for name in ODOMETRY_TYPES} == ODOMETRY_TYPES
+    assert set(ODOMETRY_TYPES.values()) <= set(STORES["ros1"].types) & set(STORES["ros2"].types)
+    assert instead[RosTopics().velocity][0] == "geometry_msgs/msg/TwistStamped"
+    assert RosTopics(image="/camera/image_raw/compressed").image_type == "sensor_msgs/msg/CompressedImage"
+    assert all(kind in STORES["ros2"].types for kind in kinds.values())
+
+
+# ---------------------------------------------------------------------------------- the nodes, on stand-ins
+
+
+@pytest.fixture
+def packages(monkeypatch):
+    """ROS' message packages, with rosbags' classes in them."""
+    made = {}
+    for name, kind in STORES["ros2"].types.items():
+        package, _, short = name.split("/")
+        if f"{package}.msg" not in made:
+            made[package], made[f"{package}.msg"] = ModuleType(package), ModuleType(f"{package}.msg")
+        setattr(made[f"{package}.msg"], short, kind)
+    for name, module in made.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    for variable in ("ROS_IP", "ROS_HOSTNAME", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.setenv(variable, "")
+        monkeypatch.delenv(variable)
+
+
+class Rclpy(ModuleType):
+    """As much of rclpy as the node uses: what is subscribed to is delivered once when it is spun."""
+
+    def __init__(self, messages):
+        super().__init__("rclpy")
+        self.messages, self.published, self.subscribed, self.turns = messages, {}, {}, 0
+
+    def init(self, args):
+        self.arguments = args
+
+    def declare_parameter(self, name, default):
+        return SimpleNamespace(value={"method": "sift"}.get(name, default))
+
+    def ok(self):
+        return self.turns < 20
+
+    def create_node(self, name):
+        return self
+
+    def create_publisher(self, kind, topic, depth):
+        sent = self.published.setdefault(topic, [])
+        return SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1, kind=kind)
+
+    def create_subscription(self, kind, topic, handler, quality):
+        self.subscribed[topic] = handler
+        return topic
+
+    def destroy_subscription(self, topic):
+        del self.subscribed[topic]
+
+    def get_clock(self):
+        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=NOW_NS))
+
+    def spin_once(self, node, timeout_sec):
+        self.turns += 1
+        for topic, handler in list(self.subscribed.items()):
+            if topic in self.messages:
+                handler(self.messages.pop(topic))
+        time.sleep(0.01)
+
+
+def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
+    maker, camera = maker_of("ros2"), Camera.from_fov(6, 4, 60.0)
+    rclpy = Rclpy({
+        RosTopics().camera_info: maker.camera_info(NOW_NS, "", camera),
+        RosTopics().image: an_image(maker, NOW_NS),
+    })  # fmt: skip
+    quality = ModuleType("rclpy.qos")
+    quality.qos_profile_sensor_data = "best effort"
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
+    monkeypatch.setitem(sys.modules, "rclpy.qos", quality)
+    from scenematch.bridges import ros2
+
+    node = ros2.Node("scenematch", ["--ros-args", "-r", "__ns:=/uav1"])
+    assert rclpy.arguments == ["--ros-args", "-r", "__ns:=/uav1"]
+    assert (node.parameter("method", "auto"), node.parameter("start", "")) == ("sift", "")
+    assert (ros2.os.environ["ROS_LOCALHOST_ONLY"], ros2.os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]) == (
+        "1",
+        "LOCALHOST",
+    )
+    stated = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
+    assert np.array_equal(camera_from_message(stated).matrix, camera.matrix)
+    assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+        node.spin(bridge.handlers(RosTopics()), bridge.check_input, None)
+    assert {topic: len(sent) for topic, sent in rclpy.published.items()} == {
+        "~/pose": 1, "~/fix": 1, "~/window": 1, "/diagnostics": 1,
+    }  # fmt: skip
+    assert isinstance(rclpy.published["~/window"][0].data, array.array)
+    assert rclpy.published["/diagnostics"][0].status[0].level == b"\x00"
+
+
+class Rospy(ModuleType):
+    """As much of rospy as the node uses: what is subscribed to is delivered at once."""
+
+    ROSException = TimeoutError
+
+    def __init__(self, messages):
+        super().__init__("rospy")
+        self.messages, self.published, self.subscribed, self.named = messages, {}, {}, None
+        self.Time = SimpleNamespace(now=lambda: SimpleNamespace(to_nsec=lambda: NOW_NS))
+
+    def init_node(self, name, argv):
+        self.named, self.arguments = name, argv
+
+    def is_shutdown(self):
+        return False
+
+    def Publisher(self, topic, kind, queue_size, tcp_nodelay):  # noqa: N802
+        sent = self.published.setdefault(topic, [])
+        return SimpleNamespace(publish=sent.append, get_num_connections=lambda: 1)
+
+    def Subscriber(self, topic, kind, handler, tcp_nodelay, **options):  # noqa: N802
+        self.subscribed[topic] = options
+        if topic in self.messages:
+            handler(self.messages[topic])
+
+    def wait_for_message(self, topic, kind, timeout_s):
+        if topic not in self.messages:
+            raise TimeoutError
+        return self.messages[topic]
+
+
+def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
+    maker = maker_of("ros1")
+    for name, kind in STORES["ros1"].types.items():
+        package, _, short = name.split("/")
+        if f"{package}.msg" in sys.modules:
+            setattr(sys.modules[f"{package}.msg"], short, kind)
+    rospy = Rospy({RosTopics().image: an_image(maker, NOW_NS)})
+    genpy, rosgraph = ModuleType("genpy"), ModuleType("rosgraph")
+    genpy.Time = lambda secs, nsecs: SimpleNamespace(secs=secs, nsecs=nsecs)
+    rosgraph.is_master_online, rosgraph.get_master_uri = (lambda: rospy.named is None), (lambda: "http://here")
+    for module in (rospy, genpy, rosgraph):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    from scenematch.bridges import ros1
+
+    node = ros1.Node("scenematch", ["/a:=/b"])
+    assert rospy.arguments == ["/a:=/b"]
+    assert ros1.os.environ["ROS_IP"] == "127.0.0.1"
+    assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
+    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
+        node.spin(bridge.handlers(RosTopics()), bridge.check_input, 1.0)
+    assert {topic: len(sent) for topic, sent in rospy.published.items()} == {
+        "~pose": 1, "~fix": 1, "~window": 1, "/diagnostics": 1,
+    }  # fmt: skip
+    assert stamp_ns(rospy.published["~pose"][0]) == NOW_NS
+    # By rospy's own buffer pictures would grow old in the socket.
+    assert rospy.subscribed[RosTopics().image] == {"queue_size": 1, "buff_size": 2**24}
+    with pytest.raises(BackendError, match="expected a ROS master at http://here"):
+        ros1.Node("again")
+
+
+def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp_path, monkeypatch):
+    """Of its field of view; nothing but the picture's topic is waited for."""
+    from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
+    from scenematch.runs.simulation import write_flight
+    from scenematch.simulator import plan_flight
+
+    class Spun(StandIn):
+        asked, picture = [], an_image(maker, NOW_NS, (30, 40, 3))
+
+        def wait_for(self, topic, msgtype, timeout_s):
+            self.asked.append((topic, msgtype))
+            return self.picture
+
+        def spin(self, handlers, every_second, seconds):
+            pass
+
+    class LoadedError(Exception):
+        """Ends the run where the camera is known."""
+
+    def matcher(site, camera, *_):
+        raise LoadedError(camera)
+
+    monkeypatch.setattr("scenematch.runs.ros_bridge.SceneMatcher", matcher)
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+    settings = RosSettings(map=tmp_path / "map.tif", hfov_deg=90.0, topics=RosTopics(image="/down"))
+    node = Spun(maker)
+    with pytest.raises(LoadedError) as ended:
+        run_ros_bridge(settings, node=node)
+    (camera,) = ended.value.args
+    assert node.asked == [("/down", "sensor_msgs/msg/Image")]
+    assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (40, 30, pytest.approx(20.0))
+    Spun.picture = None
+    with pytest.raises(BackendError, match=r"image_topic: expected a picture on /down within 30 s, got none"):
+        run_ros_bridge(settings, node=node)
+    with pytest.raises(OptionError, match="hfov_deg: expected without `camera`"):
+        RosSettings(map="m.tif", hfov_deg=90.0, camera="c.yaml")
+
+
+def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
+    from scenematch.runs.simulation import write_flight
+    from scenematch.simulator import plan_flight
+
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+    for name in ("rospy", "rclpy"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setenv("ROS_IP", "127.0.0.1")
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    for version, code, stated in (("1", 1, "rospy"), ("2", 1, "rclpy"), ("3", 2, "--ros: expected 1 or 2")):
+        capsys.readouterr()
+        assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "map.tif")]) == code
+        assert stated in capsys.readouterr().err
+    assert main(["bridge", "ros", "--map", str(tmp_path / "map.tif"), "--firmware", "x"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("typed", "moved"),
+    [
+        (["--ros", "2", "--map", "m"], ["--ros", "2", "--map", "m"]),
+        (["/a:=/b", "--map", "m", "__name:=x"], ["--map", "m", "--", "/a:=/b", "__name:=x"]),
+        (
+            ["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
+            ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"],
+        ),
+    ],
+)
+def test_arguments_of_ros_are_told_apart(typed, moved):
+    assert ros_arguments_last(typed) == moved
+
+
+def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
+    for version, given, stated in (
+        ("1", ["--ros-args", "-r", "a:=b"], "expected NAME:=VALUE for ROS 1, got --ros-args -r"),
+        ("2", ["a:=b"], "expected --ros-args -r NAME:=VALUE, got a:=b"),
+        ("1", ["nonsense"], "expected NAME:=VALUE for ROS 1, got nonsense"),
+    ):
+        assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "m.tif"), *given]) == 2
+        assert stated in capsys.readouterr().err
+
+
+def test_an_odometry_of_another_message_is_refused(capsys, tmp_path):
+    given = ["--odometry-topic", "/vio", "--odometry-type", "PoseStamped"]
+    assert main(["bridge", "ros", "--map", str(tmp_path / "m.tif"), *given]) == 2
+    stated = (
+        "--odometry-type: expected one of Odometry, TwistWithCovarianceStamped, TwistStamped, got 'PoseStamped'"
+    )
+    assert stated in capsys.readouterr().err
+
+
+def test_the_command_line_names_the_topics_of_the_code(capsys):
+    assert main(["bridge", "ros", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert all(name in text for name in ODOMETRY_TYPES)
+    for name in RosTopics.__slots__:
+        assert getattr(RosTopics(), name) in text

@@ -1,0 +1,511 @@
+"""Bags of ROS 1 and ROS 2: the same pictures and numbers in every format, in and out; damage in one line."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import sys
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+from PIL import Image
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from bench.live.fuzz_bags import damaged
+from engine.camera import Camera
+from engine.errors import MissingExtraError, OptionError, TelemetryError
+from engine.values import Frame, Prior, Truth
+from scenematch.cli.app import run as main
+from scenematch.files.flight import open_flight
+from scenematch.files.logs.readers import open_truth
+from scenematch.files.ros.bag_writer import BAG_KINDS, write_bag
+from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
+from scenematch.files.ros.messages import MessageFactory
+from tests.support.odometries import odometry_message, twist_message
+from tests.support.towns import drawn_town
+
+STEP_NS = 100_000_000
+CAMERA = Camera(
+    31, 23, np.array([[40.5, 0, 15.25], [0, 41.0, 10.75], [0, 0, 1]]), "plumb_bob",
+    np.array([0.1, -0.02, 1e-3, 2e-3, 0.0]),
+)  # fmt: skip
+
+
+def a_flight(count=5, grey=False):
+    rng = np.random.default_rng(3)
+    shape = (23, 31) if grey else (23, 31, 3)
+    frames = [
+        Frame(
+            rng.integers(0, 256, shape, dtype=np.uint8),
+            timestamp_ns=1_700_000_000_123_456_789 + k * STEP_NS,
+            height_agl_m=120.0 + k,
+            heading_deg=(357.0 + 2.0 * k) % 360.0,
+            roll_deg=3.0 * k - 5.0,
+            pitch_deg=-2.0 * k,
+            east_velocity_mps=0.5 * k,
+            north_velocity_mps=-1.5,
+        )
+        for k in range(count)
+    ]
+    truth = [
+        Truth(
+            timestamp_ns=frame.timestamp_ns, lat_deg=48.2 + k * 1e-6, lon_deg=15.1 - k * 1e-6,
+            alt_amsl_m=400.0 + k, height_agl_m=121.0 + k, roll_deg=1.0, pitch_deg=-1.0, heading_deg=10.0 * k,
+        )
+        for k, frame in enumerate(frames)
+    ]  # fmt: skip
+    return frames, truth
+
+
+def a_bag(folder, kind, **options):
+    path = folder / ("flight.bag" if kind == "ros1" else kind)
+    frames, truth = a_flight(**options)
+    start = Prior(lat_deg=48.2001, lon_deg=15.1001, sigma_m=12.0)
+    write_bag(path, ((f, start if k == 0 else None) for k, f in enumerate(frames)), CAMERA, kind=kind, truth=truth)
+    return path, frames, truth
+
+
+@pytest.mark.parametrize(("kind", "grey"), list(zip(BAG_KINDS, (False, True, False), strict=True)))
+def test_pictures_come_back_byte_for_byte(tmp_path, kind, grey):
+    path, frames, _ = a_bag(tmp_path, kind, grey=grey)
+    source = BagFrames(path)
+    assert source.stamps_ns() == [frame.timestamp_ns for frame in frames]
+    for k in (0, 1, 4, 2, 2):  # forward, and back
+        image = frames[k].image if not grey else np.repeat(frames[k].image[:, :, None], 3, axis=2)
+        assert source.read(str(k)).tobytes() == image.tobytes()
+
+
+@pytest.mark.parametrize("kind", BAG_KINDS)
+def test_a_flight_comes_back(tmp_path, kind):
+    path, frames, truth = a_bag(tmp_path, kind)
+    flight = open_flight(path, camera=read_bag_camera(path))
+    assert len(flight) == len(frames)
+    for k, (item, frame) in enumerate(zip(flight, frames, strict=True)):
+        assert item.frame.timestamp_ns == frame.timestamp_ns
+        for name in ("height_agl_m", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps"):
+            assert getattr(item.frame, name) == pytest.approx(getattr(frame, name), abs=1e-9)
+        assert item.frame.heading_deg == pytest.approx(frame.heading_deg, abs=1e-9)
+        assert (item.prior is not None) == (k <= 1)  # a position holds for a tenth of a second
+    prior = next(iter(flight)).prior
+    assert (prior.lat_deg, prior.lon_deg) == pytest.approx((48.2001, 15.1001), abs=1e-12)
+    assert prior.sigma_m == pytest.approx(12.0)
+    for row, true in zip(open_truth(path, frames[0].timestamp_ns), truth, strict=True):
+        for name in Truth.__slots__:
+            assert getattr(row, name) == pytest.approx(getattr(true, name), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", BAG_KINDS)
+def test_the_calibration_comes_back_but_its_mount(tmp_path, kind):
+    path, _, _ = a_bag(tmp_path, kind)
+    camera = read_bag_camera(path)
+    assert (camera.width_px, camera.height_px, camera.distortion_model) == (31, 23, "plumb_bob")
+    assert np.array_equal(camera.matrix, CAMERA.matrix)
+    assert np.array_equal(camera.distortion, CAMERA.distortion)
+
+
+@pytest.mark.parametrize("kind", BAG_KINDS)
+def test_others_read_what_is_written(tmp_path, kind):
+    """By rosbags alone: the names, types and numbers that a ROS tool finds."""
+    path, frames, _ = a_bag(tmp_path, kind)
+    with AnyReader([path]) as reader:
+        assert {c.topic: c.msgtype for c in reader.connections}[IMAGE] == "sensor_msgs/msg/Image"
+        found = {}
+        for connection, time_ns, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            found.setdefault(connection.topic, []).append((time_ns, message))
+    assert [time_ns for time_ns, _ in found[IMAGE]] == [frame.timestamp_ns for frame in frames]
+    first = found[IMAGE][0][1]
+    assert (first.encoding, first.height, first.width, first.step) == ("rgb8", 23, 31, 93)
+    assert bytes(first.data) == frames[0].image.tobytes()
+    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
+    compass = [message.data for _, message in found["/mavros/global_position/compass_hdg"]]
+    assert compass == [frame.heading_deg for frame in frames]
+
+
+def test_without_a_compass_the_imu_has_the_heading(tmp_path):
+    types = get_typestore(Stores.ROS1_NOETIC)
+    maker = MessageFactory(types.types.__getitem__, True)
+    with Writer1(tmp_path / "imu.bag") as writer:
+        connection = writer.add_connection("/imu/data", "sensor_msgs/msg/Imu", typestore=types)
+        for k in range(3):
+            message = maker.imu(10**9 + k, "base_link", 5.0, -7.0, 200.0 + k)
+            writer.write(connection, 5 * 10**9, types.serialize_ros1(message, connection.msgtype))
+    series = read_bag(tmp_path / "imu.bag").series
+    assert series["heading_deg"].stamps_ns.tolist() == [10**9 + k for k in range(3)]  # the headers', not the bag's
+    assert np.mod(series["heading_deg"].values, 360.0) == pytest.approx([200.0, 201.0, 202.0])
+
+
+STORES = {True: Stores.ROS1_NOETIC, False: Stores.ROS2_HUMBLE}
+
+
+def written(path, topics):
+    """A bag with messages by topic, (time_ns, message): of ROS 1 where its name is one, else a folder of ROS 2."""
+    ros1 = path.suffix == ".bag"
+    types = get_typestore(STORES[ros1])
+    serialize = types.serialize_ros1 if ros1 else types.serialize_cdr
+    with Writer1(path) if ros1 else Writer2(path, version=9) as writer:
+        for topic, messages in topics.items():
+            name = messages[0][1].__msgtype__
+            connection = writer.add_connection(topic, name, typestore=types)
+            for time_ns, message in messages:
+                writer.write(connection, time_ns, serialize(message, name))
+    return path
+
+
+@pytest.fixture
+def maker():
+    return MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
+
+
+def test_several_topics_with_pictures_ask_for_one(tmp_path, maker):
+    pictures = [np.full((4, 6), level, np.uint8) for level in (10, 20)]
+    topics = {f"/{name}/image_raw": [(10**9, maker.image(10**9, "", picture))] for name, picture in
+              zip(("front", "down"), pictures, strict=True)}  # fmt: skip
+    path = written(tmp_path / "two.bag", topics)
+    with pytest.raises(TelemetryError, match=r"one topic.*/down/image_raw, /front/image_raw; .*`image_topic`"):
+        BagFrames(path)
+    assert (BagFrames(path, "/down/image_raw").read("0") == 20).all()
+    with pytest.raises(TelemetryError, match="pictures on /up"):
+        BagFrames(path, "/up")
+
+
+def test_compressed_pictures_and_unset_stamps(tmp_path, maker):
+    image = np.random.default_rng(1).integers(0, 256, (9, 7, 3), dtype=np.uint8)
+    png = io.BytesIO()
+    Image.fromarray(image).save(png, "PNG")
+    message = maker.make(
+        "sensor_msgs/msg/CompressedImage", header=maker.header(0, ""), format="png",
+        data=np.frombuffer(png.getvalue(), np.uint8),
+    )  # fmt: skip
+    source = BagFrames(written(tmp_path / "png.bag", {"/camera/image_raw/compressed": [(7 * 10**9, message)]}))
+    assert source.stamps_ns() == [7 * 10**9]
+    assert np.array_equal(source.read("0"), image)
+
+
+def test_frames_out_of_order_are_refused(tmp_path, maker):
+    image = np.zeros((4, 6), np.uint8)
+    messages = [(k, maker.image(time_ns, "", image)) for k, time_ns in enumerate((10**9, 3 * 10**9, 2 * 10**9))]
+    with pytest.raises(TelemetryError, match=r"frame 2 after 3\.0"):
+        BagFrames(written(tmp_path / "x.bag", {IMAGE: messages})).stamps_ns()
+
+
+def test_a_picture_that_is_published_again_counts_once(tmp_path, maker):
+    stamps_ns = [10**9, 10**9, 2 * 10**9, 2 * 10**9, 3 * 10**9]
+    pictures = [np.full((4, 6), level, np.uint8) for level in (10, 10, 20, 20, 30)]
+    messages = [(k, maker.image(t, "", p)) for k, (t, p) in enumerate(zip(stamps_ns, pictures, strict=True))]
+    source = BagFrames(written(tmp_path / "x.bag", {IMAGE: messages}))
+    assert source.names == ["0", "2", "4"]
+    assert source.stamps_ns() == [10**9, 2 * 10**9, 3 * 10**9]
+    assert [source.read(name)[0, 0, 0] for name in source.names] == [10, 20, 30]
+
+
+def test_the_heading_with_a_stamp_precedes_the_one_without(tmp_path, maker):
+    imu = [(k, maker.imu(k, "base_link", 0.0, 0.0, 100.0)) for k in (10**9, 2 * 10**9)]
+    compass = [(k, maker.float64(110.0)) for k in (10**9, 2 * 10**9)]
+    one = {"/mavros/imu/data": imu, "/mavros/global_position/compass_hdg": compass}
+    assert read_bag(written(tmp_path / "one.bag", one)).series["heading_deg"].values == pytest.approx(100.0)
+    raw = {"/imu/data": imu, "/mavros/global_position/compass_hdg": compass}
+    assert read_bag(written(tmp_path / "raw.bag", raw)).series["heading_deg"].values == pytest.approx(110.0)
+
+
+def a_bag_with_odometry(path, maker, *, variances=None, by=None, **left_out):
+    """A turn of 60 degrees a second by attitude and odometry, and by a velocity of another source."""
+    moments = [(k * STEP_NS, (10.0, -5.0, 20.0 + 6.0 * k), (0.5 * k, -3.0, 0.25)) for k in range(1, 12)]
+    by = by or partial(odometry_message, yaw_deg=77.0)
+    topics = {
+        IMAGE: [(t, maker.image(t, "", np.zeros((4, 6), np.uint8))) for t, _, _ in moments[::5]],
+        "/imu/data": [(t, maker.imu(t, "", *angles)) for t, angles, _ in moments],
+        "/uav/velocity_local": [(t, maker.velocity(t, "map", 50.0, 50.0)) for t, _, _ in moments],
+        "/vio/odometry": [
+            (t + 7, by(maker, t, angles, enu_mps, variances=variances)) for t, angles, enu_mps in moments
+        ],
+    }
+    return written(path, {name: each for name, each in topics.items() if name not in left_out.get("without", ())})
+
+
+def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, maker):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker, variances=(0.16, 0.04, 0.04))
+    for item in open_flight(path):
+        assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
+    flight = open_flight(path, odometry_topic="/vio/odometry")
+    for k, item in zip((1, 6, 11), flight, strict=True):
+        velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
+        assert velocity == pytest.approx((0.5 * k, -3.0), abs=1e-9)
+        speed_mps = np.linalg.norm((0.5 * k, -3.0, 0.25))
+        assert item.frame.velocity_sigma_mps == pytest.approx(np.hypot(0.4, np.radians(1.0) * speed_mps))
+    unstated = a_bag_with_odometry(tmp_path / "zeros.bag", maker)
+    frames = [item.frame for item in open_flight(unstated, odometry_topic="/vio/odometry")]
+    assert [frame.velocity_sigma_mps for frame in frames] == [None] * 3
+    assert frames[1].east_velocity_mps == pytest.approx(3.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("variances", [(0.16, 0.04, 0.04), None])
+@pytest.mark.parametrize("ros1", [True, False])
+def test_a_twist_by_itself_is_an_odometry_too(tmp_path, ros1, variances):
+    maker = MessageFactory(get_typestore(STORES[ros1]).types.__getitem__, ros1)
+    path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker, variances=variances, by=twist_message)
+    flight = open_flight(path, odometry_topic="/vio/odometry")
+    for k, item in zip((1, 6, 11), flight, strict=True):
+        velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
+        assert velocity == pytest.approx((0.5 * k, -3.0), abs=1e-9)
+        turned_mps = np.radians(1.0) * np.linalg.norm((0.5 * k, -3.0, 0.25))
+        stated = None if variances is None else pytest.approx(np.hypot(0.4, turned_mps))
+        assert item.frame.velocity_sigma_mps == stated
+
+
+def test_a_twist_along_other_axes_is_refused(tmp_path, maker):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker, by=partial(twist_message, frame="odom"))
+    message = r"x\.bag: /vio/odometry: frame_id: expected a velocity along base_link .*, got one along 'odom'"
+    with pytest.raises(TelemetryError, match=message):
+        read_bag(path, odometry_topic="/vio/odometry")
+    with pytest.raises(TelemetryError, match=r"/uav/velocity_local: .*, got one along 'map'"):
+        read_bag(path, odometry_topic="/uav/velocity_local")
+
+
+def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker)
+    for other in ("/odom", "/imu/data"):
+        message = f"nav_msgs/msg/Odometry or .* on {other}, got /uav/velocity_local, /vio/odometry"
+        with pytest.raises(TelemetryError, match=message):
+            read_bag(path, odometry_topic=other)
+    path = a_bag_with_odometry(tmp_path / "blind.bag", maker, without=("/imu/data",))
+    with pytest.raises(TelemetryError, match="expected a heading at the times of /vio/odometry, got none"):
+        read_bag(path, odometry_topic="/vio/odometry")
+    path = a_bag_with_odometry(tmp_path / "lost.bag", maker, variances=(100.0,) * 3)
+    with pytest.raises(TelemetryError, match="expected a velocity that can be used on /vio/odometry, got none"):
+        read_bag(path, odometry_topic="/vio/odometry")
+
+
+def test_an_odometrys_topic_needs_a_bag(tmp_path, capsys):
+    for command in ("track", "check", "compare"):
+        given = ["--map", "m.tif", "--frames", "f", "--telemetry", "t.csv", "--odometry-topic", "/vio"]
+        out = [] if command == "check" else ["--out", str(tmp_path / "out")]
+        assert main([command, *given, *out]) == 2
+        assert "--odometry-topic: expected a bag as telemetry, got t.csv" in capsys.readouterr().err
+
+
+def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
+    path = written(tmp_path / "x.bag", {IMAGE: [(10**9, maker.image(10**9, "", np.zeros((4, 6), np.uint8)))]})
+    with pytest.raises(TelemetryError, match="attitude, height, velocity or position"):
+        read_bag(path)
+    with pytest.raises(TelemetryError, match="CameraInfo"):
+        read_bag_camera(path)
+
+
+def test_what_counts_as_a_bag(tmp_path):
+    path, _, _ = a_bag(tmp_path, "ros2-mcap")
+    assert is_bag(path)
+    assert is_bag(next(path.glob("*.mcap")))
+    assert is_bag("FLIGHT.BAG")
+    assert not is_bag(tmp_path)
+    assert not is_bag("flight.mp4")
+    assert len(BagFrames(next(path.glob("*.mcap"))).names) == 5
+
+
+@pytest.mark.parametrize(("name", "kind"), [("b.mcap", "ros2-mcap"), ("b.db3", "ros2-sqlite3")])
+def test_a_bag_of_ros_2_is_one_file_where_its_name_says_so(tmp_path, name, kind):
+    frames, truth = a_flight(3)
+    path = tmp_path / "deep" / name
+    for replace in (False, True):
+        assert write_bag(path, ((f, None) for f in frames), CAMERA, kind=kind, truth=truth, replace=replace) == 3
+        assert path.is_file()
+        assert list(path.parent.iterdir()) == [path]
+    read = BagFrames(path)
+    for frame, number in zip(frames, read.names, strict=True):
+        np.testing.assert_array_equal(read.read(number), frame.image)
+    other = "ros2-mcap" if kind == "ros2-sqlite3" else "ros2-sqlite3"
+    with pytest.raises(OptionError, match=r"path: expected a name that ends in .* or is a folder's for ros2"):
+        write_bag(tmp_path / name, [], CAMERA, kind=other)
+
+
+def test_misuse_is_named(tmp_path):
+    frames, _ = a_flight(1)
+    with pytest.raises(OptionError, match="kind: expected one of ros1"):
+        write_bag(tmp_path / "x", [], CAMERA, kind="ros3")
+    with pytest.raises(OptionError, match=r"ends in \.bag for ros1"):
+        write_bag(tmp_path / "x", [], CAMERA, kind="ros1")
+    with pytest.raises(TelemetryError, match="frame 0: expected a stamp"):
+        write_bag(tmp_path / "x.bag", [(Frame(frames[0].image), None)], CAMERA, kind="ros1")
+    (tmp_path / "there.bag").write_bytes(b"")
+    with pytest.raises(OptionError, match=r"there\.bag exists"):
+        write_bag(tmp_path / "there.bag", [], CAMERA, kind="ros1")
+    with pytest.raises(TelemetryError, match=r"/there\.bag/x: cannot be written"):
+        write_bag(tmp_path / "there.bag" / "x", [], CAMERA, kind="ros2-mcap")
+    with pytest.raises(TelemetryError, match="no such bag"):
+        BagFrames(tmp_path / "missing.bag")
+
+
+# -------------------------------------------------------------------------------------------------- damage
+
+
+@pytest.mark.parametrize(
+    "kind", [BAG_KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in BAG_KINDS[1:])]
+)
+def test_every_truncation_is_one_line_or_a_shorter_flight(tmp_path, kind):
+    path, frames, _ = a_bag(tmp_path, kind, count=2)
+    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix in (".db3", ".mcap"))
+    data = file.read_bytes()
+    for size in [0, 1, 13, *range(500, len(data), max(len(data) // 12, 1))]:
+        file.write_bytes(data[:size])
+        check_readable_or_one_line(path, frames)
+
+
+@pytest.mark.parametrize(
+    "kind", [BAG_KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in BAG_KINDS[1:])]
+)
+def test_mutated_bags_are_one_line_or_a_flight(tmp_path, kind):
+    path, frames, _ = a_bag(tmp_path, kind, count=2)
+    rng = np.random.default_rng(5)
+    for k in range(25):
+        copy = tmp_path / f"copy{k}{path.suffix}"
+        damaged(path, copy, rng)
+        check_readable_or_one_line(copy, frames)
+        shutil.rmtree(copy) if copy.is_dir() else copy.unlink()
+
+
+def check_readable_or_one_line(path, frames):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # the reader's own, where a file breaks while it opens
+        said, count = str(path), 0
+        try:
+            for item in open_flight(path):
+                assert item.frame.image.dtype == np.uint8
+                count += 1
+        except TelemetryError as error:
+            said = str(error)
+    assert "\n" not in said
+    assert str(path) in said
+    assert count <= 2 * len(frames)
+
+
+# ---------------------------------------------------------------------------------------------- command line
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("bare_runs")
+def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
+    from scenematch.runs.simulation import write_flight
+    from scenematch.simulator import plan_flight
+
+    folder, bag = tmp_path / "flight", tmp_path / "flight.bag"
+    folder.mkdir()
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+    assert main(["bag", str(folder), "--out", str(bag)]) == 0
+    assert main(["bag", str(folder), "--out", str(bag)]) == 2
+    assert main(["bag", str(folder), "--out", str(bag), "--force"]) == 0
+    assert main(["bag", str(folder), "--out", str(tmp_path / "x"), "--format", "ros1"]) == 2
+    assert main(["bag", str(folder), "--out", str(tmp_path / "b.mcap")]) == 0
+    assert (tmp_path / "b.mcap").is_file()
+    world = ["--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif")]
+    inputs = {
+        "folder": ["--frames", str(folder / "frames"), "--telemetry", str(folder / "telemetry.csv"),
+                   "--camera", str(folder / "camera.yaml")],
+        "bag": ["--frames", str(bag), "--truth", str(bag)],
+    }  # fmt: skip
+    tracks = []
+    for name, options in inputs.items():
+        assert main(["track", *world, *options, "--out", str(tmp_path / name)]) == 0
+        lines = (tmp_path / name / "track.csv").read_text(encoding="utf-8").splitlines()
+        assert len(lines) == 4
+        tracks.append([row.split(",") for row in lines[1:]])
+    for one, other in zip(*tracks, strict=True):
+        assert (one[0], one[2]) == (other[0], other[2])
+        # Angles that went through a quaternion differ in the last bit, and places by less than is printed.
+        assert np.array(one[4:8], float) == pytest.approx(np.array(other[4:8], float), abs=0.01)
+    capsys.readouterr()
+    assert main(["track", *world, "--frames", str(folder / "frames"), "--out", str(tmp_path / "y")]) == 1
+    assert "--camera" in capsys.readouterr().err
+
+
+def files_in(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_force_replaces_a_bag_and_nothing_else(tmp_path):
+    path, _, _ = a_bag(tmp_path, "ros2-mcap")
+    (path / "notes.txt").write_text("mine", encoding="utf-8")
+    before = files_in(tmp_path)
+    with pytest.raises(OptionError, match=r"notes\.txt"):
+        write_bag(path, [], CAMERA, kind="ros2-mcap", replace=True)
+    (tmp_path / "link").symlink_to(path)
+    (path / "notes.txt").unlink()
+    with pytest.raises(OptionError, match="it is a link"):
+        write_bag(tmp_path / "link", [], CAMERA, kind="ros2-mcap", replace=True)
+    (path / "notes.txt").write_text("mine", encoding="utf-8")
+    (tmp_path / "link").unlink()
+    assert files_in(tmp_path) == before
+
+
+def unreadable():
+    """A frame, and then one that does not decode."""
+    frames, _ = a_flight(1)
+    yield frames[0], None
+    raise TelemetryError("frame 1: expected a readable picture")
+
+
+@pytest.mark.parametrize("kind", BAG_KINDS)
+def test_a_bag_stays_until_the_next_one_is_whole(tmp_path, kind, monkeypatch):
+    path, _, _ = a_bag(tmp_path, kind, count=2)
+    before = files_in(tmp_path)
+    with pytest.raises(TelemetryError, match="readable"):
+        write_bag(path, unreadable(), CAMERA, kind=kind, replace=True)
+    assert files_in(tmp_path) == before
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "rosbags", None)
+        patch.setitem(sys.modules, "rosbags.highlevel", None)
+        with pytest.raises(MissingExtraError, match=r"\[bags\]"):
+            write_bag(path, [], CAMERA, kind=kind, replace=True)
+    assert files_in(tmp_path) == before
+    frames, _ = a_flight(3)
+    assert write_bag(path, [(frame, None) for frame in frames], CAMERA, kind=kind, replace=True) == 3
+    assert len(BagFrames(path).names) == 3
+    assert list(tmp_path.iterdir()) == [path]
+    assert sorted(files_in(tmp_path)) == sorted(before)
+
+    new = tmp_path / "deep" / path.name  # where nothing was, nothing half is left
+    with pytest.raises(TelemetryError, match="readable"):
+        write_bag(new, unreadable(), CAMERA, kind=kind)
+    assert not any(new.parent.iterdir())
+
+
+def test_topics_of_the_calibration(tmp_path, maker):
+    """The camera_info beside the pictures counts, not the first."""
+    image = np.zeros((23, 31), np.uint8)
+    other = Camera.from_fov(31, 23, 30.0)
+    path = written(
+        tmp_path / "x.bag",
+        {
+            IMAGE: [(10**9, maker.image(10**9, "", image))],
+            "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", other))],
+            CAMERA_INFO: [(10**9, maker.camera_info(10**9, "", CAMERA))],
+        },
+    )
+    assert np.array_equal(read_bag_camera(path).matrix, CAMERA.matrix)
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
+def test_compressed_bags_are_read(tmp_path, compression):
+    """A bag that rosbags wrote again with compression; of ROS 2 message by message."""
+    ros1 = compression != "zstd"
+    path, frames, _ = a_bag(tmp_path, "ros1" if ros1 else "ros2-sqlite3")
+    again = tmp_path / ("again.bag" if ros1 else "again")
+    if ros1:
+        writer = Writer1(again)
+        writer.set_compression(Writer1.CompressionFormat[compression.upper()])
+    else:
+        writer = Writer2(again, version=9)
+        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with AnyReader([path]) as reader, writer:
+        made = {
+            c.id: writer.add_connection(c.topic, c.msgtype, typestore=reader.typestore) for c in reader.connections
+        }
+        for connection, time_ns, data in reader.messages():
+            writer.write(made[connection.id], time_ns, data)
+    source = BagFrames(again)
+    assert [source.read(name).tobytes() for name in source.names] == [frame.image.tobytes() for frame in frames]

@@ -1,0 +1,142 @@
+"""Telemetry with the columns of other programs: named in the settings, or guessed and asked."""
+
+import json
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from engine.errors import OptionError, TelemetryError
+from scenematch.files.column_names import likely
+from scenematch.files.settings import changed, nested, options_from_mapping
+from scenematch.files.telemetry import open_telemetry
+from scenematch.runs.inputs import FlightFiles, open_inputs
+from scenematch.runs.settings import TrackSettings, load_settings
+
+OTHERS = "time_us,Image Name,altitude_agl [m],Yaw,Latitude,Longitude,battery\n0,0.png,120.5,-90,48.5,16.5,99\n"
+MORE = "500000,1.png,121.5,-91,48.5,16.5,98\n"
+NAMES = {
+    "timestamp_us": "time_us", "frame": "Image Name", "height_agl_m": "altitude_agl [m]", "heading_deg": "Yaw",
+    "lat_deg": "Latitude", "lon_deg": "Longitude",
+}  # fmt: skip
+
+
+@pytest.fixture
+def save(tmp_path):
+    def write(text):
+        path = tmp_path / "telemetry.csv"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_named_columns_are_read(save):
+    found = open_telemetry(save(OTHERS + MORE), names=NAMES)
+    row = found.rows[1]
+    assert (row.timestamp_ns, row.frame, row.height_agl_m, row.heading_deg) == (500_000_000, "1.png", 121.5, 269.0)
+    assert (row.lat_deg, row.lon_deg) == (48.5, 16.5)
+    assert found.remarks == []
+
+
+def test_a_missing_required_column_is_asked_for(save):
+    with pytest.raises(TelemetryError) as caught:
+        open_telemetry(save(OTHERS))
+    assert (
+        "line 1: lacks the column timestamp_ns: is it 'time_us'? "
+        'Say so in the settings, [telemetry_columns] timestamp_us = "time_us"; its columns are'
+    ) in str(caught.value)
+    with pytest.raises(TelemetryError, match="lacks the column frame: is it 'Image Name'"):
+        open_telemetry(save(OTHERS), names={"timestamp_us": "time_us"})
+    with pytest.raises(TelemetryError, match="lacks the column timestamp_ns; its columns are 'speed,frame'"):
+        open_telemetry(save("speed,frame\n1,a.png\n"))
+
+
+def test_other_columns_that_look_like_ours_are_asked_for_in_one_line(save):
+    found = open_telemetry(save(OTHERS), names={"timestamp_us": "time_us", "frame": "Image Name"})
+    assert found.rows[0].heading_deg is None
+    assert found.remarks == [
+        "telemetry.csv: columns that are not read; are they these? Say so in the settings, [telemetry_columns]: "
+        'height_agl_m = "altitude_agl [m]", heading_deg = "Yaw", lat_deg = "Latitude", lon_deg = "Longitude"'
+    ]
+
+
+def test_a_name_that_the_file_lacks_is_refused(save):
+    with pytest.raises(TelemetryError, match="line 1: lacks the column alt, which is to be height_agl_m"):
+        open_telemetry(save(OTHERS), names=NAMES | {"height_agl_m": "alt"})
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours"),
+    [
+        ("time", "timestamp_ns"), ("Timestamp (ms)", "timestamp_ms"), ("time_s", "timestamp_s"),
+        ("utc", "timestamp_utc"), ("datetime_utc", "timestamp_utc"), ("timestamp_ns", "timestamp_ns"),
+        ("filename", "frame"), ("rel_alt", "height_agl_m"), ("Altitude (m)", "alt_amsl_m"), ("altitude_ft", None),
+        ("yaw_deg", "heading_deg"), ("roll_rad", None), ("vel_n", "north_velocity_mps"), ("lat", "lat_deg"),
+        ("battery", None), ("", None), ("frame", None),
+    ],
+)  # fmt: skip
+def test_what_a_column_is_likely_to_be(theirs, ours):
+    """In feet or radians it is none: a name alone would not convert it."""
+    assert likely(theirs) == ours
+
+
+def test_the_settings_name_them(tmp_path):
+    path = tmp_path / "settings.toml"
+    lines = "".join(f'{ours} = "{theirs}"\n' for ours, theirs in NAMES.items())
+    path.write_text(f'method = "sift"\n[telemetry_columns]\n{lines}', encoding="utf-8")
+    settings = load_settings(path)
+    assert settings.telemetry_columns == NAMES
+    recorded = json.loads(json.dumps(changed(settings)))  # as the record of a run keeps them
+    assert options_from_mapping(TrackSettings, nested(recorded)) == settings
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('altitude = "alt"', "telemetry_columns: expected one of timestamp_ns, "),
+        ('frame = " "', "telemetry_columns.frame: expected the name of a column, got a blank one"),
+        ("frame = 3", "telemetry_columns.frame: expected a quoted string, got 3"),
+    ],
+)
+def test_settings_that_name_nothing_are_refused(tmp_path, line, words):
+    path = tmp_path / "settings.toml"
+    path.write_text(f"[telemetry_columns]\n{line}\n", encoding="utf-8")
+    with pytest.raises(OptionError) as caught:
+        load_settings(path)
+    assert words in str(caught.value)
+
+
+def database_export(path):
+    """A table as a database's shell exports it: semicolons, and its own dates and names."""
+    with closing(sqlite3.connect(":memory:")) as database:
+        rows = database.execute(
+            "SELECT strftime('%Y-%m-%d %H:%M:%f', 1777636800 + k / 2.0, 'unixepoch'), k || '.png', 120.5 + k "
+            "FROM (SELECT 0 AS k UNION SELECT 1)"
+        ).fetchall()
+    path.write_text("time;image;agl\n" + "".join(";".join(map(str, row)) + "\n" for row in rows), encoding="utf-8")
+    return path
+
+
+def test_a_run_reads_them_by_its_settings(tmp_path):
+    (tmp_path / "frames").mkdir()
+    for k in range(2):
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.png")
+    table = database_export(tmp_path / "export.csv")
+    files = FlightFiles(map="none.tif", frames=tmp_path / "frames", telemetry=table, hfov_deg=60.0)
+    flight = files.open_flight({"timestamp_utc": "time", "frame": "image", "height_agl_m": "agl"})
+    assert [row.timestamp_ns for row in flight.rows] == [1_777_636_800_000_000_000, 1_777_636_800_500_000_000]
+    assert [row.height_agl_m for row in flight.rows] == [120.5, 121.5]
+    assert flight.remarks == []
+    with pytest.raises(OptionError, match="telemetry_columns: expected a table as telemetry, got None"):
+        FlightFiles(map="none.tif", frames=tmp_path / "frames", hfov_deg=60.0).open_flight({"frame": "image"})
+
+
+def test_runs_of_one_flight_name_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(FlightFiles, "open_map", lambda self, progress: None)
+    files = FlightFiles(map="none.tif", frames=tmp_path, hfov_deg=60.0)
+    runs = [TrackSettings(), TrackSettings(telemetry_columns={"frame": "image"})]
+    with pytest.raises(OptionError, match="telemetry_columns: expected the same of all runs"):
+        open_inputs(files, runs)

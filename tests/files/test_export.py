@@ -1,0 +1,272 @@
+"""Tracks in other programs' formats, read back by other parsers: places, times, gaps, checksums, rounding."""
+
+import io
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from functools import reduce
+from operator import xor
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from engine.errors import TelemetryError
+from engine.geo import enu_from_body
+from scenematch.cli.app import run
+from scenematch.files import export
+from scenematch.files.notes import FrameNote
+from scenematch.files.track import write_track
+
+T0 = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
+GPX = "{http://www.topografix.com/GPX/1/1}"
+KML = "{http://www.opengis.net/kml/2.2}"
+
+
+def fix(k, lat_deg=32.5, lon_deg=35.25, *, start_ns=T0, up_m=None, **more):
+    return export.PoseRow(
+        timestamp_ns=None if start_ns is None else start_ns + k * 250_000_000,
+        frame=f"<{k}>&.png",
+        status="fix",
+        lat_deg=lat_deg + k * 1e-5,
+        lon_deg=lon_deg - k * 2e-5,
+        east_m=1.5 * k,
+        north_m=-0.5 * k,
+        up_m=up_m,
+        sigma_east_m=0.25,
+        sigma_north_m=0.5,
+        covariance_en_m2=0.01,
+        score=0.8,
+        method="ncc",
+        **more,
+    )
+
+
+def refusal(k):
+    return export.PoseRow(timestamp_ns=T0 + k * 250_000_000, frame=f"{k}.png", status="no_fix", reason="low_score")
+
+
+ROWS = [fix(0), fix(1), refusal(2), fix(3), refusal(4), refusal(5), fix(6), fix(7), fix(8)]
+
+
+def test_a_refusal_ends_a_segment():
+    assert [[row.frame for row in run] for run in export.segments(ROWS)] == [
+        ["<0>&.png", "<1>&.png"],
+        ["<3>&.png"],
+        ["<6>&.png", "<7>&.png", "<8>&.png"],
+    ]
+    assert export.segments([refusal(0)]) == []
+
+
+def test_the_180th_meridian_ends_a_segment_and_longitudes_stay_on_their_circle():
+    rows = [fix(0, lon_deg=179.9999), fix(0, lon_deg=180.0001), fix(0, lon_deg=-179.9998)]
+    assert [len(run) for run in export.segments(rows)] == [1, 2]
+    points = json.loads(export.to_geojson(rows))["features"][1:]
+    assert [p["geometry"]["coordinates"][0] for p in points] == pytest.approx([179.9999, -179.9999, -179.9998])
+
+
+def test_gpx_has_a_segment_a_run_and_its_elements_in_the_order_of_the_schema():
+    rows = [fix(0, alt_amsl_m=12.5), fix(1, up_m=150.0), refusal(2), fix(3, alt_amsl_m=-1.0)]
+    root = ElementTree.fromstring(export.to_gpx(rows))
+    assert (root.tag, root.attrib["version"]) == (f"{GPX}gpx", "1.1")
+    runs = root.findall(f"{GPX}trk/{GPX}trkseg")
+    assert [len(run) for run in runs] == [2, 1]
+    first, second = runs[0]
+    assert [child.tag.removeprefix(GPX) for child in first] == ["ele", "time", "name"]
+    assert [child.tag.removeprefix(GPX) for child in second] == ["time", "name"]
+    assert (first.attrib["lat"], first.attrib["lon"]) == ("32.500000000", "35.250000000")
+    assert [child.text for child in first] == ["12.500", "2023-11-14T22:13:20.000000Z", "<0>&.png"]
+    assert root.find(f"{GPX}trk")[0].tag == f"{GPX}name"
+
+
+def test_geojson_has_lines_of_two_points_or_more_and_every_fix_with_its_sigma():
+    line, *points = json.loads(export.to_geojson(ROWS))["features"]
+    assert line["geometry"]["type"] == "MultiLineString"
+    assert [len(part) for part in line["geometry"]["coordinates"]] == [2, 3]
+    assert [p["properties"]["frame"] for p in points] == [row.frame for row in ROWS if row.fixed]
+    for point, row in zip(points, (row for row in ROWS if row.fixed), strict=True):
+        assert point["geometry"]["coordinates"] == pytest.approx([row.lon_deg, row.lat_deg], abs=1e-9)
+        assert (point["properties"]["sigma_east_m"], point["properties"]["sigma_north_m"]) == (0.25, 0.5)
+        assert point["properties"]["timestamp_ns"] == row.timestamp_ns
+    assert all(f["geometry"]["type"] == "Point" for f in json.loads(export.to_geojson([fix(0)]))["features"])
+
+
+def test_kml_is_longitude_first_with_a_line_a_run():
+    root = ElementTree.fromstring(export.to_kml(ROWS))
+    lines = [e.text.split() for e in root.iterfind(f".//{KML}LineString/{KML}coordinates")]
+    assert [len(line) for line in lines] == [2, 3]
+    assert lines[0][0] == "35.250000000,32.500000000"
+    assert len(root.findall(f".//{KML}Folder/{KML}Placemark")) == 6
+    assert root.find(f".//{KML}when").text == "2023-11-14T22:13:20.000000Z"
+
+
+def test_tum_keeps_every_nanosecond_and_says_what_is_not_known():
+    rows = [fix(0, start_ns=T0 + 1), refusal(1), fix(2, start_ns=-600_000_000), fix(0, start_ns=5)]
+    head, *lines = export.to_tum(rows).splitlines()
+    assert head.startswith("#")
+    assert "quaternion is unity" in head
+    assert "z is 0" in head
+    assert lines == [
+        "1700000000.000000001 0.0000 0.0000 0.0000 0 0 0 1",
+        "-0.100000000 3.0000 -1.0000 0.0000 0 0 0 1",
+        "0.000000005 0.0000 0.0000 0.0000 0 0 0 1",
+    ]
+    with pytest.raises(TelemetryError, match="timestamp_ns: expected a stamp for the format tum"):
+        export.to_tum([fix(0, start_ns=None)])
+
+
+def test_tum_has_whole_poses_and_leaves_out_what_is_none():
+    angles = [(1.0, -2.0, 0.0), (10.0, 20.0, 359.5), (-3.0, 4.0, 181.0)]
+    names = ("roll_deg", "pitch_deg", "heading_deg")
+    whole = [fix(k, up_m=150.0 + k, **dict(zip(names, angles[k], strict=True))) for k in range(3)]
+    flat, level = fix(3, heading_deg=90.0), fix(4, up_m=150.0)
+    rows = [*whole, flat, refusal(9), level]
+    text = export.to_tum(rows)
+    assert "not known" not in text
+    table = np.loadtxt(io.StringIO(text))
+    assert table[:, 3].tolist() == [150.0, 151.0, 152.0]
+    assert table[:, 1:3] == pytest.approx(np.array([[row.east_m, row.north_m] for row in whole]))
+    body_frd = Rotation.from_quat(table[:, 4:]).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    for turn, roll_pitch_heading in zip(body_frd, angles, strict=True):
+        assert turn == pytest.approx(enu_from_body(*roll_pitch_heading), abs=1e-8)
+    # Without any attitude a height is still a reason to leave the others out, never a z of 0 among 150.
+    assert np.loadtxt(io.StringIO(export.to_tum([flat, level])), ndmin=2)[:, 3].tolist() == [150.0]
+
+
+def test_heights_above_the_sea_are_only_those_that_are():
+    rows = [fix(0, up_m=150.0)]
+    assert "<ele>" not in export.to_gpx(rows)
+    assert export.to_nmea(rows).split(",")[9:11] == ["", ""]
+    row = export.pose_rows(rows, is_amsl=True)[0]
+    assert "<ele>150.000</ele>" in export.to_gpx([row])
+    assert export.to_nmea([row]).split(",")[9:11] == ["150.00", "M"]
+
+
+def test_notes_complete_the_pose_of_a_fix_and_of_no_refusal():
+    known = {"heading_deg": 12.5, "roll_deg": -1.0, "pitch_deg": 2.0, "sigma_up_m": 0.3}
+    notes = [FrameNote(frame=row.frame, state="tracking", **known) for row in ROWS[:3]]
+    rows = export.pose_rows(ROWS[:4], notes)
+    assert [row.angles_deg for row in rows] == [(-1.0, 2.0, 12.5)] * 2 + [None] * 2
+    point = json.loads(export.to_geojson(rows))["features"][1]["properties"]
+    assert {name: point[name] for name in known} == known
+    assert json.loads(export.to_geojson(rows))["features"][-1]["properties"]["sigma_up_m"] is None
+
+
+def test_the_checksum_is_that_of_a_sentence_known_from_the_standards_example():
+    body = "GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
+    assert export.nmea_sentence(body) == f"${body}*47"
+
+
+def test_nmea_sentences_are_valid_and_a_refusal_is_void():
+    text = export.to_nmea([fix(0, -32.5, -35.25, alt_amsl_m=7.125), refusal(1)])
+    assert text.endswith("\r\n")
+    sentences = text.split("\r\n")[:-1]
+    for sentence in sentences:
+        body, checksum = re.fullmatch(r"\$(.+)\*([0-9A-F]{2})", sentence).groups()
+        assert reduce(xor, body.encode()) == int(checksum, 16)
+        assert len(body.split(",")) == (15 if body.startswith("GPGGA") else 13)
+    assert sentences[0].startswith("$GPGGA,221320.00,3230.000000,S,03515.000000,W,1,00,,7.12,M,")
+    assert sentences[1].startswith("$GPRMC,221320.00,A,3230.000000,S,03515.000000,W,,,141123,,,A*")
+    assert sentences[2].startswith("$GPGGA,221320.25,,,,,0,00,,,")
+    assert sentences[3].startswith("$GPRMC,221320.25,V,,,,,,,141123,,,N*")
+
+
+def test_times_of_day_are_rounded_over_midnight_and_blank_without_utc():
+    before_midnight_ns = 1_700_006_399_998_000_000
+    gga, rmc = export.to_nmea([fix(0, start_ns=before_midnight_ns)]).split("\r\n")[:2]
+    assert gga.split(",")[1] == "000000.00"
+    assert (rmc.split(",")[1], rmc.split(",")[9]) == ("000000.00", "151123")
+    boot = [fix(0, start_ns=12_000_000_000), fix(0, start_ns=None)]
+    for sentence in export.to_nmea(boot).split("\r\n")[:-1]:
+        assert sentence.split(",")[1] == ""
+    assert "<time>" not in export.to_gpx(boot)
+    assert "<when>" not in export.to_kml(boot)
+
+
+def test_minutes_carry_into_degrees():
+    assert export.degrees_minutes(48.117300, 2) == "4807.038000"
+    assert export.degrees_minutes(59.99999 / 60, 2) == "0059.999990"
+    assert export.degrees_minutes((60 - 1e-8) / 60, 3) == "00100.000000"
+    assert export.degrees_minutes(9.9999999999, 3) == "01000.000000"
+
+
+@given(st.floats(-180, 180))
+def test_minutes_stay_below_sixty_and_read_back_to_two_millimetres(value_deg):
+    text = export.degrees_minutes(value_deg, 3)
+    degrees, minutes = int(text[:3]), float(text[3:])
+    assert minutes < 60
+    assert degrees + minutes / 60 == pytest.approx(abs(value_deg), abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", export.WRITERS)
+def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_path, capfd):
+    write_track(tmp_path / "track.csv", ROWS)
+    arguments = ["export", str(tmp_path), "--format", kind, "--json"]
+    assert run(arguments) == 0
+    stated = json.loads(capfd.readouterr().out)
+    assert (stated["fixes"], stated["segments"]) == (6, 3)
+    written = tmp_path / f"track.{kind}"
+    assert written.stat().st_size > 100
+    written.write_text("mine")
+    assert run(arguments) == 2
+    assert "exists; choose another file, or add --force" in capfd.readouterr().err
+    assert written.read_text() == "mine"
+    assert run([*arguments, "--force"]) == 0
+    assert written.stat().st_size > 100
+
+
+def test_the_truth_comes_at_the_moments_of_the_fixes_about_the_same_origin(tmp_path, capfd):
+    write_track(tmp_path / "track.csv", ROWS)
+    settings = {
+        "map": "m.tif", "surface": None, "truth": None, "method": "ncc", "profile": "engine", "ground_m": 5.0,
+        "ground_amsl_m": 20.0, "origin": {"lat_deg": 32.5, "lon_deg": 35.25},
+    }  # fmt: skip
+    (tmp_path / "summary.json").write_text(json.dumps({"settings": settings}))
+    # 100 m north of the origin at T0, another 4 m in each second; it ends before the last two fixes.
+    degrees_a_metre = 1.0 / 110_888.0  # of latitude at 32.5 degrees
+    rows = [
+        f"{T0 + k * 10**9},{32.5 + (100 + 4 * k) * degrees_a_metre:.9f},35.25,{170 + k},0,0,90" for k in (0, 1)
+    ]
+    rows.append(f"{T0 + 1_600_000_000},{32.5 + 106.4 * degrees_a_metre:.9f},35.25,171.6,0,0,90")
+    header = "timestamp_ns,lat_deg,lon_deg,alt_amsl_m,roll_deg,pitch_deg,heading_deg"
+    (tmp_path / "t.csv").write_text(header + "\n" + "\n".join(rows) + "\n")
+    arguments = ["export", str(tmp_path), "--format", "tum", "--truth", str(tmp_path / "t.csv"), "--json"]
+    assert run(arguments) == 0
+    assert json.loads(capfd.readouterr().out)["fixes"] == 4
+    lines = (tmp_path / "truth.tum").read_text().splitlines()[1:]
+    values = [[float(value) for value in line.split()[1:4]] for line in lines]
+    assert all(line.endswith(" 0 0 0 1") for line in lines)  # heading east is the identity of forward, left, up
+    assert [line.split()[0][-11:] for line in lines] == [
+        "0.000000000",
+        "0.250000000",
+        "0.750000000",
+        "1.500000000",
+    ]
+    expected = [[0.0, 100.0 + 4.0 * t, 155.0 + t] for t in (0.0, 0.25, 0.75, 1.5)]
+    assert [value for row in values for value in row] == pytest.approx(
+        [value for row in expected for value in row], abs=0.02
+    )
+    assert run(arguments) == 2
+    (tmp_path / "t.csv").write_text("timestamp_ns,lat_deg,lon_deg\n1,32.5,35.25\n2,32.5,35.25\n")
+    assert run([*arguments, "--force"]) == 1
+    assert "expected the truth at the moment of a fix, got none" in capfd.readouterr().err
+
+
+def test_the_command_refuses_in_one_line(tmp_path, capfd):
+    def refused(*arguments):
+        code, error = run(["export", str(tmp_path), *arguments]), capfd.readouterr().err
+        assert len(error.splitlines()) == 1
+        return code, error
+
+    code, error = refused("--format", "gpx")
+    assert (code, "no such file" in error) == (1, True)
+    write_track(tmp_path / "track.csv", [refusal(0)])
+    code, error = refused("--format", "gpx")
+    assert (code, "expected a track with a fix, got 1 rows without" in error) == (1, True)
+    code, error = refused("--format", "shp")
+    assert (code, "--format: expected one of gpx, geojson, kml, tum, nmea, got 'shp'" in error) == (2, True)
+    write_track(tmp_path / "track.csv", ROWS)
+    code, error = refused("--format", "gpx", "--out", str(tmp_path / "none" / "x.gpx"))
+    assert (code, "cannot be written" in error) == (1, True)

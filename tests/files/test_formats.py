@@ -1,0 +1,672 @@
+"""Telemetry, truth, frames, flights, tracks and GeoTIFF: what is read, what is written, what is refused."""
+
+import dataclasses
+import re
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from engine.camera import Camera
+from engine.errors import (
+    CalibrationError,
+    DtypeError,
+    EngineError,
+    MapError,
+    OptionError,
+    ShapeError,
+    TelemetryError,
+)
+from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
+from scenematch.files.flight import open_flight, write_flight_folder
+from scenematch.files.frames import open_frames, read_image
+from scenematch.files.geotiff import write_geotiff
+from scenematch.files.telemetry import (
+    DEFAULT_PRIOR_SIGMA_M,
+    TelemetryRow,
+    ground_amsl_m,
+    read_telemetry,
+    write_telemetry,
+)
+from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
+from scenematch.files.truth import interpolate_truth, read_truth, write_truth
+from tests.support.paths import SHARED
+from tests.support.photos import photograph
+from tests.support.videos import write_video
+
+FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
+
+HEADER = "timestamp_ns,frame,height_agl_m,heading_deg,lat_deg,lon_deg\n"
+
+
+def refusal(call, *arguments, error=TelemetryError, **options):
+    """The one line with which a call refuses its input."""
+    with pytest.raises(error) as caught:
+        call(*arguments, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.fixture
+def save(tmp_path):
+    def write(text, name="telemetry.csv"):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def picture(value, size=(8, 6)):
+    return np.full((size[1], size[0], 3), value, np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three pictures whose names sort one way as text and another as numbers."""
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for name, value in (("1.png", 10), ("2.png", 20), ("10.png", 100)):
+        Image.fromarray(picture(value)).save(frames / name)
+    (frames / "notes.txt").write_text("no picture")
+    (frames / "._1.png").write_text("what some systems leave behind")
+    return frames
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """Twelve frames; frame i is a flat picture of about 20 i."""
+    path = tmp_path_factory.mktemp("video") / "flight.avi"
+    write_video(path, [20 * k for k in range(12)], rate_hz=10.0)
+    return path
+
+
+# ------------------------------------------------------------------------------------------------ telemetry
+
+
+def test_reads_telemetry_and_leaves_unknown_cells_none(save):
+    rows = read_telemetry(
+        save(
+            "timestamp_ns,frame,height_agl_m,heading_deg,battery\n5000000,a.jpg,149.5,,full\n9000000,b.jpg,,-90,\n"
+        )
+    )
+    assert rows == [
+        TelemetryRow(timestamp_ns=5_000_000, frame="a.jpg", height_agl_m=149.5),
+        TelemetryRow(timestamp_ns=9_000_000, frame="b.jpg", heading_deg=270.0),
+    ]
+    assert rows[0].prior is None
+
+
+def test_a_byte_order_mark_crlf_blank_lines_and_spaces_are_accepted(save):
+    text = b"\xef\xbb\xbftimestamp_ns, frame ,height_agl_m\r\n5000000, a.jpg ,1e2\r\n\r\n9000000,b.jpg,3,,\r\n"
+    assert read_telemetry(save(text)) == [
+        TelemetryRow(timestamp_ns=5_000_000, frame="a.jpg", height_agl_m=100.0),
+        TelemetryRow(timestamp_ns=9_000_000, frame="b.jpg", height_agl_m=3.0),
+    ]
+
+
+def test_a_prior_without_sigma_takes_the_default(save):
+    rows = read_telemetry(save("timestamp_ns,frame,lat_deg,lon_deg,sigma_m\n1,a,32.5,35.25,\n2,b,32.5,35.25,4\n"))
+    assert rows[0].prior == Prior(lat_deg=32.5, lon_deg=35.25, sigma_m=DEFAULT_PRIOR_SIGMA_M)
+    assert rows[1].prior == Prior(lat_deg=32.5, lon_deg=35.25, sigma_m=4.0)
+
+
+def cells(number, low=-180.0, high=180.0):
+    return st.none() | st.integers(int(low * 10**number), int(high * 10**number)).map(lambda v: v / 10**number)
+
+
+@given(
+    st.lists(
+        st.builds(
+            TelemetryRow,
+            timestamp_ns=st.integers(-(2**63) // 10**8 + 1, 2**63 // 10**8).map(lambda v: v * 10**8),
+            frame=st.from_regex(r"[a-z0-9,\"]{1,6}\.jpg", fullmatch=True),
+            height_agl_m=cells(3, 0.001, 9000),
+            alt_amsl_m=cells(3, -500, 9000),
+            heading_deg=cells(4, 0, 359.9),
+            roll_deg=cells(4),
+            pitch_deg=cells(4, -90, 90),
+            east_velocity_mps=cells(4),
+            sigma_m=cells(3, 0, 500),
+        ),
+        min_size=1,
+        max_size=6,
+        unique_by=(lambda row: row.timestamp_ns, lambda row: row.frame),
+    ),
+    st.tuples(cells(9, -90, 90).filter(lambda v: v is not None), cells(9).filter(lambda v: v is not None)),
+)
+@settings(max_examples=60, deadline=None)
+def test_telemetry_round_trip(tmp_path_factory, rows, place):
+    path = tmp_path_factory.mktemp("t") / "telemetry.csv"
+    rows.sort(key=lambda row: row.timestamp_ns)
+    rows[0] = dataclasses.replace(rows[0], lat_deg=place[0], lon_deg=place[1])
+    write_telemetry(path, rows)
+    assert read_telemetry(path) == rows
+
+
+def test_golden_bytes_of_telemetry(tmp_path):
+    path = tmp_path / "telemetry.csv"
+    row = TelemetryRow(
+        timestamp_ns=7, frame="a.jpg", height_agl_m=150.0, roll_deg=-0.00001, lat_deg=1 / 3, lon_deg=-2 / 3
+    )
+    write_telemetry(path, [row, TelemetryRow(timestamp_ns=8, frame="b,c.jpg")])
+    assert path.read_bytes() == (
+        b"timestamp_ns,frame,height_agl_m,roll_deg,lat_deg,lon_deg\n"
+        b'7,a.jpg,150.000,0.0000,0.333333333,-0.666666667\n8,"b,c.jpg",,,,\n'
+    )
+
+
+BAD_TELEMETRY = {
+    "empty": ("", "expected a header with timestamp_ns, frame, got an empty first line"),
+    "no rows": (HEADER, "expected one row a frame, got a header and no rows"),
+    "missing column": ("timestamp_ns,height_agl_m\n1,5\n", "line 1: lacks the column frame"),
+    "colons": ("timestamp_ns:frame\n1:a\n", "lacks the column timestamp_ns; its columns are 'timestamp_ns:frame'"),
+    "duplicate column": (
+        "timestamp_ns,frame,frame\n1,a,b\n",
+        "line 1, frame: expected the column once, got it 2 times",
+    ),
+    "short row": (HEADER + "1,a.jpg,5\n", "line 2: expected 6 cells as in the header, got 3"),
+    "long row": (HEADER + "1,a.jpg,5,1,2,3,4\n", "line 2: expected 6 cells as in the header, got 7"),
+    "out of order": (
+        HEADER + "5,a,,,,\n4,b,,,,\n",
+        "line 3, timestamp_ns: expected a stamp later than the row before (5), got '4'",
+    ),
+    "repeated stamp": (HEADER + "5,a,,,,\n5,b,,,,\n", "line 3, timestamp_ns: expected a stamp later"),
+    "repeated frame": (
+        HEADER + "5,a,,,,\n6,a,,,,\n",
+        "line 3, frame: expected each frame once (it stands in line 2 too)",
+    ),
+    "blank stamp": (HEADER + ",a,,,,\n", "line 2, timestamp_ns: expected whole nanoseconds, got ''"),
+    "stamp in seconds": (HEADER + "1.5,a,,,,\n", "line 2, timestamp_ns: expected a whole number, got '1.5'"),
+    "huge stamp": (HEADER + "9" * 19 + ",a,,,,\n", "line 2, timestamp_ns: expected a whole number"),
+    "blank frame": (HEADER + "1,,,,,\n", "line 2, frame: expected a value"),
+    "nan": (HEADER + "1,a,nan,,,\n", "line 2, height_agl_m: expected a finite number above 0, got 'nan'"),
+    "inf": (HEADER + "1,a,inf,,,\n", "height_agl_m: expected a finite number above 0, got 'inf'"),
+    "overflow": (HEADER + "1,a,1e999,,,\n", "height_agl_m: expected a finite number above 0, got '1e999'"),
+    "negative height": (HEADER + "1,a,-3,,,\n", "height_agl_m: expected a finite number above 0, got '-3'"),
+    "zero height": (HEADER + "1,a,0.0,,,\n", "height_agl_m: expected a finite number above 0, got '0.0'"),
+    "word": (HEADER + "1,a,high,,,\n", "height_agl_m: expected a finite number above 0, got 'high'"),
+    "underscore": (HEADER + "1,a,1_0,,,\n", "height_agl_m: expected a finite number above 0, got '1_0'"),
+    "centidegrees": (HEADER + "1,a,5,21790,,\n", "heading_deg: expected degrees from -360 to 360, got '21790'"),
+    "latitude": (HEADER + "1,a,5,,91,3\n", "lat_deg: expected degrees from -90 to 90, got '91'"),
+    "longitude": (HEADER + "1,a,5,,9,361\n", "lon_deg: expected degrees from -180 to 360, got '361'"),
+    "half a position": (HEADER + "1,a,5,,9,\n", "lon_deg: expected a value, as lat_deg has one, got ''"),
+    "not UTF-8": (b"timestamp_ns,frame\n1,\xe9.jpg\n", "expected UTF-8 text, got the byte 0xe9"),
+    "line in a cell": (HEADER + '1,a,"5\nx",,,\n', r"height_agl_m: expected a finite number above 0, got '5\nx'"),
+    "long cell": (HEADER + "1,a," + "x" * 500 + ",,,\n", "got '" + "x" * 40 + "'..."),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TELEMETRY, ids=list(BAD_TELEMETRY))
+def test_bad_telemetry_is_refused_with_its_place(save, case):
+    text, expected = BAD_TELEMETRY[case]
+    message = refusal(read_telemetry, save(text))
+    assert expected in message
+    assert "telemetry.csv" in message
+
+
+def test_missing_telemetry_and_a_folder_in_its_place_are_refused(tmp_path):
+    assert refusal(read_telemetry, tmp_path / "none.csv").endswith("none.csv: no such file")
+    assert "cannot be read" in refusal(read_telemetry, tmp_path)
+    assert "cannot be written" in refusal(write_telemetry, tmp_path / "none" / "t.csv", [])
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=150, deadline=None)
+def test_garbage_never_raises_anything_but_the_engines_error(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "garbage.csv"
+    for start in (b"", HEADER.encode(), HEADER.encode() + b"1,a,"):
+        path.write_bytes(start + content)
+        for read in (read_telemetry, read_truth, read_track):
+            try:
+                read(path)
+            except EngineError as error:
+                assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_ground_is_the_median_difference_of_the_two_heights():
+    pairs = [(200.0, 150.0), (210.0, 159.0), (300.0, 100.0), (None, 5.0), (5.0, None)]
+    rows = [
+        TelemetryRow(timestamp_ns=i, frame=str(i), alt_amsl_m=a, height_agl_m=h) for i, (a, h) in enumerate(pairs)
+    ]
+    assert ground_amsl_m(rows) == 51.0
+    assert ground_amsl_m(rows[3:]) is None
+
+
+# ---------------------------------------------------------------------------------------------------- truth
+
+
+def test_truth_round_trip_and_refusals(tmp_path, save):
+    rows = [
+        Truth(timestamp_ns=5_000_000, lat_deg=1.123456789, lon_deg=-2.0, alt_amsl_m=200.1234, heading_deg=359.5),
+        Truth(timestamp_ns=9_000_000, lat_deg=1.5, lon_deg=-2.5, roll_deg=-3.25),
+    ]
+    write_truth(tmp_path / "truth.csv", rows)
+    assert read_truth(tmp_path / "truth.csv") == rows
+    header = "timestamp_ns,lat_deg,lon_deg\n"
+    assert "lacks the column lon_deg" in refusal(read_truth, save("timestamp_ns,lat_deg\n1,2\n"))
+    assert "line 2, lat_deg: expected degrees" in refusal(read_truth, save(header + "1,,3\n"))
+    assert "line 3, timestamp_ns: expected a stamp later" in refusal(read_truth, save(header + "1,2,3\n1,2,3\n"))
+    assert "got a header and no rows" in refusal(read_truth, save(header))
+
+
+def test_truth_is_linear_between_neighbours_and_turns_the_short_way():
+    rows = [
+        Truth(timestamp_ns=0, lat_deg=10.0, lon_deg=179.99, alt_amsl_m=100.0, heading_deg=350.0, roll_deg=2.0),
+        Truth(timestamp_ns=4_000_000_000, lat_deg=11.0, lon_deg=-179.99, alt_amsl_m=104.0, heading_deg=20.0),
+    ]
+    middle = interpolate_truth(rows, 1_000_000_000)
+    assert middle.timestamp_ns == 1_000_000_000
+    assert middle.lat_deg == pytest.approx(10.25)
+    assert middle.lon_deg == pytest.approx(179.995)
+    assert middle.alt_amsl_m == pytest.approx(101.0)
+    assert middle.heading_deg == pytest.approx(357.5)
+    assert interpolate_truth(rows, 2_000_000_000).heading_deg == pytest.approx(5.0)
+    assert middle.roll_deg is None
+    assert middle.height_agl_m is None
+
+
+def test_truth_is_unknown_outside_and_in_gaps():
+    rows = [Truth(timestamp_ns=t * 10**9, lat_deg=0.0, lon_deg=0.0) for t in (10, 12, 18)]
+    assert interpolate_truth(rows, 12 * 10**9) is rows[1]
+    assert interpolate_truth(rows, 18 * 10**9) is rows[2]
+    for stamp_s in (9, 19, 15):
+        assert interpolate_truth(rows, stamp_s * 10**9) is None
+    assert interpolate_truth(rows, 15 * 10**9, max_gap_ns=6 * 10**9) is not None
+    assert interpolate_truth([], 5) is None
+
+
+# --------------------------------------------------------------------------------------------------- frames
+
+
+def test_a_folder_reads_in_natural_order(folder):
+    source = open_frames(folder)
+    assert source.names == ["1.png", "2.png", "10.png"]
+    assert "2.png" in source
+    assert "notes.txt" not in source
+    np.testing.assert_array_equal(source.read("10.png"), picture(100))
+    message = refusal(source.read, "3.png")
+    assert "expected one of 3 pictures, 1.png to 10.png, got '3.png'" in message
+
+
+@pytest.mark.parametrize(
+    ("mode", "value", "expected"),
+    [("L", 7, 7), ("RGBA", (7, 7, 7, 128), 7), ("I;16", 0x1280, 0x12), ("1", 1, 255), ("P", 0, None)],
+)
+def test_every_kind_of_picture_becomes_rgb(tmp_path, mode, value, expected):
+    Image.new(mode, (8, 6), value).save(tmp_path / "a.png")
+    read = read_image(tmp_path / "a.png")
+    assert (read.shape, read.dtype) == ((6, 8, 3), np.uint8)
+    if expected is not None:
+        assert (read == expected).all()
+
+
+def test_channels_come_in_the_order_red_green_blue(tmp_path):
+    Image.new("RGB", (8, 6), (200, 100, 50)).save(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png")[0, 0].tolist() == [200, 100, 50]
+
+
+def test_unreadable_pictures_are_refused(tmp_path):
+    good = tmp_path / "good.jpg"
+    Image.fromarray(np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8)).save(good)
+    (tmp_path / "cut.jpg").write_bytes(good.read_bytes()[:600])
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "text.jpg").write_text("no picture")
+    Image.new("F", (4, 4)).save(tmp_path / "float.tif")
+    for name in ("cut.jpg", "empty.jpg", "text.jpg"):
+        assert f"{name}: expected a readable picture" in refusal(read_image, tmp_path / name)
+    assert "got mode F" in refusal(read_image, tmp_path / "float.tif")
+    assert "no such picture" in refusal(read_image, tmp_path / "none.jpg")
+
+
+def test_paths_without_frames_are_refused(tmp_path):
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    (tmp_path / "text.txt").write_text("no video" * 50)
+    (tmp_path / "none").mkdir()
+    assert "expected pictures" in refusal(open_frames, tmp_path / "none")
+    assert "no such folder or video" in refusal(open_frames, tmp_path / "elsewhere")
+    assert "got an empty file" in refusal(open_frames, tmp_path / "empty.mp4")
+    assert "a file that is neither" in refusal(open_frames, tmp_path / "text.txt")
+
+
+def test_one_picture_is_a_source_of_one(folder):
+    assert open_frames(folder / "2.png").names == ["2.png"]
+
+
+def value_of(source, name):
+    return round(float(source.read(name).mean()) / 20)
+
+
+def test_a_video_is_read_by_exact_index_in_any_order(video):
+    source = open_frames(video)
+    assert source.names == [str(i) for i in range(12)]
+    order = ["0", "1", "5", "5", "11", "3", "4", "0"]
+    assert [value_of(source, name) for name in order] == [int(name) for name in order]
+    assert source.read("2").shape == (48, 64, 3)
+
+
+def test_going_forward_in_a_video_opens_it_once(video, monkeypatch):
+    opened, real = [], cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: opened.append(path) or real(path))
+    source = open_frames(video)
+    for name in ("0", "2", "3", "9", "9", "11"):
+        source.read(name)
+    assert len(opened) == 1
+    source.read("1")
+    assert len(opened) == 2
+
+
+def test_a_frame_that_was_read_may_be_written_on(video):
+    source = open_frames(video)
+    source.read("3")[:] = 0
+    assert value_of(source, "3") == 3
+
+
+def test_an_index_outside_a_video_is_refused(video):
+    source = open_frames(video)
+    for name in ("12", "-1", "a.jpg", "01"):
+        assert f"expected an index from 0 to 11 of the video, got {name!r}" in refusal(source.read, name)
+
+
+class LyingCapture:
+    """A video whose header counts frames wrongly."""
+
+    counted, real = 15, cv2.VideoCapture
+
+    def __init__(self, path):
+        self._capture = self.real(path)
+
+    def get(self, prop):
+        return self.counted if prop == cv2.CAP_PROP_FRAME_COUNT else self._capture.get(prop)
+
+    def __getattr__(self, name):
+        return getattr(self._capture, name)
+
+
+def test_a_video_that_ends_early_is_refused(video, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", LyingCapture)
+    source = open_frames(video)
+    assert value_of(source, "11") == 11
+    for name in ("12", "14"):
+        message = refusal(source.read, name)
+        assert f"frame {name}: expected 15 frames as the file says, got no more than 12" in message
+    assert value_of(source, "3") == 3
+
+
+def test_a_video_that_does_not_say_how_long_it_is_is_counted(video, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", LyingCapture)
+    monkeypatch.setattr(LyingCapture, "counted", -1)
+    assert len(open_frames(video).names) == 12
+
+
+# --------------------------------------------------------------------------------------------------- flight
+
+
+def test_a_flight_joins_rows_and_pictures_and_counts_the_rest(folder, save):
+    telemetry = save(HEADER + "5000000,10.png,150,90,32,35\n9000000,1.png,,,,\n")
+    flight = open_flight(folder, telemetry)
+    assert (len(flight), flight.unused, flight.names) == (2, 1, ["10.png", "1.png"])
+    first, second = flight
+    np.testing.assert_array_equal(first.frame.image, picture(100))
+    assert (first.name, first.frame.timestamp_ns, first.frame.height_agl_m) == ("10.png", 5_000_000, 150.0)
+    assert first.frame.heading_deg == 90.0
+    assert first.prior == Prior(lat_deg=32.0, lon_deg=35.0, sigma_m=DEFAULT_PRIOR_SIGMA_M)
+    assert first.telemetry is flight.rows[0]
+    assert second.prior is None
+    assert [item.name for item in flight] == ["10.png", "1.png"]  # may be flown again
+
+
+def test_a_row_that_names_no_picture_is_refused_before_the_flight(folder, save):
+    message = refusal(open_flight, folder, save(HEADER + "5,1.png,,,,\n9,4.png,,,,\n"))
+    assert "telemetry.csv: line 3, frame: expected one of 3 pictures, 1.png to 10.png, got '4.png'" in message
+
+
+def test_a_video_flight_names_frames_by_index(video, save):
+    flight = open_flight(video, save("timestamp_ns,frame\n0,0\n1,5\n2,10\n"))
+    assert [round(float(item.frame.image.mean()) / 20) for item in flight] == [0, 5, 10]
+    assert flight.unused == 9
+    message = refusal(open_flight, video, save("timestamp_ns,frame\n0,12\n"))
+    assert "line 2, frame: expected an index from 0 to 11 of the video, got '12'" in message
+
+
+@pytest.mark.parametrize("name", ["flight.ts", "flight.klv", "GX010001.MP4"])
+def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name):
+    """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""
+    path = tmp_path / name
+    path.write_bytes(b"\x47\x40\x11" + bytes.fromhex("060e2b34020b01010e01030101000000"))
+    with pytest.raises(TelemetryError) as caught:
+        open_flight(folder, path)
+    assert str(caught.value).startswith(f"{path}: expected a table or a flight log, got a video's metadata")
+    assert "convert it to a .SRT" in str(caught.value)
+
+
+def test_without_telemetry_frames_come_bare(folder, video):
+    for source in (folder, video):
+        items = list(open_flight(source))
+        assert items[0].telemetry is items[0].prior is items[0].frame.timestamp_ns is None
+    assert [item.name for item in open_flight(folder)] == ["1.png", "2.png", "10.png"]
+
+
+def test_without_telemetry_photographs_bring_their_own(tmp_path):
+    photograph(tmp_path / "a.jpg", gps={1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0)})
+    (item,) = open_flight(tmp_path)
+    assert item.prior.lat_deg == pytest.approx(-33.51)
+
+
+def test_a_camera_of_another_size_is_refused_up_front(folder):
+    assert len(open_flight(folder, camera=Camera.from_fov(8, 6, 60.0))) == 3
+    message = refusal(open_flight, folder, camera=Camera.from_fov(300, 300, 60.0), error=CalibrationError)
+    assert "calibrated for 300 x 300, but the frame is 8 x 6" in message
+
+
+def test_a_written_flight_folder_reads_back(tmp_path):
+    camera = Camera(
+        8, 6, np.array([[7.1, 0, 3.5], [0, 7.2, 2.5], [0, 0, 1]]), "plumb_bob", np.array([0.1, 0, 0, 0]), np.eye(3)
+    )
+    truth = []
+
+    def frames():
+        for i in range(3):
+            truth.append(Truth(timestamp_ns=i * 10**8, lat_deg=32.0, lon_deg=35.0))
+            yield f"{i:06d}.png", Frame(picture(i), i * 10**8, 150.0 + i, -90.0, 1.0, 2.0, 3.0, 4.0)
+
+    affine = [[0.5, 0.0, 600_000.25], [0.0, -0.5, 3_600_000.75]]
+    write_flight_folder(
+        tmp_path / "out",
+        frames=frames(),
+        truth=truth,
+        camera=camera,
+        ortho_rgb=picture(9, (20, 10)),
+        pixel_to_crs=affine,
+        crs_epsg=32636,
+        surface_m=np.zeros((10, 20)),
+        start=Prior(lat_deg=32.0, lon_deg=35.0, sigma_m=5.0),
+    )
+    out = tmp_path / "out"
+    loaded = Camera.load(out / "camera.yaml")
+    for name in ("matrix", "distortion", "mount"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(camera, name))
+    flight = list(open_flight(out / "frames", out / "telemetry.csv", loaded))
+    assert [item.frame.height_agl_m for item in flight] == [150.0, 151.0, 152.0]
+    assert flight[0].frame.heading_deg == 270.0
+    assert (flight[2].frame.image == 2).all()
+    assert [item.prior is None for item in flight] == [False, True, True]
+    assert read_truth(out / "truth.csv") == truth
+    with rasterio.open(out / "map.tif") as ortho, rasterio.open(out / "dsm.tif") as surface:
+        assert (ortho.count, ortho.crs.to_epsg(), surface.dtypes) == (3, 32636, ("float32",))
+
+
+def test_a_frame_without_a_stamp_cannot_be_written(tmp_path):
+    message = refusal(
+        write_flight_folder,
+        tmp_path,
+        frames=[("a.png", Frame(picture(1)))],
+        truth=[],
+        camera=Camera.from_fov(8, 6, 60.0),
+        ortho_rgb=picture(1),
+        pixel_to_crs=np.eye(2, 3),
+        crs_epsg=32636,
+    )
+    assert "a.png: timestamp_ns: expected a stamp" in message
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_reads_the_shared_flights(name):
+    directory = SHARED / name
+    if not directory.is_dir():
+        pytest.skip(f"no flight {name} under {SHARED}")
+    frames = directory / "flight.mp4" if name == "nust" else directory / "frames"
+    camera = Camera.load(directory / "camera.yaml")
+    flight = open_flight(frames, directory / "telemetry.csv", camera)
+    truth = read_truth(directory / "truth.csv")
+    assert (len(flight), flight.unused) == FLIGHTS[name]
+    iterator = iter(flight)
+    for item in (next(iterator), next(iterator)):
+        camera.check_size(item.frame.image.shape)
+        assert item.frame.height_agl_m > 20.0
+        assert interpolate_truth(truth, item.frame.timestamp_ns) is not None
+        assert (item.prior is not None) == (name == "caliterra")
+
+
+# -------------------------------------------------------------------------------------------------- GeoTIFF
+
+
+@pytest.mark.parametrize("shape", [(30, 40), (30, 40, 3)])
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_geotiff_keeps_pixels_and_moves_the_half_pixel(tmp_path, shape, dtype):
+    array = np.random.default_rng(2).uniform(0, 255, shape).astype(dtype)
+    centre = np.array([[0.5, 0.1, 600_000.0], [0.2, -0.6, 3_600_000.0]])
+    write_geotiff(tmp_path / "a.tif", array, centre, 32636, nodata=0)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        read = np.moveaxis(file.read(), 0, 2).reshape(shape)
+        # rasterio's xy() answers for the centre of a pixel.
+        assert file.xy(0, 0) == pytest.approx(centre[:, 2])
+        assert file.xy(7, 11) == pytest.approx(centre @ [11, 7, 1])
+        assert (file.crs.to_epsg(), file.nodata, file.profile["tiled"]) == (32636, 0, True)
+        assert file.compression.name == "deflate"
+    np.testing.assert_array_equal(read, array)
+
+
+def test_geotiff_refuses_what_it_cannot_write(tmp_path):
+    good, path = np.zeros((4, 4), np.uint8), tmp_path / "a.tif"
+    assert "(H, W) or (H, W, 3)" in refusal(
+        write_geotiff, path, np.zeros((4, 4, 2)), np.eye(2, 3), 4326, error=ShapeError
+    )
+    assert "complex" in refusal(write_geotiff, path, good.astype(complex), np.eye(2, 3), 4326, error=DtypeError)
+    assert "expected (2, 3)" in refusal(write_geotiff, path, good, np.eye(3), 4326, error=ShapeError)
+    assert "invertible" in refusal(write_geotiff, path, good, np.zeros((2, 3)), 4326, error=OptionError)
+    assert "cannot be written" in refusal(write_geotiff, path, good, np.eye(2, 3), 999_999, error=MapError)
+    assert "cannot be written" in refusal(
+        write_geotiff, tmp_path / "no" / "a.tif", good, np.eye(2, 3), 4326, error=MapError
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- track
+
+FIX = Fix(
+    timestamp_ns=107_802_500_000,
+    lat_deg=32.7931868031,
+    lon_deg=34.9888531542,
+    east_m=-12.34567,
+    north_m=0.00004,
+    up_m=None,
+    covariance_m2=np.array([[4.0, -0.5, 0.0], [-0.5, 2.25, 0.0], [0.0, 0.0, 9.0]]),
+    attitude=None,
+    score=0.87654321,
+    method="ncc",
+    window=Window(3, 4, 420, 415),
+    timings=Timings(),
+    map_xy_px=(1.0, 2.0),
+)
+REFUSAL = NoFix(reason=Reason.AMBIGUOUS, timestamp_ns=None, method="sift", score=-0.00001)
+
+
+def test_golden_bytes_of_a_track(tmp_path):
+    path = tmp_path / "track.csv"
+    rows = [
+        track_row("000000.jpg", FIX, latency_ms=12.3456, deadline_met=True),
+        track_row("1", REFUSAL, latency_ms=40.0, deadline_met=False),
+        track_row("2", dataclasses.replace(FIX, up_m=151.25), latency_ms=None, deadline_met=None),
+    ]
+    write_track(path, rows)
+    assert path.read_bytes() == (
+        b"timestamp_ns,frame,status,reason,lat_deg,lon_deg,east_m,north_m,up_m,sigma_east_m,sigma_north_m,"
+        b"covariance_en_m2,score,method,window_width_px,window_height_px,latency_ms,deadline_met\n"
+        b"107802500000,000000.jpg,fix,,32.793186803,34.988853154,-12.346,0.000,,2.0000,1.5000,"
+        b"-0.500000,0.8765,ncc,420,415,12.346,true\n"
+        b",1,no_fix,ambiguous,,,,,,,,,0.0000,sift,,,40.000,false\n"
+        b"107802500000,2,fix,,32.793186803,34.988853154,-12.346,0.000,151.250,2.0000,1.5000,"
+        b"-0.500000,0.8765,ncc,420,415,,\n"
+    )
+
+
+def test_a_track_reads_back(tmp_path):
+    rows = [
+        TrackRow(timestamp_ns=5, frame="a", status="no_fix", reason="late", latency_ms=1.5, deadline_met=False),
+        dataclasses.replace(
+            track_row("b", FIX, latency_ms=2.5, deadline_met=True),
+            lat_deg=32.5,
+            lon_deg=35.5,
+            east_m=1.25,
+            north_m=-2.5,
+            score=0.5,
+        ),
+    ]
+    write_track(tmp_path / "track.csv", rows)
+    assert read_track(tmp_path / "track.csv") == rows
+    assert [row.fixed for row in rows] == [False, True]
+
+
+def test_an_interrupted_run_keeps_its_rows(tmp_path):
+    path = tmp_path / "track.csv"
+    writer = TrackWriter(path)
+    assert read_track(path) == []
+    writer.write(track_row("a", REFUSAL, latency_ms=1.0, deadline_met=None))
+    assert [row.frame for row in read_track(path)] == ["a"]  # before it is closed
+
+    def interrupted():
+        with writer:
+            writer.write(track_row("b", REFUSAL, latency_ms=1.0, deadline_met=None))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [row.frame for row in read_track(path)] == ["a", "b"]
+    writer.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"status": "good"}, "line 2, status: expected fix or no_fix, got 'good'"),
+        ({"lat_deg": ""}, "line 2, lat_deg: expected a number, as the row is a fix, got ''"),
+        ({"reason": "bored"}, "line 2, reason: expected a known reason or nothing, got 'bored'"),
+        ({"sigma_east_m": "-1"}, "line 2, sigma_east_m: expected a finite number of 0 or more, got '-1'"),
+        ({"window_width_px": "1.5"}, "line 2, window_width_px: expected a whole number, got '1.5'"),
+        ({"deadline_met": "maybe"}, "line 2, deadline_met: expected true, false or nothing, got 'maybe'"),
+    ],
+)
+def test_a_bad_track_is_refused_with_its_place(tmp_path, change, expected):
+    path = tmp_path / "track.csv"
+    write_track(path, [track_row("a", FIX, latency_ms=1.0, deadline_met=True)])
+    header, line, _ = path.read_text().split("\n")
+    values = dict(zip(COLUMNS, line.split(","), strict=True)) | change
+    path.write_text(f"{header}\n{','.join(values.values())}\n")
+    assert expected in refusal(read_track, path)
+
+
+def test_a_track_lacking_a_column_or_cut_in_a_row_is_refused(tmp_path, save):
+    assert "lacks the column frame" in refusal(read_track, save("timestamp_ns,status\n1,fix\n"))
+    write_track(tmp_path / "track.csv", [track_row("a", FIX, latency_ms=1.0, deadline_met=True)])
+    text = (tmp_path / "track.csv").read_text()
+    message = refusal(read_track, save(text[:-60]))
+    assert re.search(r"line 2: expected 18 cells as in the header, got \d+", message)
+
+
+def test_a_track_cannot_be_written_where_there_is_no_folder(tmp_path):
+    assert "cannot be written" in refusal(TrackWriter, tmp_path / "none" / "track.csv")

@@ -1,0 +1,102 @@
+"""Settings files: made from the option classes, read back with every key checked."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from engine import OptionError
+from engine.options import NavigatorOptions, SiftOptions
+from scenematch.files.settings import (
+    changed,
+    field_descriptions,
+    options_from_mapping,
+    read_settings,
+    settings_text,
+)
+from scenematch.runs.settings import TrackSettings, load_settings
+
+KEY = re.compile(r"^#(\w+ = )", re.MULTILINE)
+
+
+def test_all_keys_set_to_what_the_file_shows_are_the_defaults(tmp_path):
+    path = tmp_path / "all.toml"
+    text = KEY.sub(r"\1", settings_text(TrackSettings()))
+    path.write_text(text, encoding="utf-8")
+    assert read_settings(path, TrackSettings) == TrackSettings()
+    assert len(KEY.findall(settings_text(TrackSettings()))) > 60
+
+
+def test_a_new_file_changes_nothing(tmp_path):
+    path = tmp_path / "new.toml"
+    path.write_text(settings_text(TrackSettings()), encoding="utf-8")
+    assert read_settings(path, TrackSettings) == TrackSettings()
+
+
+def test_every_field_that_a_file_can_hold_is_explained():
+    """A key without a meaning would fail here by its name: the classes' docstrings are the file's comments."""
+    text = settings_text(TrackSettings())
+    for line in KEY.findall(text):
+        before = text[: text.index("\n#" + line)]
+        assert before.splitlines()[-1].startswith("# "), line
+
+
+def test_values_arrive(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'method = "auto"\n[ncc]\nmargin = 2\n[ncc.rule]\nmin_sigmas = 6.5\n[sift]\nmax_turn_deg = "none"\n',
+        encoding="utf-8",
+    )
+    found = read_settings(path, TrackSettings)
+    assert (found.method, found.ncc.margin, found.ncc.rule.min_sigmas) == ("auto", 2.0, 6.5)
+    assert found.sift.max_turn_deg is None
+    assert changed(found) == {
+        "method": "auto",
+        "ncc.margin": 2.0,
+        "ncc.rule.min_sigmas": 6.5,
+        "sift.max_turn_deg": None,
+    }
+    assert changed(TrackSettings()) == {}
+
+
+def test_the_command_line_counts_more_than_the_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('method = "sift"\nbudget_ms = 40\n', encoding="utf-8")
+    found = load_settings(path, method="ncc", budget_ms=None)
+    assert found == replace(TrackSettings(), method="ncc", budget_ms=40.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("marign = 1", "marign: not a setting; did you mean margin?"),
+        ("[rule]\nmin_sigmsa = 4", "rule.min_sigmsa: not a setting; did you mean min_sigmas?"),
+        ("zebra = 1", "zebra: not a setting; known here are margin, "),
+        ('margin = "wide"', "margin: expected a number, got 'wide'"),
+        ("margin = 0.5", "margin: expected 1 or more, got 0.5"),
+        ("enhance_radius_px = 2.5", "enhance_radius_px: expected a whole number, got 2.5"),
+        ("refine = 1", "refine: expected true or false, got 1"),
+        ("rule = 3", "rule: expected a table, got 3"),
+        ("[rule]\nmin_sigmas = -1", "rule.min_sigmas: expected a number above 0, got -1.0"),
+        ("margin = ", "expected TOML, got something else: "),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, text, message):
+    path = tmp_path / "bad.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(OptionError) as caught:
+        read_settings(path, type(TrackSettings().ncc))
+    assert str(caught.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_cannot_hold_what_is_no_value():
+    """A matcher of the user's own is code; a file that names one is refused with that reason."""
+    with pytest.raises(OptionError, match=r"^matcher: not a setting"):
+        options_from_mapping(SiftOptions, {"matcher": "mine"})
+
+
+def test_meanings_are_whole_sentences_of_the_docstring():
+    meanings = field_descriptions(NavigatorOptions)
+    assert meanings["growth"].endswith("for every refusal in a row.")
+    assert set(meanings) == set(NavigatorOptions.__dataclass_fields__)

@@ -1,0 +1,165 @@
+"""Stamps in other units, dates, semicolons and decimal commas: read, said, or refused."""
+
+import csv
+import datetime
+import json
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from engine.errors import TelemetryError
+from scenematch.files.flight import open_flight
+from scenematch.files.telemetry import open_telemetry, read_telemetry
+from scenematch.files.truth import read_truth
+
+NS = [k * 500_000_000 for k in range(60)]
+BOOT_NS = [12_345_000_000 + ns for ns in NS]
+UTC_NS = [1_777_636_800_250_000_000 + ns for ns in NS]
+
+
+def table(path, stamps, column="timestamp_ns", delimiter=",", more=()):
+    """What a spreadsheet or csv.writer makes of a list."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, delimiter=delimiter)
+        writer.writerow([column, "frame", *(name for name, _ in more)])
+        writer.writerows([stamp, f"{k}.jpg", *(v for _, v in more)] for k, stamp in enumerate(stamps))
+    return path
+
+
+def stamps(path):
+    return [row.timestamp_ns for row in read_telemetry(path)]
+
+
+@pytest.mark.parametrize("truth_ns", [NS, BOOT_NS, UTC_NS], ids=["from 0", "boot", "UTC"])
+@pytest.mark.parametrize(
+    ("per_s", "word"),
+    [(1, "seconds"), (10**3, "milliseconds"), (10**6, "microseconds"), (10**9, None)],
+)
+def test_the_unit_is_recognised_and_said_in_one_line(tmp_path, truth_ns, per_s, word):
+    given = [ns / 10**9 if per_s == 1 else ns * per_s // 10**9 for ns in truth_ns]
+    found = open_telemetry(table(tmp_path / "t.csv", given))
+    wanted = truth_ns
+    assert [row.timestamp_ns for row in found.rows] == pytest.approx(wanted, abs=0, rel=1e-15)
+    if word is None:
+        assert found.remarks == []
+    else:
+        assert len(found.remarks) == 1
+        assert f"t.csv: timestamp_ns is taken as {word}" in found.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("column", "per_s"), [("timestamp_us", 10**6), ("timestamp_ms", 10**3), ("timestamp_s", 1)]
+)
+def test_a_name_that_states_the_unit_needs_no_words(tmp_path, column, per_s):
+    path = table(tmp_path / "t.csv", [k * 10 * per_s for k in range(5)], column)
+    found = open_telemetry(path)
+    assert found.remarks == []
+    assert [row.timestamp_ns for row in found.rows] == [k * 10**10 for k in range(5)]
+
+
+def test_microseconds_of_utc_between_photographs_are_not_nanoseconds(tmp_path):
+    path = table(tmp_path / "t.csv", [1_777_636_800_000_000 + 2_000_000 * k for k in range(9)])
+    assert stamps(path)[:2] == [1_777_636_800_000_000_000, 1_777_636_802_000_000_000]
+
+
+def test_dates_as_python_writes_them(tmp_path):
+    start = datetime.datetime(2026, 5, 1, 14, 0, 0, 250_000, datetime.timezone(datetime.timedelta(hours=2)))
+    given = [(start + datetime.timedelta(milliseconds=500 * k)).isoformat() for k in range(60)]
+    found = open_telemetry(table(tmp_path / "t.csv", given))
+    assert [row.timestamp_ns for row in found.rows] == UTC_NS
+    assert found.remarks == []
+
+
+def test_dates_without_a_zone_are_utc_and_said(tmp_path):
+    with closing(sqlite3.connect(":memory:")) as database:  # another program's way to write a date
+        query = "SELECT strftime('%Y-%m-%d %H:%M:%f', ?, 'unixepoch')"
+        given = [database.execute(query, (ns / 1e9,)).fetchone()[0] for ns in UTC_NS]
+    found = open_telemetry(table(tmp_path / "t.csv", given))
+    assert [row.timestamp_ns for row in found.rows] == UTC_NS
+    assert found.remarks == ["t.csv: timestamp_ns holds dates without a time zone, taken as UTC"]
+    assert open_telemetry(table(tmp_path / "t.csv", given, "timestamp_utc")).remarks == []
+
+
+@pytest.mark.parametrize(
+    ("text", "ns"),
+    [
+        ("1970-01-01T00:00:00Z", 0),
+        ("2026-05-01T12:00:00.123456789Z", 1_777_636_800_123_456_789),
+        ("2026/05/01 12:00:00,5 UTC", 1_777_636_800_500_000_000),
+        ("2026-05-01T06:30:00-05:30", 1_777_636_800_000_000_000),
+        ("2024-02-29T00:00:00+0000", 1_709_164_800_000_000_000),
+    ],
+)
+def test_a_date_to_the_nanosecond(tmp_path, text, ns):
+    path = tmp_path / "t.csv"
+    path.write_text(f'timestamp_utc,frame\n"{text}",a.jpg\n', encoding="utf-8")
+    assert stamps(path) == [ns]
+
+
+REFUSED = {
+    "ambiguous": (
+        [10, 20, 30],
+        "rows 10 apart, which may be milliseconds or seconds: name the column timestamp_ms or",
+    ),
+    "too dense": ([0, 0.001, 0.002], "rows 0.001 apart, which no unit makes"),
+    "seconds that would not fit": ([10**15, 10**15 + 1], "rows 1 apart, which no unit makes the interval"),
+    "a date that is none": (["2026-02-30T00:00:00Z"], "expected a date in UTC such as"),
+    "day first": (["01.05.2026 12:00"], "expected a number or a date in UTC, got '01.05.2026 12:00'"),
+    "mixed": (["2026-02-03T00:00:00Z", 5], "line 3, timestamp_ns: expected a date in UTC"),
+    "back": ([1.0, 0.5], "line 3, timestamp_ns: expected a stamp later than the row before (1.0), got '0.5'"),
+    "a fraction of a nanosecond": ([0.5, 1e9, 2e9], "expected a whole number, got '0.5'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+def test_what_cannot_be_told_is_refused(tmp_path, case):
+    given, words = REFUSED[case]
+    with pytest.raises(TelemetryError) as caught:
+        read_telemetry(table(tmp_path / "t.csv", given))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_name_that_states_a_wrong_unit_is_refused(tmp_path):
+    path = table(tmp_path / "t.csv", [0.0, 0.5, 1.0, 1.5], "timestamp_ms")
+    with pytest.raises(
+        TelemetryError, match=r"timestamp_ms: expected milliseconds, got rows 0\.5 apart, which may be"
+    ):
+        read_telemetry(path)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+@pytest.mark.parametrize("mark", [".", ","])
+def test_semicolons_and_decimal_commas(tmp_path, delimiter, mark):
+    more = [("height_agl_m", f"149{mark}5"), ("lat_deg", f"-33{mark}25"), ("lon_deg", f"1{mark}5e1")]
+    rows = read_telemetry(table(tmp_path / "t.csv", ["0", f"0{mark}5"], "timestamp_s", delimiter, more))
+    assert [row.timestamp_ns for row in rows] == [0, 500_000_000]
+    assert (rows[1].height_agl_m, rows[1].lat_deg, rows[1].lon_deg) == (149.5, -33.25, 15.0)
+    assert rows[1].frame == "1.jpg"
+
+
+def test_two_decimal_marks_are_refused(tmp_path):
+    path = table(
+        tmp_path / "t.csv", [0, 10**9], delimiter=";", more=[("height_agl_m", "1.234"), ("alt_amsl_m", "12,5")]
+    )
+    with pytest.raises(TelemetryError, match=r"line 2: expected one decimal mark, got '12,5' and '1\.234'"):
+        read_telemetry(path)
+
+
+def test_the_truth_is_on_the_same_clock(tmp_path):
+    path = tmp_path / "truth.csv"
+    path.write_text("timestamp_ns;lat_deg;lon_deg\n0;48,5;16,5\n500;48,5;16,5\n", encoding="utf-8")
+    rows = read_truth(path)
+    assert [(row.timestamp_ns, row.lat_deg) for row in rows] == [(0, 48.5), (500_000_000, 48.5)]
+
+
+def test_a_flight_says_how_it_was_read(tmp_path):
+    (tmp_path / "frames").mkdir()
+    for k in range(3):
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.jpg")
+    flight = open_flight(tmp_path / "frames", table(tmp_path / "telemetry.csv", [0, 33, 67]))
+    assert list(flight.remarks) == ["telemetry.csv: timestamp_ns is taken as milliseconds: rows are 33.5 apart"]
+    assert json.dumps([row.timestamp_ns for row in flight.rows]) == "[0, 33000000, 67000000]"

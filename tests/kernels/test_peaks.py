@@ -1,0 +1,132 @@
+"""The highest places of a surface and the summits between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from engine.kernels.peaks import best_positions, fit_summit
+
+
+def greedy(values, separation, count):
+    """The highest place, then the highest that is far enough from all before, one by one."""
+    order = np.argsort(-values, axis=None, kind="stable")
+    places = []
+    for y, x in zip(*np.unravel_index(order, values.shape), strict=True):
+        if len(places) == count or values[y, x] <= -1.0:
+            break
+        if all(max(abs(x - u), abs(y - v)) > separation for u, v, _ in places):
+            places.append((int(x), int(y), float(values[y, x])))
+    return places
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.tuples(st.integers(1, 25), st.integers(1, 25)),
+    separation=st.integers(0, 6),
+    count=st.integers(1, 9),
+)
+def test_best_places_are_taken_one_by_one(seed, size, separation, count):
+    values = np.random.default_rng(seed).uniform(-0.9, 0.9, size).astype(np.float32)
+    before = values.copy()
+    assert best_positions(torch.from_numpy(values), separation, count) == greedy(values, separation, count)
+    np.testing.assert_array_equal(values, before)
+
+
+@pytest.mark.parametrize("size", [(600, 500), (513, 1030), (1, 300_001)])
+def test_best_places_of_a_large_surface_are_those_of_lone_summits(size):
+    """Of every tile only its highest place counts, which is no loss where summits are further apart than tiles."""
+    rng = np.random.default_rng(1)
+    values = rng.uniform(-0.5, 0.1, size).astype(np.float32)
+    places = np.stack([rng.integers(0, n, 40) for n in size], axis=1)
+    apart = [p for k, p in enumerate(places) if all(abs(p - q).max() > 40 for q in places[:k])]
+    for rank, (y, x) in enumerate(apart):
+        values[y, x] = 0.95 - 0.01 * rank
+    found = best_positions(torch.from_numpy(values), 5, min(6, len(apart)))
+    assert found == greedy(values, 5, min(6, len(apart)))
+    assert [place[:2] for place in found] == [(x, y) for y, x in apart[:6]]
+
+
+def test_the_highest_place_of_a_large_surface_is_always_the_first():
+    for seed in range(5):
+        values = np.random.default_rng(seed).uniform(-1.0, 1.0, (520, 517)).astype(np.float32)
+        y, x = np.unravel_index(values.argmax(), values.shape)
+        places = best_positions(torch.from_numpy(values), 3, 5)
+        assert places[0] == (x, y, float(values.max()))
+        for k, (u, v, score) in enumerate(places):
+            assert score == values[v, u]
+            assert all(max(abs(u - a), abs(v - b)) > 3 for a, b, _ in places[:k])
+
+
+@pytest.mark.parametrize("size", [(7, 9), (600, 600)])
+def test_places_that_do_not_count_are_no_places(size):
+    assert best_positions(torch.full(size, -1.0), 2, 3) == []
+
+
+# Summits
+
+
+def patch_of(polynomial, n):
+    y, x = np.mgrid[:n, :n] - n // 2
+    return polynomial(x.astype(float), y.astype(float))
+
+
+@given(
+    at=st.tuples(st.floats(-0.49, 0.49), st.floats(-0.49, 0.49)),
+    bend=st.tuples(st.floats(-1.0, -0.01), st.floats(-0.9, 0.9), st.floats(-1.0, -0.01)),
+    n=st.sampled_from([3, 5]),
+)
+def test_the_summit_of_a_paraboloid_is_exact(at, bend, n):
+    a, share, b = bend
+    c = share * np.sqrt(a * b)
+    x0, y0 = at
+
+    def paraboloid(x, y):
+        return 0.7 + 0.5 * (a * (x - x0) ** 2 + 2 * c * (x - x0) * (y - y0) + b * (y - y0) ** 2)
+
+    dx, dy, curvature = fit_summit(patch_of(paraboloid, n))
+    assert (dx, dy) == (pytest.approx(x0, abs=1e-6), pytest.approx(y0, abs=1e-6))
+    np.testing.assert_allclose(curvature, [[a, c], [c, b]], atol=1e-9)
+
+
+@given(
+    at=st.tuples(st.floats(-0.45, 0.45), st.floats(-0.45, 0.45)),
+    sharp=st.tuples(st.floats(0.0, 0.02), st.floats(0.0, 0.02), st.floats(0.0, 0.02)),
+    skew=st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)),
+)
+def test_the_summit_of_a_quartic_is_exact(at, sharp, skew):
+    """A polynomial of degree 4 in each axis with x^2 y^2, about a summit inside: all of it is in the family."""
+    (x0, y0), (p, q, r), (s, t) = at, sharp, skew
+
+    def along(u, u0, k, m):
+        # u-derivative is (u - u0) (-0.2 + m u + 4 k u^2): it vanishes at u0 alone within reach
+        return -0.1 * u * u + 0.2 * u0 * u + m * (u**3 / 3 - u0 * u * u / 2) + k * (u**4 - 4 * u0 * u**3 / 3)
+
+    def quartic(x, y):
+        both = r * (x * x - 2 * x0 * x) * (y * y - 2 * y0 * y) if x0 == y0 == 0.0 else 0.0
+        return 0.8 + along(x, x0, p, s) + along(y, y0, q, t) - both
+
+    dx, dy, curvature = fit_summit(patch_of(quartic, 5))
+    assert (dx, dy) == (pytest.approx(x0, abs=1e-4), pytest.approx(y0, abs=1e-4))
+    assert np.linalg.eigvalsh(curvature).max() < 0
+
+
+@pytest.mark.parametrize("n", [3, 5])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_an_offset_is_finite_and_at_most_half_a_pixel(n, seed):
+    patch = np.random.default_rng(seed).uniform(-1.0, 1.0, (n, n))
+    dx, dy, curvature = fit_summit(patch)
+    assert abs(dx) <= 0.5
+    assert abs(dy) <= 0.5
+    assert np.isfinite(curvature).all()
+    turned = fit_summit(np.ascontiguousarray(patch.T))
+    assert turned[:2] == (pytest.approx(dy, abs=1e-6), pytest.approx(dx, abs=1e-6))
+
+
+@pytest.mark.parametrize("n", [3, 5])
+def test_level_ground_ridges_and_bowls_have_no_summit(n):
+    for shape in (lambda x, y: 0 * x, lambda x, y: x * x + y * y, lambda x, y: x * x - y * y):
+        assert fit_summit(patch_of(shape, n))[:2] == (0.0, 0.0)

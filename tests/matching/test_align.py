@@ -1,0 +1,352 @@
+"""From frame to map: every sign and every half pixel, each against rays or rotations written out by hand.
+
+The frames of :class:`Ground` are drawn ray by ray, so that no homography of the engine checks itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from rasterio.transform import Affine
+
+from engine import Attitude, Camera, Fix, Frame, OptionError, OrthoMap, Prior, SceneMatcher
+from engine.kernels.scores import enhance
+from engine.matching.align import MAX_RAY_DEG, rectify, to_gray, view_of
+from tests.support.ground import Ground, ground_hits
+
+CAMERA = Camera.from_fov(300, 300, 60.0)
+UPRIGHT = np.array([[0.5, 0.0], [0.0, -0.5]])  # metres east and north per map pixel
+NADIR = np.array([310.0, 305.0])
+METHODS = ("ncc", "sift")
+PIXELS = 0.3  # the most that a fix may be off, in map pixels
+
+
+def locate(ground, camera, frame, method="ncc", nadir=NADIR):
+    return SceneMatcher(ground.site, camera, method, "cpu").locate(frame, ground.prior(nadir))
+
+
+def assert_found(result, nadir=NADIR, within=PIXELS):
+    assert isinstance(result, Fix), result
+    off = np.hypot(*(np.array(result.map_xy_px) - nadir))
+    assert off < within, f"{off:.3f} px off: {np.array(result.map_xy_px) - nadir}"
+
+
+def assert_not_found(result, by_px):
+    """The opposite sign would have been noticed: it ends in no fix or in a wrong one."""
+    assert not isinstance(result, Fix) or np.hypot(*(np.array(result.map_xy_px) - NADIR)) > by_px
+
+
+# The map
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("nadir", [(310.0, 305.0), (290.5, 320.25)])
+def test_half_pixel_of_the_map_a_place_is_counted_from_the_centre_of_the_first_pixel(
+    ground, camera, nadir, method
+):
+    result = locate(ground, camera, ground.frame(camera, np.array(nadir)), method, np.array(nadir))
+    assert_found(result, nadir, within=0.15)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_half_pixel_of_the_map_a_geotiff_counts_from_the_corner_of_the_first_pixel(
+    ground, camera, method, tmp_path
+):
+    left, top = ground.pixel_to_crs[:, 2] + (-0.5 * ground.gsd_m, 0.5 * ground.gsd_m)
+    corner = Affine(ground.gsd_m, 0.0, left, 0.0, -ground.gsd_m, top)
+    profile = {"driver": "GTiff", "dtype": "uint8", "crs": f"EPSG:{ground.epsg}", "transform": corner}
+    with rasterio.open(tmp_path / "map.tif", "w", width=640, height=600, count=1, **profile) as file:
+        file.write(ground.gray, 1)
+    matcher = SceneMatcher(OrthoMap.open(tmp_path / "map.tif"), camera, method, "cpu")
+    result = matcher.locate(ground.frame(camera, NADIR), ground.prior(NADIR))
+    assert_found(result, within=0.15)
+    east, north = ground.enu_from_pixel(NADIR)
+    assert (result.east_m, result.north_m) == (pytest.approx(east, abs=0.08), pytest.approx(north, abs=0.08))
+
+
+@pytest.mark.parametrize(("method", "lon_deg", "sign"), [("ncc", 17.9, 1.0), ("sift", 12.1, -1.0)])
+def test_meridian_convergence_heading_is_from_true_north_and_not_from_the_maps_up(camera, method, lon_deg, sign):
+    """At 60 degrees north and 2.9 degrees off the central meridian the map's up is 2.5 degrees off north."""
+    ground = Ground(lat_deg=60.0, lon_deg=lon_deg)
+    assert ground.site.info()["convergence_deg"] == pytest.approx(sign * 2.51, abs=0.02)
+    tilted = {"pitch_deg": 12.0, "heading_deg": 20.0}  # the aim lies 32 m ahead: 1.4 m aside for 2.5 degrees
+    result = locate(ground, camera, ground.frame(camera, NADIR, **tilted), method)
+    assert_found(result)
+
+
+# Equation 3: heading
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("heading_deg", [30.0, 90.0, 137.0, 271.5, 359.9])
+def test_sign_of_heading_is_clockwise_from_north(ground, camera, heading_deg, method):
+    frame = ground.frame(camera, NADIR, heading_deg=heading_deg)
+    assert_found(locate(ground, camera, frame, method))
+
+
+def test_sign_of_heading_turned_round_is_noticed(ground, camera):
+    image = ground.picture(camera, NADIR, 150.0, heading_deg=30.0)
+    assert_not_found(locate(ground, camera, Frame(image, 0, 150.0, -30.0, 0.0, 0.0)), by_px=3.0)
+
+
+def test_sign_of_heading_at_90_the_top_of_the_frame_lies_to_the_east():
+    picture = np.zeros((300, 300), np.uint8)
+    picture[20:40, 140:160] = 255  # near the top, in the middle
+    view = view_of(CAMERA, Attitude(0.0, 0.0, 90.0), 129.9, UPRIGHT)  # 0.5 m a pixel
+    patch = rectify(picture, CAMERA, view, fraction=1.0)
+    y, x = np.argwhere(patch.gray > 128).mean(axis=0) + patch.offset_px[::-1]
+    assert x == pytest.approx(120.0, abs=1.0)
+    assert y == pytest.approx(0.0, abs=1.0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("alpha_deg", [35.0, -110.0])
+def test_direction_of_the_rotation_undoes_a_frame_that_was_cut_out_of_the_map_with_a_known_turn(
+    ground, camera, alpha_deg, method
+):
+    """Equation 3 in pixels alone: the frame is the map itself, turned by OpenCV, at a scale of exactly 1."""
+    a = math.radians(alpha_deg)
+    # One pixel up in the frame is (sin a, -cos a) on the map, one to the right is (cos a, sin a).
+    turn = np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+    map_from_frame = np.c_[turn, NADIR - turn @ (149.5, 149.5)]
+    image = cv2.warpAffine(ground.gray, map_from_frame, (300, 300), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+    height_m = camera.focal_px * ground.site.gsd_m_per_px  # eq. 2: s = 1
+    frame = Frame(image, 0, height_m, alpha_deg % 360.0, 0.0, 0.0)
+    assert_found(locate(ground, camera, frame, method))
+
+
+# Equation 2: scale
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("height_m", [90.0, 150.0, 220.0])
+def test_scale_a_frame_from_any_height_is_drawn_in_the_maps_pixels(ground, camera, height_m, method):
+    assert_found(locate(ground, camera, ground.frame(camera, NADIR, height_m, heading_deg=12.0), method))
+
+
+def test_scale_is_height_over_focal_length_and_map_resolution():
+    """150 m over 0.53 m a pixel: 1.0894 map pixels a frame pixel."""
+    view = view_of(CAMERA, Attitude(0.0, 0.0, 0.0), 150.0, np.diag([0.53, -0.53]))
+    assert view.footprint_px == pytest.approx((1.08934 * 300, 1.08934 * 300), rel=1e-5)
+    assert view.area_px == pytest.approx((1.08934 * 300) ** 2, rel=1e-5)
+    np.testing.assert_allclose(view.center_px, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (301, 200)])
+def test_scale_of_frames_much_finer_than_the_map_keeps_their_place(ground, size):
+    """Every map pixel is the average of a dozen frame pixels, and none of the two rasters' half pixels is lost."""
+    camera = Camera.from_fov(4 * size[0], 4 * size[1], 60.0)
+    result = locate(ground, camera, ground.frame(camera, NADIR, 140.0, heading_deg=77.0))
+    assert_found(result, within=0.15)
+
+
+# Tilt
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("roll_deg", "heading_deg"), [(8.0, 90.0), (-15.0, 0.0), (-15.0, 200.0)])
+def test_sign_of_roll_is_right_side_down(ground, camera, roll_deg, heading_deg, method):
+    frame = ground.frame(camera, NADIR, roll_deg=roll_deg, heading_deg=heading_deg)
+    assert_found(locate(ground, camera, frame, method))
+
+
+def test_sign_of_roll_turned_round_is_noticed(ground, camera):
+    image = ground.picture(camera, NADIR, 150.0, roll_deg=5.0)
+    assert_not_found(locate(ground, camera, Frame(image, 0, 150.0, 0.0, -5.0, 0.0)), by_px=40.0)
+
+
+def test_sign_of_roll_right_side_down_the_camera_looks_to_the_left():
+    """Heading north: left is west. 150 tan 8 = 21.1 m, 42.2 map pixels."""
+    view = view_of(CAMERA, Attitude(8.0, 0.0, 0.0), 150.0, UPRIGHT)
+    np.testing.assert_allclose(view.center_px, [-42.16, 0.0], atol=0.01)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("pitch_deg", "heading_deg"), [(8.0, 90.0), (-15.0, 0.0), (-15.0, 200.0)])
+def test_sign_of_pitch_is_nose_up(ground, camera, pitch_deg, heading_deg, method):
+    frame = ground.frame(camera, NADIR, pitch_deg=pitch_deg, heading_deg=heading_deg)
+    assert_found(locate(ground, camera, frame, method))
+
+
+def test_sign_of_pitch_turned_round_is_noticed(ground, camera):
+    image = ground.picture(camera, NADIR, 150.0, pitch_deg=5.0)
+    assert_not_found(locate(ground, camera, Frame(image, 0, 150.0, 0.0, 0.0, -5.0)), by_px=40.0)
+
+
+def test_sign_of_pitch_nose_up_the_camera_looks_ahead():
+    """Heading north: ahead is up on the map. The paper's 7 degrees of vibration are 18.4 m at 150 m."""
+    view = view_of(CAMERA, Attitude(0.0, 7.0, 0.0), 150.0, UPRIGHT)
+    np.testing.assert_allclose(view.center_px * 0.5, [0.0, -18.4], atol=0.02)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_heading_pitch_and_roll_together_in_aerospace_order(ground, camera, method):
+    frame = ground.frame(camera, NADIR, roll_deg=-11.0, pitch_deg=9.0, heading_deg=233.0)
+    assert_found(locate(ground, camera, frame, method))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_camera_that_is_mounted_the_other_way_round_finds_the_same_place(ground, camera, method):
+    backwards = Camera(300, 300, camera.matrix, mount=camera.mount @ np.diag([-1.0, -1.0, 1.0]))
+    frame = ground.frame(camera, NADIR, roll_deg=4.0, pitch_deg=-6.0, heading_deg=51.0)
+    turned = Frame(np.ascontiguousarray(frame.image[::-1, ::-1]), 0, 150.0, 51.0, 4.0, -6.0)
+    assert_found(locate(ground, backwards, turned, method))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_off_centre_principal_point_is_honoured(ground, method):
+    matrix = np.array([[250.0, 0.0, 170.0], [0.0, 255.0, 110.0], [0.0, 0.0, 1.0]])
+    camera = Camera(320, 240, matrix)
+    frame = ground.frame(camera, NADIR, heading_deg=160.0, pitch_deg=3.0)
+    assert_found(locate(ground, camera, frame, method))
+
+
+@given(
+    roll=st.floats(-25.0, 25.0),
+    pitch=st.floats(-25.0, 25.0),
+    heading=st.floats(0.0, 360.0),
+    height=st.floats(2.0, 2000.0),
+    convergence=st.floats(-3.0, 3.0),
+)
+def test_the_view_is_what_rays_do(roll, pitch, heading, height, convergence):
+    c, s = math.cos(math.radians(convergence)), math.sin(math.radians(convergence))
+    jacobian = np.array([[c, s], [-s, c]]) @ UPRIGHT
+    attitude = {"roll_deg": roll, "pitch_deg": pitch, "heading_deg": heading}
+    view = view_of(CAMERA, Attitude(**attitude), height, jacobian)
+    pixels = np.array([[0.0, 0.0], [299.0, 0.0], [40.0, 250.0], [149.5, 149.5]])
+    hits_m = ground_hits(CAMERA, pixels, height, **attitude)
+    hits_px = np.linalg.solve(jacobian, hits_m.T).T
+    seen = np.c_[hits_px, np.ones(4)] @ view.image_from_map.T
+    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], pixels, atol=1e-6)
+    np.testing.assert_allclose(view.center_px, hits_px[3], atol=1e-6 * height)
+    corners = ground_hits(CAMERA, [[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]], height, **attitude)
+    corners = np.linalg.solve(jacobian, corners.T).T
+    np.testing.assert_allclose(view.footprint_px, np.ptp(corners, axis=0), rtol=1e-9)
+    x, y = corners.T
+    shoelace = 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+    assert view.area_px == pytest.approx(shoelace, rel=1e-4)
+
+
+@pytest.mark.parametrize("angle", [-1.0, 1.0])
+@pytest.mark.parametrize("axis", ["roll", "pitch"])
+def test_there_is_no_view_where_a_corner_looks_at_the_horizon(axis, angle):
+    # Each half of the frame spans 30 degrees; its corners lie a little further out.
+    for tilt, sees in (
+        (MAX_RAY_DEG - 30.0 - 5.0, True),
+        (MAX_RAY_DEG - 30.0, False),
+        (90.0, False),
+        (180.0, False),
+    ):
+        roll, pitch = (angle * tilt, 0.0) if axis == "roll" else (0.0, angle * tilt)
+        view = view_of(CAMERA, Attitude(roll, pitch, 30.0), 150.0, UPRIGHT)
+        assert (view is not None) == sees, tilt
+
+
+@given(
+    roll=st.floats(-25.0, 25.0),
+    pitch=st.floats(-25.0, 25.0),
+    heading=st.floats(0.0, 360.0),
+    fraction=st.floats(0.3, 1.0),
+)
+def test_a_patch_holds_frame_alone(roll, pitch, heading, fraction):
+    """No corner of the patch lies outside the frame, and it keeps to whole map pixels and to its fraction."""
+    view = view_of(CAMERA, Attitude(roll, pitch, heading), 150.0, UPRIGHT)
+    patch = rectify(np.full((300, 300), 9, np.uint8), CAMERA, view, fraction=fraction)
+    height, width = patch.gray.shape
+    corners = patch.offset_px + np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]])
+    seen = np.c_[corners, np.ones(4)] @ view.image_from_map.T
+    pixels = seen[:, :2] / seen[:, 2:]
+    assert pixels.min() > -1.5
+    assert pixels.max() < 300.5
+    assert (patch.offset_px == np.round(patch.offset_px)).all()
+    assert width * height <= fraction**2 * view.area_px * 1.001
+    assert (patch.gray == 9).all()
+
+
+def test_a_frame_that_covers_a_few_map_pixels_gives_no_patch():
+    view = view_of(CAMERA, Attitude(0.0, 0.0, 0.0), 4.0, UPRIGHT)  # 9 map pixels wide
+    assert rectify(np.zeros((300, 300), np.uint8), CAMERA, view) is None
+
+
+def test_the_longitude_of_a_prior_may_be_written_either_way(ground, camera):
+    frame = ground.frame(camera, NADIR)
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
+    results = [
+        matcher.locate(frame, Prior(lat_deg=ground.lat_deg, lon_deg=lon, sigma_m=12.0))
+        for lon in (ground.lon_deg, ground.lon_deg - 360.0)
+    ]
+    for result in results:
+        assert_found(result)
+
+
+# Grey and enhance
+
+
+def test_grey_is_luma_of_rgb():
+    image = np.zeros((2, 2, 3), np.uint8)
+    image[0, 0], image[0, 1], image[1, 0] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    gray = to_gray(Frame(image))
+    assert gray.tolist() == [[76, 150], [29, 0]]  # 0.299, 0.587, 0.114
+    assert to_gray(Frame(torch.from_numpy(image))).tolist() == gray.tolist()
+    assert to_gray(Frame(image[..., 1])).tolist() == image[..., 1].tolist()
+
+
+def binomial(gray):
+    """Rows and columns weighted 1-2-1, the border reflected about its pixels."""
+    wide = np.pad(gray.astype(float), 1, mode="reflect")
+    tall = wide[:-2] + 2 * wide[1:-1] + wide[2:]
+    return (tall[:, :-2] + 2 * tall[:, 1:-1] + tall[:, 2:]) / 16
+
+
+def test_enhance_is_the_local_normalisation_as_written():
+    gray = np.random.default_rng(0).integers(0, 256, (40, 50)).astype(np.uint8)
+    smooth = binomial(gray)
+    for enhanced in (enhance(gray, radius_px=3), enhance(gray, radius_px=3, valid=np.ones(gray.shape, bool))):
+        for y, x in ((10, 10), (20, 33), (36, 46)):
+            box = smooth[y - 3 : y + 4, x - 3 : x + 4]
+            expected = (smooth[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
+            assert enhanced[y, x] == pytest.approx(expected, abs=0.05)  # smoothed to whole grey levels
+
+
+@given(gain=st.floats(0.5, 1.0), offset=st.integers(0, 60), seed=st.integers(0, 1000))
+def test_enhance_takes_exposure_out(gain, offset, seed):
+    gray = np.random.default_rng(seed).integers(0, 190, (48, 48)).astype(np.uint8)
+    exposed = np.rint(gain * gray + offset).astype(np.uint8)
+    difference = enhance(exposed, radius_px=8) - enhance(gray, radius_px=8)
+    assert np.abs(difference).max() < 0.25  # what rounding to whole grey levels leaves
+    assert np.abs(difference).mean() < 0.05
+
+
+def test_enhance_leaves_flat_ground_flat_and_never_nan():
+    for level in (0, 17, 255):
+        assert np.abs(enhance(np.full((30, 30), level, np.uint8))).max() < 1e-2
+    nowhere = enhance(np.full((30, 30), 80, np.uint8), valid=np.zeros((30, 30), bool))
+    assert not nowhere.any()
+
+
+@pytest.mark.parametrize("radius_px", [0, 5])
+def test_enhance_does_not_see_what_is_not_valid(radius_px):
+    gray = np.random.default_rng(1).integers(0, 256, (60, 60)).astype(np.uint8)
+    valid = np.ones((60, 60), bool)
+    valid[:, 40:] = False
+    black, white = gray.copy(), gray.copy()
+    black[:, 40:], white[:, 40:] = 0, 255
+    first, second = (enhance(picture, radius_px=radius_px, valid=valid) for picture in (black, white))
+    np.testing.assert_allclose(first, second, atol=1e-6)
+    assert not first[:, 40:].any()
+    whole = enhance(gray, radius_px=radius_px)
+    np.testing.assert_allclose(first[:, :34], whole[:, :34], atol=0.6 if radius_px == 0 else 0.05)
+
+
+def test_enhance_with_no_neighbourhood_only_smooths():
+    gray = np.random.default_rng(2).integers(0, 256, (9, 7)).astype(np.uint8)
+    np.testing.assert_allclose(enhance(gray, radius_px=0), binomial(gray), atol=0.51)
+    with pytest.raises(OptionError, match=r"^radius_px: expected 0 or more, got -1"):
+        enhance(gray, radius_px=-1)

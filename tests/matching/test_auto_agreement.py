@@ -1,0 +1,60 @@
+"""Where NCC and SIFT differ: at one place SIFT's pose is taken and made vaguer, at two places nothing is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import Fix, NoFix, SceneMatcher
+from engine.matching.ncc import Ncc
+from engine.matching.sift import Sift
+from engine.values import Reason
+
+NADIR = np.array([310.0, 305.0])
+
+
+@pytest.mark.parametrize(("off_m", "same_place"), [(4.0, True), (25.0, False)])
+def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
+    ground, site, camera, monkeypatch, off_m, same_place
+):
+    frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
+    own, compared = Ncc.correlate, Sift.confirm
+    seen = []
+    monkeypatch.setattr(Sift, "confirm", lambda self, *args: seen.append(compared(self, *args)) or seen[-1])
+
+    def off(self, query, *args, **kwargs):
+        fix = own(self, query, *args, **kwargs)
+        return replace(fix, east_m=fix.east_m + off_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+
+    monkeypatch.setattr(Ncc, "correlate", off)
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda _self, _query: None)
+    monkeypatch.setattr(Ncc, "refine", lambda _self, _query, result: result)  # it would lead back
+    result = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
+    if same_place:
+        assert isinstance(result, Fix)
+        (sift,) = seen
+        assert (result.east_m, result.north_m) == (sift.east_m, sift.north_m)
+        assert result.covariance_m2[0, 0] > sift.covariance_m2[0, 0] + 0.8 * off_m**2
+    else:
+        assert isinstance(result, NoFix)
+        assert result.reason is Reason.INCONSISTENT
+
+
+def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, camera, monkeypatch):
+    """All of them are; a pose of few, a level coarser, is off by more."""
+    frame, prior = (
+        ground.frame(camera, NADIR, 150.0, heading_deg=20.0, roll_deg=0.0, pitch_deg=0.0),
+        ground.prior(NADIR),
+    )
+    few = Sift._by_few_features
+    matcher = SceneMatcher(site, camera, "auto", "cpu")
+    expected = matcher.locate(frame, prior)
+
+    def off(self, query):
+        fix = few(self, query)
+        return replace(fix, north_m=fix.north_m + 4.0, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+
+    monkeypatch.setattr(Sift, "_by_few_features", off)
+    result = matcher.locate(frame, prior)
+    assert result.stage == expected.stage == "verified"
+    assert (result.east_m, result.north_m) == (expected.east_m, expected.north_m)

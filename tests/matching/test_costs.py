@@ -1,0 +1,179 @@
+"""What steps are thought to cost after the runs that were seen; the clock is the numbers that a test gives."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from engine.budget import Budget, Deadline
+from engine.runtime import scheduler
+from engine.runtime.device import Device
+from engine.runtime.scheduler import MAX_WAIT_MS, RUNS, SEVERAL, Costs, OutOfTime, Scheduler
+
+ANY_MS = st.floats(1e-3, 1e6)
+RUN = st.tuples(st.sampled_from("abc"), ANY_MS, st.floats(0.0, 1.0))  # step, time taken, and the share of it used
+REGULAR = st.floats(0.8, 1.2)
+
+
+def note(costs, step, took_ms, used_share=1.0):
+    """A run of a step, which is one stage."""
+    costs.learn(step, 1.0, used_share * took_ms, took_ms)
+    costs.stages_ms.append((used_share * took_ms, (1.0 - used_share) * took_ms))
+
+
+def learned(runs):
+    costs = Costs()
+    for run in runs:
+        note(costs, *run)
+    return costs
+
+
+def can_afford(costs, step, left_ms, *, has_fix=False):
+    one = Scheduler(Deadline(Budget(total_ms=left_ms), lambda: 0), Device("cpu"), costs)
+    one.has_fix = has_fix
+    return one.can_afford({step: 1.0})
+
+
+@given(st.lists(RUN, max_size=60), st.booleans())
+def test_nothing_is_refused_for_its_cost_while_several_times_its_median_is_left(runs, has_fix):
+    """Whatever was run before it; beside a fix, while there is time for the longest wait as well."""
+    costs = learned(runs)
+    for step in "abc":
+        last = [took_ms for name, took_ms, _ in runs if name == step][-RUNS:]
+        left_ms = SEVERAL * np.percentile(last or [0.0], 50, method="lower") * (1.0 + 1e-9) + has_fix * MAX_WAIT_MS
+        assert can_afford(costs, step, left_ms + 1e-9, has_fix=has_fix)
+
+
+@given(
+    st.lists(REGULAR, min_size=0, max_size=40),
+    st.integers(0, 40),
+    ANY_MS,
+    st.floats(0.0, 1.0),
+    st.sampled_from(["step", "other"]),
+    st.booleans(),
+)
+def test_no_single_run_however_odd_refuses_a_step(regular, at, odd_ms, used_share, odd_step, has_fix):
+    """Of a step that takes 1 ms, give or take a fifth, when there are 2.5 ms."""
+    runs = [("step", ms) for ms in regular]
+    runs.insert(min(at, len(runs)), (odd_step, odd_ms, used_share))
+    assert can_afford(learned(runs), "step", 2.5, has_fix=has_fix)
+
+
+@pytest.mark.parametrize("runs", [[], [("step", 60_000.0)]])
+def test_a_step_that_never_ran_or_once_is_begun_unless_the_time_is_over(runs):
+    assert can_afford(learned(runs), "step", 1e-6)
+    late = Scheduler(
+        Deadline(Budget(total_ms=1.0), itertools.count(0, 10**9).__next__), Device("cpu"), learned(runs)
+    )
+    assert not late.can_afford({"step": 1.0})
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.25, 4.0, 10.0])
+def test_a_processor_of_another_pace_is_known_within_ten_frames(factor):
+    costs = learned([("step", 2.0)] * 50 + [("step", 2.0 * factor)] * 10)
+    assert costs.needed_ms("step", 1.0) == pytest.approx(2.0 * factor, rel=0.01)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
+def test_a_processor_that_others_use_is_known_within_ten_frames_also_for_steps_that_do_not_run(share):
+    """A frame has five stages; the process runs for a share of the time."""
+    costs = learned([("step", 2.0), ("rare", 20.0)] * 50)
+    for _ in range(10):
+        for stage in "abcde":
+            note(costs, stage, 1.0 / share, share)
+    assert costs.load() == pytest.approx(1.0 / share, rel=0.1)
+    assert costs.needed_ms("rare", 1.0) == pytest.approx(20.0 / share, rel=0.1)
+
+
+def test_steps_do_not_mix_and_more_work_costs_in_proportion():
+    costs = learned([("one", 7.0), ("other", 1.0)] * 5)
+    assert costs.needed_ms("one", 1.0) == pytest.approx(7.0)
+    assert costs.needed_ms("other", 30.0) == pytest.approx(30.0)
+
+
+def test_what_is_needed_is_rarely_exceeded():
+    rng = np.random.default_rng(0)
+    costs, exceeded = Costs(), 0
+    for n in range(3000):
+        ms = 3.5 * rng.gamma(100, 0.01)  # spread by a tenth
+        exceeded += n > 100 and ms > costs.needed_ms("step", 1.0)
+        note(costs, "step", ms)
+    assert exceeded < 0.03 * 2900
+    assert costs.needed_ms("step", 1.0) < 1.6 * 3.5  # and is no mere large number
+
+
+def test_a_wait_that_comes_again_is_left_time_for_beside_a_fix():
+    costs = learned([("step", 2.0)] * 40)
+    assert can_afford(costs, "step", 2.1, has_fix=True)
+    for _ in range(2):
+        note(costs, "step", 6.0, 1 / 3)
+    assert costs.wait_ms() == pytest.approx(4.0)
+    assert not can_afford(costs, "step", 6.0, has_fix=True)
+    assert can_afford(costs, "step", 6.0)
+
+
+def test_a_refusal_makes_a_step_seem_cheaper_until_it_runs():
+    costs = learned([("step", 5.0)] * 9)
+    for _ in range(200):
+        costs.note_refusal("step")
+    assert costs.needed_ms("step", 1.0) < 2.0
+    note(costs, "step", 5.0)  # tried in vain
+    assert costs.needed_ms("step", 1.0) == pytest.approx(5.0)
+    for _ in range(100):
+        costs.note_refusal("step")
+    note(costs, "step", 1.0)  # and has become cheap
+    assert costs.needed_ms("step", 1.0) == pytest.approx(1.0)
+    costs.note_refusal("other")
+    assert costs.needed_ms("other", 1.0) == 0.0
+
+
+def test_a_busy_machine_on_which_nothing_can_be_begun_is_soon_thought_idle():
+    costs = learned([("step", 20.0, 0.1)] * 48)
+    assert costs.load() == pytest.approx(10.0, rel=0.05)
+    for _ in range(24):
+        costs.note_refusal("step")
+        note(costs, "grey", 0.3)  # what each frame does
+    assert costs.load() < 1.01
+
+
+def clocked(budget_ms, costs, monkeypatch):
+    """A scheduler on a clock that the test turns."""
+    clock = {"ms": 0.0}
+    monkeypatch.setattr(scheduler.time, "thread_time_ns", lambda: round(clock["ms"] * 1e6))
+    deadline = Deadline(Budget(total_ms=budget_ms), lambda: round(clock["ms"] * 1e6))
+    return clock, Scheduler(deadline, Device("cpu"), costs)
+
+
+def abandoned(one, clock, **stages_ms):
+    """The stage before which a step was abandoned, None if it was not."""
+    try:
+        with one.costed("step", 1.0):
+            for name, ms in stages_ms.items():
+                with one.stage(name):
+                    clock["ms"] += ms
+    except OutOfTime:
+        return name
+    return None
+
+
+def test_what_is_abandoned_costs_more_than_the_time_that_it_had(monkeypatch):
+    costs = Costs()
+    for _ in range(RUNS):
+        clock, one = clocked(10.0, costs, monkeypatch)
+        assert abandoned(one, clock, first=12.0, second=1.0) == "second"
+    assert costs.needed_ms("step", 1.0) == pytest.approx(10.0)
+
+
+def test_beside_a_fix_a_step_is_abandoned_before_a_stage_that_would_lose_it(monkeypatch):
+    costs = Costs()
+    for _ in range(3):
+        clock, one = clocked(100.0, costs, monkeypatch)
+        assert abandoned(one, clock, match=4.0, pose=5.0) is None
+    clock, one = clocked(10.0, costs, monkeypatch)
+    with one.with_fix():
+        assert abandoned(one, clock, match=6.0, pose=5.0) == "pose"  # the first took longer than usual
+    assert one.deadline.met

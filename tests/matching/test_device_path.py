@@ -1,0 +1,337 @@
+"""What crosses between the host and a GPU, counted on a pretended device; and that its answers are the CPU's."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import engine.runtime.device
+from bench.inputs.scenes import flight
+from engine import Fix, SceneMatcher
+from engine.errors import OptionError, ShapeError
+from engine.features import match, sift
+from engine.kernels.peaks import find_peak
+from engine.ncc_fft import match_template, match_templates, ncc, prepare
+from engine.runtime.tensors import download, upload
+from tests.support.pretended import DEVICE, Pretended, pretended_device
+
+CPU = torch.device("cpu")
+SUMMIT = 28  # numbers that a peak is made of
+
+
+def picture(height, width, seed):
+    rng = torch.Generator().manual_seed(seed)
+    rough = torch.randn(1, 1, height, width, generator=rng)
+    return torch.nn.functional.avg_pool2d(rough, 5, stride=1, padding=2)[0, 0] * 4.0
+
+
+def cut(image, size, seed):
+    """A noisy part of a picture."""
+    rng = torch.Generator().manual_seed(seed)
+    y, x = ((n - m) // 3 for n, m in zip(image.shape, size, strict=True))
+    return image[y : y + size[0], x : x + size[1]] + 0.05 * torch.randn(*size, generator=rng)
+
+
+def assert_same_peak(found, expected):
+    assert (found.x, found.y) == pytest.approx((expected.x, expected.y), abs=1e-4)
+    assert (found.score, found.second_score) == pytest.approx((expected.score, expected.second_score), abs=1e-6)
+    np.testing.assert_allclose(found.curvature, expected.curvature, atol=1e-5)
+
+
+# ------------------------------------------------------------------------- the pretended device itself
+
+
+def test_the_pretended_device_counts_what_would_cross_or_wait():
+    with pretended_device() as crossings:
+        there = torch.arange(12.0).view(3, 4).to(DEVICE)
+        assert isinstance(there, Pretended)
+        assert there.device.type != "cpu"
+        assert (crossings.uploads, crossings.downloads, crossings.waits) == ([12], [], [])
+        assert float(there.sum()) == 66.0
+        assert there[there > 3.0].shape == (8,)
+        assert len(there.nonzero()) == 11
+        assert len(crossings.waits) == 3
+        np.testing.assert_array_equal((there * 2.0).cpu().numpy()[2], [16.0, 18.0, 20.0, 22.0])
+        assert crossings.downloads == [12]
+        assert there[torch.tensor([2, 0])].shape == (2, 4)  # an index of the host's is uploaded
+        assert crossings.uploads == [12, 2]
+        with pytest.raises(RuntimeError, match="expected all tensors on one device"):
+            there + torch.ones(3, 4)
+
+
+def test_the_pretended_device_computes_as_the_cpu_does():
+    image = picture(40, 51, 0)
+    with pretended_device():
+        there = image.to(DEVICE)
+        spectrum = torch.fft.rfft2(there)
+        product = torch.fft.irfft2(spectrum * spectrum.conj(), s=image.shape)
+        there[3:5].add_(1.0)
+        back, changed = product.cpu(), there.cpu()
+    spectrum = torch.fft.rfft2(image)
+    torch.testing.assert_close(back, torch.fft.irfft2(spectrum * spectrum.conj(), s=image.shape))
+    torch.testing.assert_close(changed[3:5], image[3:5] + 1.0)
+
+
+def test_arrays_cross_in_one_copy_and_come_back_as_they_were():
+    rng = np.random.default_rng(0)
+    arrays = [
+        rng.random((5, 3)).astype(np.float32),
+        rng.random(7) > 0.5,
+        np.zeros((0, 2), np.int64),
+        rng.integers(0, 9, (3, 2)),
+        rng.random((4, 4))[:, ::2],
+        rng.random(3).astype(np.float16),
+    ]
+    for device in (CPU, DEVICE):
+        with pretended_device() as crossings:
+            tensors = upload(arrays, device)
+            assert len(crossings.uploads) == (device != CPU)
+            back = download(tensors)
+            assert len(crossings.downloads) == (device != CPU)
+        for one, other in zip(arrays, back, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+
+
+# ------------------------------------------------------------------------- NCC
+
+
+@pytest.mark.parametrize(
+    ("size", "model"), [((150, 131), (63, 50)), ((425, 425), (228, 228)), ((64, 63), (63, 63))]
+)
+def test_a_match_uploads_a_template_and_downloads_28_numbers(size, model):
+    image = picture(*size, 1)
+    template = cut(image, model, 2)
+    expected = match_template(prepare(image), template, exclusion_px=5.0, exhaustive=True)
+    with pretended_device() as crossings:
+        search = prepare(image.to(DEVICE))
+        crossings.uploads.clear()
+        found = match_template(search, template.to(DEVICE), exclusion_px=5.0)
+    assert (crossings.uploads, crossings.downloads, crossings.waits) == ([template.numel()], [SUMMIT], [])
+    assert_same_peak(found, expected)
+
+
+def test_shapes_on_the_device_do_not_depend_on_values():
+    traces = []
+    for seed in (1, 2):
+        image = picture(150, 131, seed) if seed == 1 else torch.zeros(150, 131)
+        with pretended_device() as crossings:
+            search, template = prepare(image.to(DEVICE)), cut(picture(150, 131, seed), (63, 50), seed).to(DEVICE)
+            crossings.trace.clear()
+            match_template(search, template, exclusion_px=5.0)
+        traces.append(crossings.trace)
+    assert traces[0] == traces[1]
+
+
+SIZES = [((150, 131), (63, 50)), ((90, 131), (31, 50)), ((150, 131), (63, 50)), ((150, 131), (61, 50))]
+
+
+def test_a_batch_is_downloaded_once_and_matches_as_its_pairs_do():
+    images = [picture(*size, i) for i, (size, _) in enumerate(SIZES)]
+    templates = [cut(image, model, 9) for image, (_, model) in zip(images, SIZES, strict=True)]
+    with pretended_device() as crossings:
+        searches = [prepare(image.to(DEVICE)) for image in images]
+        there = [template.to(DEVICE) for template in templates]
+        alone = [match_template(s, t, exclusion_px=5.0) for s, t in zip(searches, there, strict=True)]
+        crossings.downloads.clear()
+        found = match_templates(searches, there, exclusion_px=5.0)
+        assert (crossings.downloads, crossings.waits) == ([SUMMIT * len(SIZES)], [])
+        assert match_templates([], [], exclusion_px=5.0) == []
+    on_cpu = match_templates([prepare(image) for image in images], templates, exclusion_px=5.0)
+    for one, other, third in zip(found, alone, on_cpu, strict=True):
+        assert_same_peak(one, other)
+        assert (one.x, one.y, one.score) == pytest.approx((third.x, third.y, third.score), abs=1e-3)
+
+
+def test_a_batch_needs_as_many_templates_as_parts():
+    with pytest.raises(ShapeError, match=r"^templates: expected 1 \(searches\), got 2$"):
+        match_templates([prepare(torch.rand(20, 20))], [torch.rand(5, 5)] * 2, exclusion_px=3.0)
+
+
+def test_a_large_window_is_matched_in_blocks_on_a_device_too(monkeypatch):
+    from engine.kernels import eager
+
+    images = [picture(300, 310, i) for i in range(2)]
+    templates = [cut(image, (20, 22), 3) for image in images]
+    monkeypatch.setattr(eager, "_MIN_BLOCKED_PX", 1)
+    monkeypatch.setattr(eager, "_MIN_BLOCK_PX", 60)
+    with pretended_device() as crossings:
+        searches = [prepare(image.to(DEVICE)) for image in images]
+        found = match_templates(searches, [t.to(DEVICE) for t in templates], exclusion_px=5.0)
+        assert crossings.waits == []
+    for peak, image, template in zip(found, images, templates, strict=True):
+        assert_same_peak(peak, match_template(prepare(image), template, exclusion_px=5.0, exhaustive=True))
+
+
+@pytest.mark.parametrize("zero_mean", [True, False])
+def test_the_surface_waits_for_the_check_of_its_arguments_alone(zero_mean):
+    windows = torch.stack([picture(70, 81, i) for i in range(2)]) + 3.0
+    templates = torch.stack([torch.stack([cut(w, (20, 31), i) for i in range(3)]) for w in windows])
+    with pretended_device() as crossings:
+        found = ncc(windows.to(DEVICE), templates.to(DEVICE), zero_mean=zero_mean)
+        assert (len(crossings.uploads), crossings.downloads, crossings.waits) == (2, [2], [])
+        back = found.cpu()
+    torch.testing.assert_close(back, ncc(windows, templates, zero_mean=zero_mean), atol=2e-6, rtol=0)
+
+
+def test_masks_do_not_make_the_host_wait():
+    window, template = picture(70, 81, 0), cut(picture(70, 81, 0), (20, 31), 1)
+    valid = torch.ones(70, 81, dtype=torch.bool)
+    valid[:, 50:] = False
+    with pretended_device() as crossings:
+        given = (window[None].to(DEVICE), template[None, None].to(DEVICE))
+        scores = ncc(*given, search_valid=valid[None].to(DEVICE))
+        peak = find_peak(scores[0, 0], exclusion_px=4.0)
+        assert (crossings.downloads, crossings.waits) == ([2, SUMMIT], [])
+    expected = ncc(window[None], template[None, None], search_valid=valid[None])[0, 0]
+    assert_same_peak(peak, find_peak(expected, exclusion_px=4.0))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("name", ["search", "templates"])
+def test_values_that_are_not_finite_are_refused_on_a_device(name, bad):
+    tensors = {"search": picture(30, 31, 0)[None], "templates": picture(8, 9, 1)[None, None]}
+    tensors[name].view(-1)[5] = bad
+    with pretended_device(), pytest.raises(OptionError, match=f"^{name}: expected finite values"):
+        ncc(*(tensor.to(DEVICE) for tensor in tensors.values()))
+
+
+# ------------------------------------------------------------------------- SIFT
+
+
+def scenes():
+    from bench.inputs.scenes import town_gray
+
+    parts = [town_gray(1)[y : y + 150, 100:270] for y in (100, 300)]
+    return torch.from_numpy(np.stack(parts))[:, None].float() / 255.0
+
+
+OPTIONS = {
+    "usual": {},
+    "upright": {"upright": True, "up_deg": 30.0},
+    "not doubled": {"upsample": 1, "contrast_threshold": 0.005, "max_keypoints": 900},
+    "strongest": {"spread": 1, "root": False, "max_keypoints": 20},
+    "more slots than keypoints": {"max_keypoints": 4000},
+}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(options, id=name, marks=[] if name in ("usual", "upright") else [pytest.mark.slow])
+        for name, options in OPTIONS.items()
+    ],
+)
+def test_features_do_not_make_the_host_wait_and_are_the_cpus(options):
+    pictures = scenes()
+    mask = torch.ones_like(pictures, dtype=torch.bool)
+    mask[:, :, :40] = False
+    with pretended_device():
+        there, allowed = upload([pictures.numpy(), mask.numpy()], DEVICE)
+        sift(there, **options)  # what depends on the size alone is uploaded once
+    for own_mask, its_mask in ((None, None), (mask, allowed)):
+        expected = sift(pictures, mask=own_mask, **options)
+        with pretended_device() as crossings:
+            found = sift(there, mask=its_mask, **options)
+            assert (crossings.uploads, crossings.downloads, crossings.waits) == ([], [], [])
+            found = download([found.valid, found.xy_px, found.scale_px, found.descriptors])
+        assert_same_features(found, expected)
+
+
+def assert_same_features(found, expected):
+    """Nearly all of them, in both pictures."""
+    valid, xy, scale, descriptors = found
+    own = expected.valid.numpy()
+    assert abs(int(valid.sum()) - int(own.sum())) <= 0.01 * own.sum()
+    assert not xy[~valid].any()
+    assert not descriptors[~valid].any()
+    for b in range(2):
+        mine, theirs = xy[b][valid[b]], expected.xy_px[b].numpy()[own[b]]
+        apart = np.hypot(*(mine[:, None] - theirs[None]).transpose(2, 0, 1))
+        apart += np.abs(scale[b][valid[b]][:, None] - expected.scale_px[b].numpy()[own[b]][None])
+        nearest = apart.argmin(1)
+        same = apart.min(1) < 0.01
+        assert same.mean() >= 0.98
+        difference = np.abs(descriptors[b][valid[b]] - expected.descriptors[b].numpy()[own[b]][nearest]).max(1)
+        assert (difference[same] < 1e-3).mean() >= 0.98
+
+
+def test_shapes_of_features_and_matches_do_not_depend_on_values():
+    traces = []
+    for pictures in (scenes(), torch.zeros_like(scenes())):
+        with pretended_device() as crossings:
+            there = pictures.to(DEVICE)
+            sift(there)
+            crossings.trace.clear()
+            found = sift(there)
+            match(found, found, max_angle_diff_deg=20.0, max_scale_factor=1.5)
+            assert crossings.waits == []
+        traces.append(crossings.trace)
+    assert traces[0] == traces[1]
+
+
+@pytest.mark.parametrize("size", [(5, 5), (9, 40), (12, 12), (33, 121)])
+def test_a_picture_of_any_size_has_features_on_a_device(size):
+    image = picture(*size, 3)[None, None].clamp(0.0, 1.0)
+    expected = sift(image, max_keypoints=20)
+    with pretended_device():
+        found = sift(image.to(DEVICE), max_keypoints=20)
+        valid, angles = download([found.valid, found.angle_deg])
+    np.testing.assert_array_equal(valid, expected.valid.numpy())
+    assert np.isfinite(angles).all()
+
+
+@pytest.mark.slow
+def test_a_picture_with_more_extrema_than_there_is_room_for_keeps_what_fits():
+    ramp = torch.arange(240) // 4
+    chess = ((ramp[:, None] + ramp) % 2).float()[None, None]
+    everything = sift(chess, upsample=1, max_keypoints=20_000)
+    with pretended_device() as crossings:
+        found = sift(chess.to(DEVICE), upsample=1, max_keypoints=20_000)
+        assert crossings.waits == []
+        valid, descriptors = download([found.valid, found.descriptors])
+    assert 0 < valid.sum() < everything.valid.sum()
+    np.testing.assert_allclose(np.linalg.norm(descriptors[valid], axis=1), 1.0, atol=1e-5)
+
+
+def test_matches_are_the_cpus():
+    expected = match(*(sift(scene[None]) for scene in scenes()), max_scale_factor=2.0)
+    with pretended_device() as crossings:
+        found = match(*(sift(scene[None].to(DEVICE)) for scene in scenes()), max_scale_factor=2.0)
+        assert (crossings.downloads, crossings.waits) == ([], [])
+        index, valid = download([found.train_index, found.valid])
+    agreeing = (index == expected.train_index.numpy()) & (valid == expected.valid.numpy())
+    assert agreeing.mean() >= 0.95
+
+
+# ------------------------------------------------------------------------- whole frames
+
+# Copies per frame once the map is prepared: the template up, the peak down; the orthophoto and the landmarks of
+# the window up, the pairs down.
+COPIES = {"ncc": (1, 1), "sift": (2, 1), "auto": (3, 2)}
+METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-6}
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", pytest.param("auto", marks=pytest.mark.slow)])
+def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, monkeypatch):
+    scene = flight(3)
+    matcher = SceneMatcher(scene.site, scene.camera, method, "cpu")
+    expected = [matcher.locate(*pair) for pair in zip(scene.frames, scene.priors, strict=True)]
+    monkeypatch.setattr(engine.runtime.device, "resolve", lambda name: DEVICE)
+    with pretended_device() as crossings:
+        matcher = SceneMatcher(scene.site, scene.camera, method)
+        for frame, prior in zip(scene.frames, scene.priors, strict=True):
+            matcher.locate(frame, prior)  # regions, landmarks and plans are made
+        for frame, prior, fix in zip(scene.frames, scene.priors, expected, strict=True):
+            crossings.uploads.clear()
+            crossings.downloads.clear()
+            found = matcher.locate(frame, prior)
+            assert (len(crossings.uploads), len(crossings.downloads)) == COPIES[method]
+            assert crossings.waits == []
+            assert isinstance(found, Fix)
+            assert isinstance(fix, Fix)
+            apart_m = math.hypot(found.east_m - fix.east_m, found.north_m - fix.north_m)
+            assert apart_m < METRES[method]

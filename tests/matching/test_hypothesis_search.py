@@ -1,0 +1,179 @@
+"""The bank of headings and heights, frame by frame over a simulated town: the right place, or a refusal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
+from engine.matching import hypothesis_search, ncc
+from engine.options import NccOptions
+from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
+from tests.support.towns import drawn_town, site_of
+
+EXACT = SensorNoise(
+    height_sd_m=0.0, height_drift_sd_m=0.0, heading_sd_deg=0.0, heading_bias_deg=0.0, tilt_sd_deg=0.0,
+    velocity_sd_mps=0.0,
+)  # fmt: skip
+PLACES = (0, 5, 9, 13)
+# (degrees, share) by which the telemetry is off; 5 and 0.05 are searched
+OFF = [
+    (5.0, 0.05), pytest.param(0.0, 0.0, marks=pytest.mark.slow), pytest.param(3.3, -0.05, marks=pytest.mark.slow),
+    pytest.param(-5.0, 0.03, marks=pytest.mark.slow), pytest.param(-1.7, -0.02, marks=pytest.mark.slow),
+]  # fmt: skip
+
+KNOWN = pytest.mark.parametrize(
+    "known", [pytest.param(True, id="prior"), pytest.param(False, id="whole map", marks=pytest.mark.slow)]
+)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """A flight whose telemetry is the truth: what is off, the tests put there."""
+    plan = plan_flight(3, town=drawn_town(1), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
+    return plan.draw()
+
+
+@pytest.fixture(scope="module")
+def site(flight):
+    return site_of(flight.town)
+
+
+@pytest.fixture(scope="module")
+def matcher(site, flight):
+    def build(town_site=site, **options):
+        return SceneMatcher(town_site, flight.camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(**options)))
+
+    return build
+
+
+def near(truth, sigma_m=8.0):
+    return Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=sigma_m)
+
+
+def stated(frame, turn_deg=0.0, share=0.0):
+    heading = (frame.heading_deg + turn_deg) % 360.0
+    return replace(frame, heading_deg=heading, height_agl_m=frame.height_agl_m * (1.0 + share))
+
+
+def turn_between(a_deg, b_deg):
+    return abs((a_deg - b_deg + 180.0) % 360.0 - 180.0)
+
+
+@pytest.fixture
+def aligned_heights(monkeypatch):
+    """The heights of the hypotheses behind the fixes; a fix does not have them."""
+    heights, real = [], ncc.fix_of
+
+    def noting(correlator, aligned, *rest, **named):
+        heights.append(aligned.pose.height_agl_m)
+        return real(correlator, aligned, *rest, **named)
+
+    monkeypatch.setattr(ncc, "fix_of", noting)
+    return heights
+
+
+@pytest.mark.slow
+@KNOWN
+@pytest.mark.parametrize(("turn_deg", "share"), OFF)
+def test_a_wrong_heading_and_height_are_put_right(
+    matcher, site, flight, error_m, aligned_heights, turn_deg, share, known
+):
+    bank = matcher(heading_search_deg=5.0, height_search_share=0.05)
+    for k in PLACES:
+        frame, truth = flight.frames[k], flight.truth[k]
+        fix = bank.locate(stated(frame, turn_deg, share), near(truth) if known else None)
+        assert error_m(site, fix, truth) < 2.0
+        assert turn_between(fix.attitude.heading_deg, truth.heading_deg) < 0.3
+        assert aligned_heights[-1] == pytest.approx(truth.height_agl_m, rel=0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site, flight, error_m, known):
+    bank = matcher(heading_search_deg=180.0)
+    fixes = 0
+    for k in PLACES:
+        truth = flight.truth[k]
+        result = bank.locate(replace(flight.frames[k], heading_deg=None), near(truth) if known else None)
+        if isinstance(result, Fix):
+            fixes += 1
+            assert error_m(site, result, truth) < 2.0
+            assert turn_between(result.attitude.heading_deg, truth.heading_deg) < 0.3
+    assert fixes >= len(PLACES) - 1
+
+
+@KNOWN
+def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matcher, flight, known):
+    """Where the heading is given and trusted, a search of the whole map measures no attitude either."""
+    frame, truth = flight.frames[PLACES[0]], flight.truth[PLACES[0]]
+    fix = matcher().locate(frame, near(truth) if known else None)
+    assert isinstance(fix, Fix)
+    assert fix.stage == "refined" or fix.attitude is None
+    unrefined = matcher(refine=False).locate(frame, near(truth) if known else None)
+    assert isinstance(unrefined, Fix)
+    assert unrefined.attitude is None
+
+
+@pytest.mark.slow
+@KNOWN
+def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
+    bank = matcher(other_site, heading_search_deg=5.0, height_search_share=0.05)
+    prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
+    for k in PLACES:
+        assert isinstance(bank.locate(flight.frames[k], prior), NoFix)
+
+
+@pytest.mark.slow
+@KNOWN
+def test_a_frame_of_another_town_is_refused_all_around(matcher, other_site, flight, known):
+    bank = matcher(other_site, heading_search_deg=180.0)
+    prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
+    for k in PLACES:
+        assert isinstance(bank.locate(replace(flight.frames[k], heading_deg=None), prior), NoFix)
+
+
+@pytest.mark.slow
+def test_a_frame_of_another_town_scores_far_below_one_of_this(matcher, other_site, flight):
+    """What tells them apart where every heading is tried: 0.3 and less against 0.7 and more."""
+    here, there = matcher(heading_search_deg=180.0), matcher(other_site, heading_search_deg=180.0)
+    for k in PLACES:
+        frame = replace(flight.frames[k], heading_deg=None)
+        assert here.locate(frame).score > 0.7
+        assert there.locate(frame).score < 0.3
+
+
+@pytest.fixture
+def looked_on(monkeypatch):
+    """The levels on which all hypotheses were scored, in turn."""
+    levels, real = [], hypothesis_search._from_level
+
+    def noting(correlator, first, window, level, poses):
+        levels.append(level)
+        return real(correlator, first, window, level, poses)
+
+    monkeypatch.setattr(hypothesis_search, "_from_level", noting)
+    return levels
+
+
+def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
+    matcher, site, flight, looked_on, monkeypatch
+):
+    unknown = replace(flight.frames[5], heading_deg=None)
+    quick = matcher(heading_search_deg=180.0).locate(unknown)
+    levels = list(looked_on)
+    monkeypatch.setattr(hypothesis_search, "_MIN_QUICK_SCORE", 2.0)  # nothing is beyond doubt
+    thorough = matcher(heading_search_deg=180.0).locate(unknown)
+    assert len(levels) == 1
+    assert looked_on == [*levels, *levels, levels[0] - 1]
+    assert abs(quick.east_m - thorough.east_m) < 0.1
+    assert abs(quick.north_m - thorough.north_m) < 0.1
+    assert turn_between(quick.attitude.heading_deg, thorough.attitude.heading_deg) < 0.1
+
+
+def test_a_place_in_doubt_at_a_quick_look_is_looked_for_thoroughly(matcher, other_site, flight, looked_on):
+    result = matcher(other_site, heading_search_deg=20.0).locate(flight.frames[5])
+    assert isinstance(result, NoFix)
+    assert len(looked_on) == 2
+    assert looked_on[0] == looked_on[1] + 1

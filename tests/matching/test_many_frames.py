@@ -1,0 +1,205 @@
+"""Many frames at once: the answers of one at a time, in their order, by processes and by threads."""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from engine import (
+    BackendError,
+    Budget,
+    CalibrationError,
+    Fix,
+    Frame,
+    MatcherOptions,
+    NoFix,
+    OptionError,
+    Prior,
+    Reason,
+    SceneMatcher,
+    SiftOptions,
+)
+from engine.runtime import workers as processes
+from engine.runtime.scheduler import Costs
+
+METHODS = ("ncc", "sift", "auto")
+PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
+
+
+@pytest.fixture(autouse=True)
+def _started_at_once(monkeypatch):
+    """Workers are started after the first task, however little work it is."""
+    monkeypatch.setattr(processes, "_ALONE_S", 0.0)
+    monkeypatch.setattr(processes, "_WORTH_S", 0.0)
+
+
+@pytest.fixture(scope="module")
+def matchers(ground, camera):
+    return {method: SceneMatcher(ground.site, camera, method, "cpu") for method in METHODS}
+
+
+@pytest.fixture(scope="module")
+def questions(ground, camera):
+    """Frames with their priors: places in a row, ways to be refused, and a search of the map."""
+    frames = [
+        ground.frame(camera, nadir, heading_deg=20.0 * k, roll_deg=2.0, pitch_deg=-1.0, timestamp_ns=k)
+        for k, nadir in enumerate(PLACES)
+    ]
+    priors = [ground.prior(nadir) for nadir in PLACES]
+    flat = Frame(np.full((300, 300), 90, np.uint8), 100, 150.0, 0.0, 0.0, 0.0)
+    frames += [flat, replace(frames[0], height_agl_m=None), frames[1], frames[2]]
+    priors += [priors[0], priors[0], Prior(east_m=9e3, north_m=0.0, sigma_m=5.0), None]
+    return frames, priors
+
+
+def values(result):
+    """Everything in a result that does not tell the time."""
+    if isinstance(result, NoFix):
+        return result.timestamp_ns, result.reason, result.detail, result.score, result.window, result.method
+    place = (result.lat_deg, result.lon_deg, result.up_m, result.map_xy_px, result.covariance_m2.tolist())
+    return result.timestamp_ns, *place, result.score, result.window, result.stage, result.confidence
+
+
+@pytest.mark.parametrize(
+    "method", ["ncc", *(pytest.param(method, marks=pytest.mark.slow) for method in ("sift", "auto"))]
+)
+def test_many_frames_have_the_answers_of_each_alone_in_order(matchers, questions, method):
+    matcher, (frames, priors) = matchers[method], questions
+    alone = [values(matcher.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
+    for workers in (1, 3):
+        together = matcher.locate_many(frames, priors, workers=workers)
+        assert [values(result) for result in together] == alone
+    assert {Fix, NoFix} == {type(result) for result in together}
+    assert together[6].reason is Reason.NO_TEXTURE
+    assert together[8].reason is Reason.OUTSIDE_MAP
+
+
+def test_other_processes_did_the_work(matchers, questions, monkeypatch):
+    matcher, (frames, priors) = matchers["ncc"], questions
+    here = []
+    locate = matcher.locate
+    monkeypatch.setattr(matcher, "locate", lambda *question: here.append(question) or locate(*question))
+    assert len(matcher.locate_many(frames, priors, workers=2)) == len(frames)
+    assert len(here) == 1
+
+
+def test_threads_of_ones_own_may_share_a_matcher(ground, camera, questions):
+    frames, priors = questions
+    for method in ("ncc", "sift"):
+        alone = SceneMatcher(ground.site, camera, method, "cpu")
+        expected = [values(alone.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
+        shared = SceneMatcher(ground.site, camera, method, "cpu")  # nothing is cached yet
+        with ThreadPoolExecutor(4) as threads:
+            for _ in range(2):
+                assert [values(result) for result in threads.map(shared.locate, frames, priors)] == expected
+
+
+def test_threads_learn_one_cost():
+    costs = Costs()
+
+    def learn(_):
+        for work in range(1, 200):
+            costs.learn("step", float(work), 2.0 * work, 2.0 * work)
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(learn, range(8)))
+    assert costs.needed_ms("step", 100.0) == pytest.approx(200.0, rel=1e-6)
+
+
+def test_no_frames_have_no_answers(matchers):
+    assert matchers["ncc"].locate_many([], []) == []
+
+
+def test_every_frame_has_the_budget(matchers, questions):
+    frames, priors = questions
+    refused = matchers["ncc"].locate_many(frames[:6], priors[:6], Budget(total_ms=1e-6), workers=2)
+    assert {result.reason for result in refused} == {Reason.LATE}
+
+
+def test_frames_and_priors_of_different_number_are_refused(matchers, questions):
+    frames, priors = questions
+    with pytest.raises(OptionError, match=r"^priors: expected one a frame, 10, got 9$"):
+        matchers["ncc"].locate_many(frames, priors[1:])
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_names_the_first_frame_that_has_it(matchers, questions, workers):
+    frames, priors = list(questions[0]), questions[1]
+    for index in (4, 7):
+        frames[index] = replace(frames[index], image=np.zeros((10, 20 + index), np.uint8))
+    with pytest.raises(CalibrationError, match=r"^frames\[4\]: camera: calibrated .* frame is 24 x 10$"):
+        matchers["ncc"].locate_many(frames, priors, workers=workers)
+
+
+def _fails(_frame, _crop):
+    raise ZeroDivisionError("a matcher of one's own")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_somebody_elses_code_is_theirs_and_names_the_frame(ground, camera, questions, workers):
+    frames, priors = (part[:4] for part in questions)
+    matcher = SceneMatcher(ground.site, camera, "sift", "cpu", MatcherOptions(sift=SiftOptions(matcher=_fails)))
+    with pytest.raises(ZeroDivisionError, match="of one's own") as caught:
+        matcher.locate_many(frames, priors, workers=workers)
+    assert "It is of frames[0]." in caught.value.__notes__
+
+
+def test_workers_are_refused_by_what_there_is(matchers, ground, camera, questions, monkeypatch):
+    frames, priors = questions
+    matcher = matchers["ncc"]
+    with pytest.raises(OptionError, match=r"^workers: expected 1 or more, got 0$"):
+        matcher.locate_many(frames, priors, workers=0)
+    with monkeypatch.context() as patch:
+        patch.setattr("engine.runtime.workers.sys.platform", "darwin")
+        with pytest.raises(OptionError, match=r"^workers: expected 1 here: only Linux forks"):
+            matcher.locate_many(frames, priors, workers=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(matcher, "device", torch.device("cuda:0"))
+        with pytest.raises(OptionError, match=r"^workers: expected 1 on cuda:0, got 2$"):
+            matcher.locate_many(frames, priors, workers=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(ground.site), "reads_files", True)
+        with pytest.raises(OptionError, match=r"^workers: expected 1 with .*, which is read from its file"):
+            matcher.locate_many(frames, priors, workers=2)
+
+
+def test_nothing_is_forked_beside_other_threads():
+    leave = threading.Event()
+    other = threading.Thread(target=leave.wait)
+    other.start()
+    try:
+        assert processes.safe_count() == 1
+    finally:
+        leave.set()
+        other.join()
+
+
+def test_results_come_in_order_while_workers_go_on():
+    assert list(processes.in_order(lambda task: task * task, 50, 3)) == [task * task for task in range(50)]
+
+
+def test_a_worker_that_ends_is_an_error_and_leaves_no_process():
+    parent = os.getpid()
+
+    def ends(task):
+        if os.getpid() != parent:
+            os._exit(7)
+        return task
+
+    with pytest.raises(BackendError, match=r"^workers: a process ended with code 7$"):
+        list(processes.in_order(ends, 20, 2))
+
+
+def test_workers_end_with_who_no_longer_asks():
+    results = processes.in_order(lambda _: os.getpid(), 100, 2)
+    assert next(results) == os.getpid()
+    worker = next(results)
+    results.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)

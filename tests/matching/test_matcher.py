@@ -1,0 +1,751 @@
+"""One frame, one prior, one budget: fixes with a sound covariance, and a reason for every refusal."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+import torch
+from rasterio.transform import Affine
+from rasterio.warp import Resampling, calculate_default_transform, reproject
+
+from engine import (
+    Budget,
+    CalibrationError,
+    Camera,
+    DeviceError,
+    Fix,
+    Frame,
+    MatcherOptions,
+    NoFix,
+    OptionError,
+    OrthoMap,
+    Prior,
+    Reason,
+    SceneMatcher,
+    Window,
+)
+from engine.budget import Deadline
+from engine.matching.feature_pose import FeatureMatcher
+from engine.matching.query import Query
+from engine.options import AssumedErrors, NccOptions, PeakRule, SiftOptions
+from engine.values import GridPose
+from tests.support.ground import Ground
+
+METHODS = ("ncc", "sift")
+NADIR = np.array([315.0, 296.0])
+HERE = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0)
+
+
+@pytest.fixture(scope="module")
+def matchers(ground, camera):
+    return {method: SceneMatcher(ground.site, camera, method, "cpu") for method in ("ncc", "sift", "auto")}
+
+
+@pytest.fixture(scope="module")
+def frame(ground, camera):
+    return ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0, timestamp_ns=77)
+
+
+@pytest.fixture(scope="module")
+def prior(ground):
+    return ground.prior(NADIR)
+
+
+def with_telemetry(image, height_agl_m=150.0, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0):
+    return Frame(image, 77, height_agl_m, heading_deg, roll_deg, pitch_deg)
+
+
+def values(result):
+    """Everything in a result that does not tell the time."""
+    if isinstance(result, NoFix):
+        return result.reason, result.detail, result.score, result.window
+    return result.lat_deg, result.lon_deg, result.up_m, result.score, result.window, result.covariance_m2.tolist()
+
+
+def distance_px(result, nadir=NADIR):
+    assert isinstance(result, Fix), result
+    return np.hypot(*(np.array(result.map_xy_px) - nadir))
+
+
+def assert_refused(result, reason, method=None):
+    assert isinstance(result, NoFix), result
+    assert result.reason is reason, result
+    assert result.timestamp_ns == 77
+    assert result.detail
+    assert method is None or result.method == method
+
+
+# Fixes
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_fix_says_the_same_place_in_every_way(matchers, ground, frame, prior, method):
+    fix = matchers[method].locate(frame, prior)
+    assert distance_px(fix) < 0.3
+    site = ground.site
+    np.testing.assert_allclose(site.enu_from_pixel(fix.map_xy_px), [fix.east_m, fix.north_m], atol=2e-3)
+    np.testing.assert_allclose(site.pixel_from_geodetic(fix.lat_deg, fix.lon_deg), fix.map_xy_px, atol=5e-3)
+    assert fix.timestamp_ns == 77
+    assert fix.method == method
+    assert 0.5 < fix.score <= 1.0
+    assert fix.timings.total_ms > 0
+    assert fix.up_m == pytest.approx(150.0, abs=1.0)
+    assert fix.attitude.heading_deg == pytest.approx(25.0, abs=0.5)
+    assert fix.attitude.roll_deg == pytest.approx(3.0, abs=0.5)
+    assert fix.attitude.pitch_deg == pytest.approx(-2.0, abs=0.5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_covariance_of_a_fix_is_finite_symmetric_and_positive_definite(matchers, ground, camera, method):
+    for heading in (0.0, 130.0):
+        nadir = NADIR + heading / 10
+        shown = ground.frame(camera, nadir, heading_deg=heading, pitch_deg=5.0)
+        fix = matchers[method].locate(shown, ground.prior(nadir))
+        covariance = fix.covariance_m2
+        assert covariance.shape == (3, 3)
+        assert np.isfinite(covariance).all()
+        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        assert 0.1 < fix.sigma_m < 10.0
+
+
+@pytest.mark.parametrize(
+    ("method", "profile"),
+    [
+        ("ncc", "engine"),
+        ("sift", "engine"),
+        ("ncc", "paper"),
+        pytest.param("sift", "paper", marks=pytest.mark.slow),
+    ],
+)
+def test_the_same_question_has_the_same_answer_in_any_order(ground, camera, frame, prior, method, profile):
+    options = MatcherOptions(profile=profile)
+    other = ground.frame(camera, NADIR + 12.0, heading_deg=200.0, timestamp_ns=77)
+    flat = with_telemetry(np.full((300, 300), 90, np.uint8))
+    questions = [(frame, prior), (flat, prior), (other, ground.prior(NADIR + 12.0)), (frame, None)]
+    forwards = SceneMatcher(ground.site, camera, method, "cpu", options)
+    backwards = SceneMatcher(ground.site, camera, method, "cpu", options)
+    first = [values(forwards.locate(*question)) for question in questions]
+    again = [values(forwards.locate(*question)) for question in questions]
+    last = [values(backwards.locate(*question)) for question in reversed(questions)]
+    assert first == again == last[::-1]
+
+
+def test_nothing_that_is_handed_in_is_changed(matchers, frame, prior):
+    before = frame.image.copy()
+    for matcher in matchers.values():
+        matcher.locate(frame, prior)
+        matcher.locate(frame)
+    np.testing.assert_array_equal(frame.image, before)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_without_a_prior_the_whole_map_is_searched_and_the_same_place_found(
+    matchers, ground, frame, prior, method
+):
+    known = matchers[method].locate(frame, prior)
+    lost = matchers[method].locate(frame)
+    assert distance_px(lost) < 0.3
+    assert np.hypot(lost.east_m - known.east_m, lost.north_m - known.north_m) < 0.1
+
+
+@pytest.mark.slow
+def test_without_a_prior_a_place_on_a_large_map_is_found_by_way_of_a_coarse_one(camera):
+    ground = Ground(size=(1200, 1100), seed=9)  # more than the million pixels that are searched at once
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
+    for nadir in ((320.4, 850.6), (780.5, 402.5)):
+        shown = ground.frame(camera, np.array(nadir), heading_deg=80.0)
+        assert distance_px(matcher.locate(shown), nadir) < 0.3
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sift_and_ncc_with_a_prior_in_degrees_or_in_metres(matchers, ground, frame, method):
+    east, north = ground.enu_from_pixel(NADIR)
+    lat, lon = ground.site.geodetic_from_pixel(NADIR)
+    metres = matchers[method].locate(frame, Prior(east_m=east, north_m=north, sigma_m=8.0))
+    degrees = matchers[method].locate(frame, Prior(lat_deg=float(lat), lon_deg=float(lon), sigma_m=8.0))
+    assert metres.map_xy_px == pytest.approx(degrees.map_xy_px, abs=0.1)
+
+
+def test_sift_needs_neither_height_nor_heading(matchers, ground, frame, prior):
+    bare = Frame(frame.image, 77)
+    for given in (prior, None):
+        fix = matchers["sift"].locate(bare, given)
+        assert distance_px(fix) < 2.0  # tilt and place are separated by features alone
+        assert fix.up_m == pytest.approx(150.0, abs=1.5)
+        assert fix.attitude.heading_deg == pytest.approx(25.0, abs=1.0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_colour_and_grey_frames_agree(matchers, sim_site, sim_flight, method):
+    matcher = SceneMatcher(sim_site, sim_flight.camera, method, "cpu")
+    shown, truth = sim_flight.frames[10], sim_flight.truth[10]
+    prior = Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=8.0)
+    rest = (shown.timestamp_ns, shown.height_agl_m, shown.heading_deg, shown.roll_deg, shown.pitch_deg)
+    gray = Frame(cv2.cvtColor(shown.image, cv2.COLOR_RGB2GRAY), *rest)
+    assert values(matcher.locate(shown, prior)) == values(matcher.locate(gray, prior))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("colour", [False, True])
+def test_torch_and_numpy_images_agree(matchers, frame, prior, method, colour):
+    image = np.dstack([frame.image] * 3) if colour else frame.image
+    results = [
+        matchers[method].locate(with_telemetry(picture), prior)
+        for picture in (image, torch.from_numpy(image), np.asfortranarray(image))
+    ]
+    assert distance_px(results[0]) < 0.3
+    assert values(results[0]) == values(results[1]) == values(results[2])
+
+
+def test_a_distorted_frame_finds_the_place_of_the_ideal_one(ground, frame, prior, camera):
+    lens = Camera(300, 300, camera.matrix, "plumb_bob", np.array([-0.12, 0.03, 0.001, -0.002, 0.0]))
+    x, y = np.meshgrid(np.arange(300.0), np.arange(300.0))
+    # Where each pixel of the lens looks in the ideal picture.
+    ideal = cv2.undistortPoints(
+        np.stack([x, y], -1).reshape(-1, 1, 2), lens.matrix, lens.distortion, P=lens.matrix
+    )
+    at = ideal.reshape(300, 300, 2).astype(np.float32)
+    bent = cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    for method in METHODS:
+        assert (
+            distance_px(SceneMatcher(ground.site, lens, method, "cpu").locate(with_telemetry(bent), prior)) < 0.3
+        )
+
+
+def test_warmup_leaves_no_trace(ground, camera, frame, prior):
+    cold, warm = (SceneMatcher(ground.site, camera, "ncc", "cpu") for _ in range(2))
+    warm.warmup()
+    assert values(cold.locate(frame, prior)) == values(warm.locate(frame, prior))
+
+
+def test_auto_is_ncc_where_it_can_be_and_sift_where_it_must(matchers, ground, camera, frame, prior):
+    auto = matchers["auto"]
+    assert auto.locate(frame, prior).method == "ncc"
+    for height, heading in ((None, 25.0), (150.0, None), (None, None)):
+        fix = auto.locate(with_telemetry(frame.image, height, heading), prior)
+        assert distance_px(fix) < 2.5
+        assert fix.method == "sift"
+    wrong = with_telemetry(frame.image, heading_deg=205.0)  # NCC finds nothing under this heading
+    assert isinstance(matchers["ncc"].locate(wrong, prior), NoFix)
+    free = MatcherOptions(sift=SiftOptions(use_attitude=False))
+    fix = SceneMatcher(ground.site, camera, "auto", "cpu", free).locate(wrong, prior)
+    assert distance_px(fix) < 2.5
+    assert fix.method == "sift"
+
+
+def test_nodata_about_the_flight_is_neither_matched_nor_in_the_way(camera):
+    ground = Ground()
+    valid = np.zeros(ground.gray.shape, bool)
+    valid[60:560, 60:600] = True
+    gray = np.where(valid, ground.gray, 255).astype(np.uint8)
+    site = OrthoMap.from_arrays(gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", valid=valid)
+    shown = ground.frame(camera, NADIR, heading_deg=10.0)
+    for method in METHODS:
+        matcher = SceneMatcher(site, camera, method, "cpu")
+        assert distance_px(matcher.locate(shown, ground.prior(NADIR))) < 0.3
+        assert distance_px(matcher.locate(shown)) < 0.3
+
+
+def test_a_place_counts_only_where_enough_of_the_frame_lies_on_the_map(camera):
+    """The patch is 242 px wide; the map ends 60 px right of the nadir, so that three quarters of it count."""
+    ground = Ground()
+    valid = np.ones(ground.gray.shape, bool)
+    valid[:, int(NADIR[0]) + 60 :] = False
+    site = OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", valid=valid)
+    shown = ground.frame(camera, NADIR)
+    for share, kind in ((0.6, Fix), (0.9, NoFix)):
+        options = MatcherOptions(ncc=NccOptions(min_valid_share=share))
+        result = SceneMatcher(site, camera, "ncc", "cpu", options).locate(shown, ground.prior(NADIR))
+        assert isinstance(result, kind), result
+        if isinstance(result, Fix):
+            assert distance_px(result) < 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_margin_of_the_window_is_an_option(ground, camera, frame, prior, method):
+    options = MatcherOptions(ncc=NccOptions(margin=1.6), sift=SiftOptions(margin=1.6))
+    wide = SceneMatcher(ground.site, camera, method, "cpu", options).locate(frame, prior)
+    usual = SceneMatcher(ground.site, camera, method, "cpu").locate(frame, prior)
+    assert wide.window.area_px > usual.window.area_px
+    assert distance_px(wide) < 0.3
+
+
+# What SIFT does not need
+
+
+def with_sift(ground, camera, **options):
+    return SceneMatcher(ground.site, camera, "sift", "cpu", MatcherOptions(sift=SiftOptions(**options)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("factor", "heading"), [(0.5, False), (0.7, True), (1.0, False), (1.4, False), (2.0, True), (None, False)]
+)
+def test_sift_is_as_good_with_a_height_that_is_wrong_or_unknown(matchers, ground, camera, heading, factor):
+    for height_m, turn in ((150.0, 200.0), (90.0, 25.0)):
+        shown = ground.frame(camera, NADIR, height_m, heading_deg=turn)
+        given = replace(
+            shown,
+            height_agl_m=None if factor is None else factor * height_m,
+            heading_deg=turn if heading else None,
+        )
+        for prior in (ground.prior(NADIR), None):
+            fix = matchers["sift"].locate(given, prior)
+            assert distance_px(fix) < (0.4 if heading else 2.0)  # without an attitude, tilt and place look alike
+            assert fix.up_m == pytest.approx(height_m, abs=1.0)
+
+
+def test_without_a_second_look_a_height_off_by_two_is_refused(ground, camera, frame, prior):
+    wrong = replace(frame, height_agl_m=300.0)
+    assert isinstance(with_sift(ground, camera, second_look=False).locate(wrong, prior), NoFix)
+    trusting = with_sift(ground, camera, height_factor=1.0)
+    assert isinstance(trusting.locate(wrong, prior), NoFix)
+
+
+@pytest.mark.parametrize(("budget_ms", "looks"), [(50.0, 1), (60_000.0, 3)])
+def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
+    ground, camera, frame, prior, monkeypatch, budget_ms, looks
+):
+    hypotheses, clock = [], SimpleNamespace(now_ns=0)
+    monkeypatch.setattr("engine.matching.matcher.Deadline", partial(Deadline, clock_ns=lambda: clock.now_ns))
+
+    def look(matcher, hypothesis):
+        clock.now_ns += 30_000_000
+        hypotheses.append(hypothesis)
+        return matcher.query.refuse(Reason.TOO_FEW_MATCHES, "none", "sift")
+
+    monkeypatch.setattr(FeatureMatcher, "_find_with", look)
+    result = with_sift(ground, camera).locate(frame, prior, Budget(total_ms=budget_ms))
+    assert result.reason is Reason.TOO_FEW_MATCHES
+    assert [hypothesis.x_axis_deg is None for hypothesis in hypotheses] == [False, False, True][:looks]
+    assert [hypothesis.heights_m for hypothesis in hypotheses] == [(150.0, 150.0), (150.0, 150.0), (75.0, 300.0)][
+        :looks
+    ]
+
+
+# Where SIFT's features come from
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_features_of_the_map_prepared_or_found_per_frame_give_the_same_place(ground, camera, upright):
+    prepared = with_sift(ground, camera, upright=upright)
+    per_frame = with_sift(ground, camera, upright=upright, map_features="per_frame")
+    for heading in (45.0, 300.0):
+        shown = ground.frame(camera, NADIR, heading_deg=heading, roll_deg=4.0)
+        fixes = [matcher.locate(shown, ground.prior(NADIR)) for matcher in (prepared, per_frame)]
+        assert max(distance_px(fix) for fix in fixes) < 0.3
+        assert fixes[0].score > 0.8
+
+
+def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(camera):
+    ground = Ground(lat_deg=60.0, lon_deg=17.9)  # 2.5 degrees of convergence
+    matcher = with_sift(ground, camera, second_look=False, max_turn_deg=8.0)
+    oriented = with_sift(ground, camera, second_look=False, upright=False, max_turn_deg=8.0)
+    for mount in (camera.mount, np.array([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]) @ camera.mount):
+        for heading in (100.0 if mount is camera.mount else 250.0,):
+            shown = ground.frame(camera, NADIR, heading_deg=heading, pitch_deg=8.0)
+            given = shown if mount is camera.mount else replace(shown, image=shown.image[::-1, ::-1].copy())
+            for each in (matcher, oriented):
+                turned = SceneMatcher(ground.site, replace(camera, mount=mount), "sift", "cpu", each.options)
+                assert distance_px(turned.locate(given, ground.prior(NADIR))) < 0.5
+
+
+@pytest.mark.parametrize("mounted_deg", [0.0, 30.0, 60.0])
+def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, mounted_deg):
+    """Of roll, pitch and heading by turns; of the two tilts each by whether it was given."""
+    lifted = cv2.Rodrigues(np.radians([0.0, mounted_deg, 0.0]))[0] @ camera.mount  # about the body's right
+    frame = Frame(np.zeros((8, 8), np.uint8), 0, 100.0, 40.0, None, 3.0)
+    known = GridPose(frame.height_agl_m, frame.heading_deg, frame.roll_deg, frame.pitch_deg)
+    query = SimpleNamespace(telemetry=known, camera=replace(camera, mount=lifted))
+    errors = AssumedErrors(tilt_deg=0.4, unknown_tilt_deg=5.0)
+    prior = Query.attitude_prior(query, 40.0, 1.5, errors)
+    for about_body_deg in np.diag([5.0, 0.4, 1.5]):
+        about_camera = lifted.T @ np.radians(about_body_deg)
+        assert about_camera @ prior.precision @ about_camera == pytest.approx(1.0)
+
+
+def test_a_matcher_of_ones_own_takes_the_place_of_features(ground, camera, frame, prior):
+    shapes, shifts = [], []
+
+    def opencv(picture, crop):
+        """Stands in for a network."""
+        shapes.append(tuple(picture.shape))
+        assert picture.dtype == crop.dtype == torch.float32
+        assert 0.0 <= float(picture.min()) < float(picture.max()) <= 1.0
+        detector = cv2.SIFT_create(600)
+        (ours, first), (theirs, second) = (
+            detector.detectAndCompute((tensor[0, 0].numpy() * 255).astype(np.uint8), None)
+            for tensor in (picture, crop)
+        )
+        nearest = cv2.BFMatcher().knnMatch(first, second, k=2)
+        pairs = [best for best, next_best in nearest if best.distance < 0.8 * next_best.distance]
+        points = [ours[pair.queryIdx].pt for pair in pairs], [theirs[pair.trainIdx].pt for pair in pairs]
+        shifts.append(np.diff(points, axis=0)[0])
+        return tuple(torch.tensor(xy).reshape(-1, 2) - 0.25 for xy in points)  # OpenCV's bias
+
+    matcher = with_sift(ground, camera, matcher=opencv)
+    fix = matcher.locate(frame, prior)
+    assert distance_px(fix) < 0.5
+    assert fix.up_m == pytest.approx(150.0, abs=1.0)
+    # It was given the frame in the map's pixels and axes: nothing but a translation is between the two.
+    assert np.median(np.abs(shifts[0] - np.median(shifts[0], axis=0))) < 0.5
+    assert "frame features" not in fix.timings.stages_ms
+    unknown_heading = replace(frame, heading_deg=None)
+    matcher.locate(unknown_heading, prior)
+    assert shapes[-1] == (1, 1, 150, 150)
+
+
+def test_a_matcher_of_ones_own_that_finds_nothing_is_refused(ground, camera, frame, prior):
+    nothing = with_sift(ground, camera, matcher=lambda *_: (torch.zeros(0, 2), torch.zeros(0, 2)))
+    assert_refused(nothing.locate(frame, prior), Reason.TOO_FEW_MATCHES, "sift")
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize("level", [0, 90, 255], ids=["black", "flat", "white"])
+def test_a_frame_of_one_grey_level_has_no_texture(matchers, prior, method, level):
+    for given in (prior, None):
+        assert_refused(
+            matchers[method].locate(with_telemetry(np.full((300, 300), level, np.uint8)), given), Reason.NO_TEXTURE
+        )
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize(
+    "where",
+    [
+        {"east_m": 2000.0, "north_m": 0.0},
+        {"east_m": 0.0, "north_m": -1e9},
+        {"lat_deg": -48.25, "lon_deg": -165.0},  # the other side of the Earth
+        {"lat_deg": 90.0, "lon_deg": 0.0},
+    ],
+)
+def test_a_prior_outside_the_map_is_refused(matchers, frame, method, where):
+    assert_refused(matchers[method].locate(frame, Prior(**where, sigma_m=5.0)), Reason.OUTSIDE_MAP)
+
+
+@pytest.mark.parametrize("profile", ["engine", "paper"])
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize("lon_deg", [0.0, 183.0, -177.0])
+def test_a_prior_that_the_maps_crs_cannot_show_is_refused(camera, frame, method, profile, lon_deg):
+    """Null island, as a receiver without a fix reports it, and its opposite have no place in UTM's zone 46."""
+    if (method, profile) == ("auto", "paper"):
+        return
+    site = OrthoMap.from_arrays(
+        np.random.default_rng(0).integers(0, 256, (400, 400), np.uint8),
+        [[0.5, 0.0, 500_000.0], [0.0, -0.5, 3_600_000.0]],
+        "EPSG:32646",
+    )
+    matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(profile=profile))
+    nowhere = Prior(lat_deg=0.0, lon_deg=lon_deg, sigma_m=10.0)
+    assert_refused(matcher.locate(frame, nowhere), Reason.OUTSIDE_MAP)
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize("vague", [{"sigma_m": 1e308}, {"sigma_m": 8.0, "moved_east_m": 1e308}])
+def test_a_prior_wider_than_any_map_is_a_search_of_all_of_it(matchers, ground, frame, method, vague):
+    east, north = ground.enu_from_pixel(NADIR)
+    result = matchers[method].locate(frame, Prior(east_m=east, north_m=north, **vague))
+    assert result.window.width_px == ground.site.width_px
+    assert isinstance(result, NoFix) or distance_px(result) < 1.0
+
+
+def test_an_explanation_asks_about_the_middle_of_its_window(matchers, ground, frame, monkeypatch):
+    seen, real = [], SceneMatcher._query
+    monkeypatch.setattr(
+        SceneMatcher,
+        "_query",
+        lambda self, frame, prior, clock: seen.append(prior) or real(self, frame, prior, clock),
+    )
+    matchers["ncc"].explain(frame, Window(100, 80, 400, 401))
+    middle = ground.site.pixel_from_enu([seen[0].east_m, seen[0].north_m])
+    np.testing.assert_allclose(middle, [299.5, 280.0], atol=1e-3)
+
+
+def test_ncc_needs_the_height(matchers, frame, prior):
+    assert_refused(
+        matchers["ncc"].locate(with_telemetry(frame.image, height_agl_m=None), prior), Reason.NO_HEIGHT, "ncc"
+    )
+
+
+def test_ncc_needs_the_heading(matchers, frame, prior):
+    assert_refused(
+        matchers["ncc"].locate(with_telemetry(frame.image, heading_deg=None), prior), Reason.NO_HEADING, "ncc"
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("tilt", [(80.0, 0.0), (0.0, -70.0), (180.0, 0.0)])
+def test_an_extreme_tilt_is_refused(matchers, frame, prior, method, tilt):
+    assert_refused(
+        matchers[method].locate(with_telemetry(frame.image, 150.0, 25.0, *tilt), prior), Reason.TILTED, method
+    )
+
+
+@pytest.mark.parametrize("height_m", [0.01, 2.0, 5e3, 65_535.0, 1e7])
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_a_height_that_cannot_be_leads_nowhere_else(matchers, frame, prior, method, height_m):
+    """NCC refuses; SIFT, which measures height, may still find the place."""
+    for given in (prior, None):
+        result = matchers[method].locate(with_telemetry(frame.image, height_m), given)
+        assert isinstance(result, NoFix) or (result.method == "sift" and distance_px(result) < 4.0)
+
+
+def test_more_ground_than_the_map_is_outside_the_map(matchers, frame, prior):
+    assert_refused(matchers["ncc"].locate(with_telemetry(frame.image, 65_535.0), prior), Reason.OUTSIDE_MAP, "ncc")
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_an_answer_after_the_budget_is_late(matchers, frame, prior, method):
+    for given in (prior, None):
+        assert_refused(matchers[method].locate(frame, given, Budget(total_ms=1e-6)), Reason.LATE)
+    assert distance_px(matchers[method].locate(frame, prior, Budget(total_ms=60_000.0))) < 0.3
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_answer_after_the_budget_is_late_in_the_papers_profile(ground, camera, frame, prior, method):
+    matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
+    assert_refused(matcher.locate(frame, prior, Budget(total_ms=1e-6)), Reason.LATE, method)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_frame_of_another_town_is_refused(other_site, sim_flight, method):
+    matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
+    assert {type(matcher.locate(shown, HERE)) for shown in sim_flight.frames[:5]} == {NoFix}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+def test_a_frame_of_another_town_is_refused_in_nearly_all_tries(other_site, sim_flight, method, known):
+    matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
+    results = [matcher.locate(shown, HERE if known else None) for shown in sim_flight.frames[:20]]
+    assert sum(isinstance(result, NoFix) for result in results) >= 19
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_is_refused(matchers, prior, method):
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        image = rng.integers(0, 256, (300, 300), dtype=np.uint8)
+        for given in (prior, None):
+            assert isinstance(matchers[method].locate(with_telemetry(image), given), NoFix)
+
+
+def test_a_map_that_repeats_itself_is_ambiguous(ground, camera):
+    """A chessboard of one picture: every place has its double 100 m away."""
+    tile = ground.gray[:200, :200]
+    site = OrthoMap.from_arrays(np.tile(tile, (4, 4)), ground.pixel_to_crs, f"EPSG:{ground.epsg}")
+    small = Camera.from_fov(300, 300, 60.0)
+    image = cv2.resize(np.tile(tile, (4, 4))[250:424, 250:424], (300, 300), interpolation=cv2.INTER_CUBIC)
+    height_m = 150.0 * 174 * site.gsd_m_per_px / (2 * 150 * np.tan(np.pi / 6))
+    result = SceneMatcher(site, small, "ncc", "cpu").locate(with_telemetry(image, height_m, 0.0, 0.0, 0.0))
+    assert_refused(result, Reason.AMBIGUOUS, "ncc")
+    assert result.score > 0.8
+
+
+# What is wrong is said at once
+
+
+@pytest.mark.parametrize("shape", [(299, 300), (300, 301), (150, 150), (600, 600, 3)])
+def test_a_frame_of_another_resolution_does_not_fit_the_calibration(matchers, shape):
+    for matcher in matchers.values():
+        with pytest.raises(CalibrationError, match=rf"calibrated for 300 x 300, .* {shape[1]} x {shape[0]}"):
+            matcher.locate(with_telemetry(np.zeros(shape, np.uint8)))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_a_device_that_is_missing_is_an_error_and_only_auto_falls_back(ground, camera):
+    with pytest.raises(DeviceError, match=r"^device: cuda was asked for"):
+        SceneMatcher(ground.site, camera, device="cuda")
+    assert SceneMatcher(ground.site, camera, device="auto").device.type == "cpu"
+
+
+def test_options_are_refused_by_name(ground, camera):
+    with pytest.raises(OptionError, match=r"^method: expected one of ncc, sift, auto, learned, got 'orb'"):
+        SceneMatcher(ground.site, camera, "orb")
+    with pytest.raises(OptionError, match=r"^profile: expected one of engine, paper, got 'fast'"):
+        MatcherOptions(profile="fast")
+    with pytest.raises(OptionError, match=r"^method: the paper's profile"):
+        SceneMatcher(ground.site, camera, "auto", "cpu", MatcherOptions(profile="paper"))
+    for options in (NccOptions, SiftOptions):
+        with pytest.raises(OptionError, match=r"^margin: expected 1 or more, got 0.5"):
+            options(margin=0.5)
+    for name in ("fraction", "min_valid_share"):
+        with pytest.raises(OptionError, match=rf"^{name}: expected above 0 and at most 1, got 1.5"):
+            NccOptions(**{name: 1.5})
+    for name in ("scale", "ratio"):
+        with pytest.raises(OptionError, match=rf"^{name}: expected above 0 and at most 1, got 0"):
+            SiftOptions(**{name: 0.0})
+    for name, value, text in (
+        ("height_factor", 0.9, "1 or more"),
+        ("max_turn_deg", 0.0, "above 0"), ("max_scale_factor", 1.0, "above 1"),
+        ("max_height_m", 0.5, "above 1"), ("map_features", "sometimes", "one of prepared, per_frame"),
+    ):  # fmt: skip
+        with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got '?{value}"):
+            SiftOptions(**{name: value})
+    for name, value in (("max_keypoints", 3), ("max_map_keypoints", 0)):
+        with pytest.raises(OptionError, match=rf"^{name}: expected 4 or more, got {value}"):
+            SiftOptions(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "value", "text"),
+    [
+        (SiftOptions, "min_confidence", 97, "0 or more and below 1"),
+        (SiftOptions, "min_confidence", float("nan"), "0 or more and below 1"),
+        (SiftOptions, "max_tilt_deg", -1, "above 0"),
+        (SiftOptions, "min_deviation", float("nan"), "0 or more"),
+        (SiftOptions, "max_height_m", float("inf"), "a finite number"),
+        (SiftOptions, "height_factor", float("inf"), "a finite number"),
+        (SiftOptions, "margin", float("inf"), "a finite number"),
+        (NccOptions, "margin", float("inf"), "a finite number"),
+        (NccOptions, "margin", float("nan"), "1 or more"),
+    ],
+)
+def test_options_by_which_every_frame_would_fail_are_refused(options, name, value, text):
+    with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got {value}"):
+        options(**{name: value})
+
+
+# The paper's profile
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_papers_profile_finds_the_place_of_a_level_frame(ground, camera, prior, method):
+    matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
+    for heading, given in ((0.0, prior), (60.0, None), (250.0, prior)):
+        fix = matcher.locate(ground.frame(camera, NADIR, heading_deg=heading), given)
+        assert distance_px(fix) < (1.0 if method == "ncc" else 2.0)  # whole pixels; no attitude to lean on
+        assert fix.method == method
+
+
+def test_the_papers_profile_turns_by_the_heading_less_the_maps(camera):
+    """Equation 3, alpha = psi - psi_m: on a map whose up is 2.5 degrees off north the true heading fits best."""
+    ground = Ground(lat_deg=60.0, lon_deg=17.9)
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(profile="paper"))
+    image = ground.picture(camera, NADIR, 150.0, heading_deg=40.0)
+    scores = {
+        heading: matcher.locate(with_telemetry(image, 150.0, heading, 0.0, 0.0), ground.prior(NADIR)).score
+        for heading in (37.5, 40.0, 42.5)
+    }
+    assert max(scores, key=scores.get) == 40.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, prior, method):
+    matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
+    assert_refused(matcher.locate(with_telemetry(frame.image, None), prior), Reason.NO_HEIGHT, method)
+    assert_refused(matcher.locate(frame, Prior(east_m=9e3, north_m=0.0, sigma_m=5.0)), Reason.OUTSIDE_MAP, method)
+    flat = matcher.locate(with_telemetry(np.zeros((300, 300), np.uint8)), prior)
+    assert isinstance(flat, Fix) or flat.reason is Reason.TOO_FEW_MATCHES  # NCC always has a peak
+    if method == "ncc":
+        assert_refused(matcher.locate(with_telemetry(frame.image, heading_deg=None), prior), Reason.NO_HEADING)
+        for height in (0.01, 65_535.0, 1e7):
+            assert_refused(matcher.locate(with_telemetry(frame.image, height), prior), Reason.OUTSIDE_MAP)
+
+
+# The map's projection does not matter
+
+
+def write_map(path, gray, crs, transform):
+    height, width = gray.shape
+    profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "nodata": 0, "crs": crs, "transform": transform}
+    with rasterio.open(path, "w", width=width, height=height, **profile) as file:
+        file.write(gray, 1)
+    return OrthoMap.open(path)
+
+
+def projections(folder, gray, pixel_to_crs, epsg):
+    """The same map as UTM, as degrees and as web Mercator, warped with cubic splines by GDAL."""
+    gray = np.maximum(gray, 1)  # 0 is nodata
+    corner = Affine(*pixel_to_crs.ravel()) @ Affine.translation(-0.5, -0.5)
+    height, width = gray.shape
+    sites = {"utm": write_map(folder / "utm.tif", gray, f"EPSG:{epsg}", corner)}
+    left, top = corner @ (0, 0)
+    right, bottom = corner @ (width, height)
+    for crs in ("EPSG:4326", "EPSG:3857"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PendingDeprecationWarning)  # rasterio's own use of affine
+            transform, columns, rows = calculate_default_transform(
+                f"EPSG:{epsg}", crs, width, height, left=left, bottom=bottom, right=right, top=top
+            )
+        warped = np.zeros((rows, columns), np.uint8)
+        reproject(
+            gray, warped, src_transform=corner, src_crs=f"EPSG:{epsg}", dst_transform=transform, dst_crs=crs,
+            resampling=Resampling.cubic, src_nodata=0, dst_nodata=0,
+        )  # fmt: skip
+        sites[crs] = write_map(folder / f"{crs[5:]}.tif", warped, crs, transform)
+    return sites
+
+
+def fixes_m(site, frame, camera, method, frames, priors):
+    """Fixes (N, 2) in metres about one origin, whatever the map; of NCC by the peak alone."""
+    matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
+    fixes = [matcher.locate(shown, prior) for shown, prior in zip(frames, priors, strict=True)]
+    assert all(isinstance(fix, Fix) for fix in fixes)
+    return np.array([frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg) for fix in fixes])
+
+
+@pytest.fixture(scope="module")
+def town_projections(tmp_path_factory, sim_town):
+    gray = cv2.cvtColor(sim_town.ortho, cv2.COLOR_RGB2GRAY)
+    return projections(tmp_path_factory.mktemp("town"), gray, sim_town.pixel_to_crs, sim_town.crs_epsg)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "mean_m", "most_m"), [("ncc", 0.05, 0.1), ("sift", 0.2, 1.0)])
+def test_a_town_gives_the_same_fixes_in_any_projection(town_projections, sim_flight, method, mean_m, most_m):
+    """SIFT picks other features of a picture that was resampled; all frames share them, and so their errors."""
+    frames, truths = sim_flight.frames[4:], sim_flight.truth[4:]
+    priors = [Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=8.0) for truth in truths]
+    frame = town_projections["utm"].frame
+    places = {
+        name: fixes_m(site, frame, sim_flight.camera, method, frames, priors)
+        for name, site in town_projections.items()
+    }
+    for name in ("EPSG:4326", "EPSG:3857"):
+        difference = places[name] - places["utm"]
+        assert np.hypot(*difference.mean(axis=0)) < mean_m, name
+        assert np.hypot(*difference.T).max() < most_m, name
+
+
+@pytest.mark.slow
+def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, camera):
+    ground = Ground(lon_deg=16.45)  # 1.1 degrees of convergence
+    rng = np.random.default_rng(0)
+    nadirs = rng.uniform((260.0, 250.0), (380.0, 350.0), (8, 2))
+    frames = [
+        ground.frame(camera, nadir, heading_deg=heading, roll_deg=roll, pitch_deg=pitch)
+        for nadir, heading, roll, pitch in zip(
+            nadirs, rng.uniform(0, 360, 8), *rng.uniform(-6, 6, (2, 8)), strict=True
+        )
+    ]
+    priors = [ground.prior(nadir) for nadir in nadirs]
+    truth = ground.enu_from_pixel(nadirs)
+    sites = projections(tmp_path, ground.gray, ground.pixel_to_crs, ground.epsg)
+    for method, most_m in (("ncc", 0.02), ("sift", 0.2)):
+        for name, site in sites.items():
+            places = fixes_m(site, ground.site.frame, camera, method, frames, priors)
+            assert np.hypot(*(places - truth).mean(axis=0)) < 0.1, (method, name)
+            assert np.hypot(*(places - truth).T).max() < most_m, (method, name)
+
+
+def test_a_place_that_contradicts_its_prior_must_vouch_for_itself(ground, camera, frame):
+    """Then the margin of a whole-map search is asked for; here one that no peak has."""
+    rule = PeakRule(min_margin_sigmas_whole_map=1e3)
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(rule=rule)))
+    assert isinstance(matcher.locate(frame, ground.prior(NADIR, sigma_m=2.0, off_m=(5.0, -4.0))), Fix)
+    refused = matcher.locate(frame, ground.prior(NADIR, sigma_m=2.0, off_m=(9.0, -8.0)))
+    assert isinstance(refused, NoFix)
+    assert refused.reason is Reason.AMBIGUOUS

@@ -1,0 +1,511 @@
+"""Truths about the pose: recovered where it is there, within its covariance, and refused where it is not."""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import chi2, norm
+
+from bench.accuracy.pose_scenes import GROUNDS, WRONG
+from bench.accuracy.poses import CHI2_3_SIGMA, accepted, coverage
+from engine.errors import DtypeError, OptionError, ShapeError
+from engine.kernels.pose_fit import biweight_factors
+from engine.matching.pose import AttitudePrior, PoseStart, PoseStats, solve_pose
+from engine.options import PoseOptions
+
+K = np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]])
+SIZE = 300
+
+
+@dataclass
+class Scene:
+    points_m: np.ndarray
+    points_px: np.ndarray
+    rotation: np.ndarray
+    center_m: np.ndarray
+    wrong: np.ndarray
+
+
+def scene(
+    rng: np.random.Generator,
+    count: int = 60,
+    *,
+    noise_px: float = 0.0,
+    wrong: float = 0.0,
+    relief_m: float = 0.0,
+    tilt_deg: float = 3.0,
+    offset_m: tuple[float, float, float] = (0, 0, 0),
+) -> Scene:
+    """A camera 150 m up sees points all over its image; some matches point anywhere."""
+    tilt = np.deg2rad(rng.uniform(-tilt_deg, tilt_deg, 2))
+    heading = rng.uniform(0, math.tau)
+    rotation = (
+        cv2.Rodrigues(np.array([*tilt, 0]))[0]
+        @ np.diag([1.0, -1, -1])
+        @ cv2.Rodrigues(np.array([0, 0, heading]))[0]
+    )
+    center = np.array([*rng.uniform(-50, 50, 2), 150.0])
+    pixels = rng.uniform(0, SIZE - 1, (count, 2))
+    rays = np.c_[pixels, np.ones(count)] @ np.linalg.inv(K).T @ rotation
+    heights = rng.uniform(0, relief_m, count) if relief_m else np.zeros(count)
+    points = center + rays * ((heights - 150) / rays[:, 2])[:, None]
+    pixels = pixels + rng.normal(0, noise_px, pixels.shape) if noise_px else pixels
+    astray = rng.permutation(count) < round(wrong * count)
+    pixels[astray] = rng.uniform(0, SIZE - 1, (int(astray.sum()), 2))
+    return Scene(points + offset_m, pixels, rotation, center + offset_m, astray)
+
+
+def solved(s: Scene, options: PoseOptions | None = None, **other: object) -> PoseStats:
+    result = solve_pose(s.points_m, s.points_px, K, options, **other)
+    assert result is not None
+    return result
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return math.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0]))
+
+
+# Recovered.
+
+
+@pytest.mark.parametrize("relief_m", [0.0, 60.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 25.0])
+def test_exact_points_give_the_exact_pose(relief_m, tilt_deg):
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        s = scene(rng, relief_m=relief_m, tilt_deg=tilt_deg)
+        pose = solved(s)
+        np.testing.assert_allclose(pose.center_m, s.center_m, atol=1e-5)
+        assert angle_deg(pose.rotation, s.rotation) < 1e-5
+        assert pose.inliers.all()
+        assert pose.rms_px < 1e-5
+
+
+def test_the_pose_maps_points_to_their_pixels():
+    s = scene(np.random.default_rng(2), relief_m=20, offset_m=(500_000, 3_600_000, 200))
+    pose = solved(s)
+    x = s.points_m @ pose.rotation.T + pose.translation
+    np.testing.assert_allclose((x @ K.T)[:, :2] / x[:, 2:], s.points_px, atol=1e-4)
+    np.testing.assert_allclose(pose.center_m, -pose.rotation.T @ pose.translation, atol=1e-6)
+    np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose.rotation) == pytest.approx(1)
+
+
+def test_large_coordinates_change_nothing():
+    offset = (500_000.0, 3_600_000.0, 200.0)
+    near = scene(np.random.default_rng(3), noise_px=0.5, wrong=0.3)
+    far = scene(np.random.default_rng(3), noise_px=0.5, wrong=0.3, offset_m=offset)
+    a, b = solved(near), solved(far)
+    np.testing.assert_allclose(b.center_m - offset, a.center_m, atol=1e-5)
+    np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-4, atol=1e-12)
+    assert (a.inliers == b.inliers).all()
+
+
+def test_units_scale():
+    """A world twice as large, seen from twice as far, gives the same picture."""
+    s = scene(np.random.default_rng(4), noise_px=0.5)
+    once, twice = solved(s), solve_pose(2 * s.points_m, s.points_px, K)
+    assert twice is not None
+    np.testing.assert_allclose(twice.center_m, 2 * once.center_m, rtol=1e-4)
+    np.testing.assert_allclose(twice.covariance_center_m2, 4 * once.covariance_center_m2, rtol=1e-3)
+    assert twice.rms_px == pytest.approx(once.rms_px, rel=1e-4)
+
+
+@pytest.mark.parametrize("relief_m", [0.0, 40.0])
+@pytest.mark.parametrize("wrong", [0.3, 0.5, 0.7])
+def test_wrong_matches_are_left_out(wrong, relief_m):
+    rng = np.random.default_rng(5)
+    for _ in range(15):
+        s = scene(rng, 120, noise_px=0.5, wrong=wrong, relief_m=relief_m)
+        pose = solved(s)
+        assert np.linalg.norm(pose.center_m - s.center_m) < 3
+        assert pose.inliers[~s.wrong].mean() > 0.95
+        assert pose.inliers[s.wrong].mean() < 0.1
+
+
+def test_equal_inputs_give_equal_poses():
+    s = scene(np.random.default_rng(6), 100, noise_px=0.7, wrong=0.5)
+    a, b = solved(s), solved(s)
+    assert (a.center_m == b.center_m).all()
+    assert (a.inliers == b.inliers).all()
+    assert a.log10_nfa == b.log10_nfa
+
+
+def test_unusable_matches_are_ignored():
+    s = scene(np.random.default_rng(7), 40)
+    s.points_m[3] = np.nan
+    s.points_px[5, 0] = np.inf
+    weights = np.ones(40)
+    weights[8] = 0
+    pose = solved(s, weights=weights)
+    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 8]
+    np.testing.assert_allclose(pose.center_m, s.center_m, atol=1e-5)
+
+
+def test_weights_follow_the_better_points():
+    rng = np.random.default_rng(8)
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for _ in range(40):
+        s = scene(rng, 60)
+        sigma = np.where(np.arange(60) < 20, 0.05, 0.9)
+        s.points_px += rng.normal(size=(60, 2)) * sigma[:, None]
+        for weighted, values in errors.items():
+            pose = solved(s, weights=0.25 / sigma**2 if weighted else None)
+            values.append(float(np.sum((pose.center_m - s.center_m) ** 2)))
+    assert np.mean(errors[True]) < 0.2 * np.mean(errors[False])
+
+
+# Its covariance.
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"noise_px": 0.5},
+        {"noise_px": 0.5, "tilt_deg": 25.0},
+        {"noise_px": 0.5, "relief_m": 60.0},
+        {"noise_px": 1.0, "wrong": 0.4},
+        {"noise_px": 0.1, "wrong": 0.4, "relief_m": 20.0},
+        {"noise_px": 0.5, "count": 15},
+    ],
+    ids=str,
+)
+def test_errors_lie_within_the_covariance(case):
+    rng = np.random.default_rng(9)
+    within, nees, turn = [], [], []
+    for _ in range(150):
+        s = scene(rng, **{"count": 100, **case})
+        pose = solve_pose(s.points_m, s.points_px, K)
+        if pose is None:
+            continue
+        error = pose.center_m - s.center_m
+        within.append(np.abs(error) < 3 * np.sqrt(np.diag(pose.covariance_center_m2)))
+        nees.append(error @ np.linalg.solve(pose.covariance_center_m2, error))
+        rotation = cv2.Rodrigues(s.rotation @ pose.rotation.T)[0][:, 0]
+        turn.append(rotation @ np.linalg.solve(pose.covariance[3:, 3:], rotation))
+    assert len(nees) > 145
+    assert np.mean(within) >= 0.98
+    assert 2.3 < np.mean(nees) < 4.0  # three degrees of freedom
+    assert 2.3 < np.mean(turn) < 4.0
+
+
+SLOW = {
+    ("planar nadir", True),
+    ("high relief", False),
+    ("high relief", True),
+    ("tilted", False),
+    ("distorted", False),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ground", "with_prior"),
+    [
+        pytest.param(*case, marks=[pytest.mark.slow] if case in SLOW else [])
+        for case in itertools.product(GROUNDS, (False, True))
+    ],
+)
+def test_errors_lie_within_three_sigma_whatever_the_ground(ground, with_prior):
+    """60 to 300 m up, 15 to 300 matches, noise of 0.3 to 1 px, up to 60 % wrong."""
+    c = coverage(ground, with_prior, 250, seed=3)
+    assert c.accepted >= 240
+    assert c.off == 0
+    assert c.within >= 0.98
+    assert c.within_axis >= 0.98
+    assert c.within_turn >= 0.97
+    if ground != "distorted":  # there a pixel's noise grows with the lens's stretch, which no one tells the pose
+        assert 2.4 < c.nees < 3.6
+        assert 2.4 < c.nees_turn < 3.6
+
+
+def test_three_sigma_of_three_dimensions():
+    assert chi2.cdf(CHI2_3_SIGMA, 3) == pytest.approx(norm.cdf(3) - norm.cdf(-3), abs=1e-6)
+
+
+@pytest.mark.parametrize("u", [1.0, 4.5, 8.0, 60.0])
+def test_biweight_factors_are_their_integrals(u):
+    def mean(f):
+        return quad(lambda q: f(q, (1 - q / u) ** 2) * math.exp(-q), 0, u)[0]
+
+    weight, pull, noise = mean(lambda q, w: w), mean(lambda q, w: w * q), mean(lambda q, w: w * w * q)
+    np.testing.assert_allclose(biweight_factors(u), (pull / weight, noise / pull), rtol=1e-6)
+
+
+def test_where_the_search_began_does_not_show():
+    """The attitude of the telemetry and three random matches lead to one pose."""
+    rng = np.random.default_rng(22)
+    for _ in range(20):
+        s = scene(rng, 120, noise_px=0.8, wrong=0.3, relief_m=10)
+        prior = AttitudePrior(s.rotation, sigma_deg=1.0)
+        poses = [solved(s, PoseOptions(seed=seed), prior=prior) for seed in range(3)]
+        free = solved(s, prior=AttitudePrior(scene(rng).rotation, sigma_deg=1e4))  # says nothing: RANSAC decides
+        weak = solved(s)
+        for pose in poses[1:]:
+            sigma = np.sqrt(np.diag(pose.covariance_center_m2))
+            assert (np.abs(pose.center_m - poses[0].center_m) < 0.05 * sigma).all()
+        sigma = np.sqrt(np.diag(free.covariance_center_m2))
+        assert (np.abs(free.center_m - weak.center_m) < 0.05 * sigma).all()
+
+
+def test_a_wrong_attitude_is_outvoted():
+    """Telemetry 20 degrees off and unsure of it: the matches decide."""
+    rng = np.random.default_rng(23)
+    for _ in range(10):
+        s = scene(rng, 100, noise_px=0.5, wrong=0.5)
+        astray = cv2.Rodrigues(np.deg2rad([12.0, -12.0, 10.0]))[0] @ s.rotation
+        pose = solved(s, prior=AttitudePrior(astray, sigma_deg=20.0))
+        assert np.linalg.norm(pose.center_m - s.center_m) < 5
+        assert pose.inliers[~s.wrong].mean() > 0.95
+
+
+@pytest.mark.parametrize("sigma_deg", [0.4, 4.0])
+@pytest.mark.parametrize("off_deg", [-35.0, -20.0, -8.0, 8.0, 20.0, 35.0])
+def test_about_a_wrong_attitude_the_pose_is_right_or_there_is_none(sigma_deg, off_deg):
+    """About a wrong tilt a part of the matches agree still, at a place as far off."""
+    rng, found = np.random.default_rng(5), 0
+    for _ in range(10):
+        s = scene(rng, noise_px=0.5, relief_m=20.0)
+        turn = cv2.Rodrigues(np.deg2rad([off_deg, 0.0, 0.0]))[0]
+        pose = solve_pose(s.points_m, s.points_px, K, prior=AttitudePrior(turn @ s.rotation, sigma_deg))
+        if pose is not None:
+            found += 1
+            assert np.linalg.norm(pose.center_m - s.center_m) < 3.0
+    assert found >= (1 if sigma_deg < 1.0 and abs(off_deg) < 10.0 else 9 if sigma_deg > 1.0 else 0)
+
+
+def test_covariance_is_symmetric_and_positive():
+    pose = solved(scene(np.random.default_rng(10), noise_px=0.5))
+    np.testing.assert_allclose(pose.covariance, pose.covariance.T, rtol=1e-6, atol=1e-15)
+    assert np.linalg.eigvalsh(pose.covariance).min() > 0
+    assert pose.covariance_center_m2.shape == (3, 3)
+
+
+def test_a_prior_on_attitude_separates_tilt_from_displacement():
+    rng = np.random.default_rng(11)
+    plain, helped, nees = [], [], []
+    for _ in range(80):
+        s = scene(rng, 40, noise_px=0.8)
+        measured = cv2.Rodrigues(np.deg2rad(rng.normal(0, 0.1, 3)))[0] @ s.rotation
+        prior = AttitudePrior(rotation=measured, sigma_deg=0.1)
+        a, b = solved(s), solved(s, prior=prior)
+        plain.append(np.sum((a.center_m - s.center_m)[:2] ** 2))
+        error = b.center_m - s.center_m
+        helped.append(np.sum(error[:2] ** 2))
+        nees.append(error @ np.linalg.solve(b.covariance_center_m2, error))
+        assert np.trace(b.covariance_center_m2) < np.trace(a.covariance_center_m2) * 1.05
+    assert np.mean(helped) < 0.5 * np.mean(plain)
+    assert 2.0 < np.mean(nees) < 4.2
+
+
+def test_a_weak_prior_changes_nothing_and_axes_have_their_own_sigma():
+    s = scene(np.random.default_rng(12), noise_px=0.5)
+    tilted = cv2.Rodrigues(np.deg2rad([5.0, 0, 0]))[0] @ s.rotation
+    free = solved(s)
+    weak = solved(s, prior=AttitudePrior(rotation=tilted, sigma_deg=1e4))
+    np.testing.assert_allclose(weak.center_m, free.center_m, atol=1e-3)
+    only_heading = solved(s, prior=AttitudePrior(rotation=tilted, sigma_deg=(1e4, 1e4, 1.0)))
+    np.testing.assert_allclose(only_heading.center_m, free.center_m, atol=0.02)
+
+
+def test_errors_about_the_bodys_axes_are_those_of_the_camera_however_it_is_mounted():
+    """A heading that nobody knows leaves the pose alone; the same error in the pitch does not."""
+    s = scene(np.random.default_rng(12), noise_px=0.5)
+    mount = cv2.Rodrigues(np.deg2rad([0.0, 30.0, 0.0]))[0] @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    free = solved(s)
+
+    def off_m(error_deg):
+        """How far a prior moves the pose whose body is turned by this about its forward, right and down axes."""
+        measured = cv2.Rodrigues(mount.T @ np.deg2rad(error_deg))[0] @ s.rotation
+        prior = AttitudePrior(rotation=measured, sigma_deg=(0.05, 0.05, 1e4), axes=mount)
+        return np.linalg.norm(solved(s, prior=prior).center_m - free.center_m)
+
+    assert off_m([0.0, 0.0, 5.0]) < 0.5
+    assert off_m([0.0, 0.5, 0.0]) > 0.5
+
+
+def test_the_precision_of_a_prior_is_its_covariance_inverted():
+    mount = cv2.Rodrigues(np.deg2rad([3.0, 30.0, -20.0]))[0]
+    prior = AttitudePrior(np.eye(3), (0.3, 0.6, 2.0), axes=mount)
+    about_body = np.diag(np.deg2rad([0.3, 0.6, 2.0]) ** 2)
+    np.testing.assert_allclose(np.linalg.inv(prior.precision), mount.T @ about_body @ mount, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(AttitudePrior(np.eye(3), 0.3).precision, np.eye(3) / np.deg2rad(0.3) ** 2)
+
+
+# Refused.
+
+
+@pytest.mark.parametrize("sets", [30, pytest.param(170, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", WRONG)
+def test_wrong_matches_never_give_a_pose(kind, sets):
+    """A slice of the 100,000 sets that ``python -m bench.accuracy.poses`` draws."""
+    assert accepted(kind, sets, seed=13) == 0
+
+
+def test_many_matches_on_one_spot_count_once():
+    """Twelve points of one small thing agree with each other, whatever they show; spread out they carry a pose."""
+    rng = np.random.default_rng(21)
+    s = scene(rng, 100, wrong=1.0)
+    spots = rng.uniform(20, SIZE - 20, (12, 2)), rng.uniform(130, 146, (12, 2))
+    for pixels, carried in zip(spots, (True, False), strict=True):
+        rays = np.c_[pixels, np.ones(12)] @ np.linalg.inv(K).T @ s.rotation
+        points = s.center_m + rays * (-s.center_m[2] / rays[:, 2])[:, None]
+        pose = solve_pose(np.r_[s.points_m, points], np.r_[s.points_px, pixels], K)
+        assert (pose is not None) == carried
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5])
+def test_too_few_are_refused(count):
+    s = scene(np.random.default_rng(14), max(count, 1))
+    assert solve_pose(s.points_m[:count], s.points_px[:count], K) is None
+
+
+def test_fewer_wrong_matches_are_surer():
+    rng = np.random.default_rng(15)
+    nfa = [solved(scene(rng, 100, wrong=w, noise_px=0.3)).log10_nfa for w in (0.0, 0.3, 0.6)]
+    assert nfa == sorted(nfa)
+    assert nfa[0] < -100
+
+
+def test_points_on_a_line_are_refused():
+    rng = np.random.default_rng(16)
+    along = rng.uniform(-60, 60, 40)
+    points = np.c_[along, 0.5 * along, np.zeros(40)]
+    camera = scene(rng, tilt_deg=0)
+    x = (points - [0, 0, 150]) @ camera.rotation.T
+    for noise in (0.0, 0.5):
+        pixels = (x @ K.T)[:, :2] / x[:, 2:] + rng.normal(0, noise, (40, 2))
+        assert solve_pose(points, pixels, K) is None
+
+
+def test_repeated_matches_count_once():
+    s = scene(np.random.default_rng(17), 5)
+    index = np.tile(np.arange(5), 12)
+    assert solve_pose(s.points_m[index], s.points_px[index], K) is None
+    one = np.zeros(30, int)
+    assert solve_pose(s.points_m[one], s.points_px[one], K) is None
+
+
+def test_points_in_one_place_of_the_map_are_refused():
+    s = scene(np.random.default_rng(18), 50)
+    assert solve_pose(np.zeros((50, 3)), s.points_px, K) is None
+
+
+def test_a_camera_below_the_ground_is_refused():
+    s = scene(np.random.default_rng(19), 50)
+    mirrored = s.points_px * (-1, 1) + (SIZE - 1, 0)  # a mirrored picture of a plane is one from below
+    assert solve_pose(s.points_m, mirrored, K) is None
+
+
+def test_the_narrow_view_of_a_plane_is_ambiguous():
+    """Nearly parallel rays leave two tilts: a pose is given only when the points tell them apart."""
+    rng = np.random.default_rng(20)
+    narrow = np.array([[9000.0, 0, 149.5], [0, 9000.0, 149.5], [0, 0, 1]])
+    rotation = cv2.Rodrigues(np.deg2rad([8.0, 0, 0]))[0] @ np.diag([1.0, -1, -1])
+    points = np.c_[rng.uniform(-2, 2, (60, 2)), np.zeros(60)]
+    center = -rotation[2] * 150
+    x = (points - center) @ rotation.T
+    pixels = (x @ narrow.T)[:, :2] / x[:, 2:]
+    noisy = pixels + rng.normal(0, 0.7, pixels.shape)
+    assert solve_pose(points, noisy, narrow) is None
+    exact = solve_pose(points, pixels, narrow)
+    assert exact is not None
+    assert angle_deg(exact.rotation, rotation) < 0.1
+
+
+def test_a_little_relief_does_not_hide_the_ambiguity():
+    """A narrow view of ground that is nearly flat leaves two tilts as well, and a wrong one is never given."""
+    rng = np.random.default_rng(24)
+    refused = 0
+    for _ in range(60):
+        narrow = np.array([[rng.uniform(4000, 12000), 0, 149.5], [0, 0, 149.5], [0, 0, 1]])
+        narrow[1, 1] = narrow[0, 0]
+        rotation = cv2.Rodrigues(np.deg2rad([*rng.uniform(4, 20, 2), 0]))[0] @ np.diag([1.0, -1, -1])
+        pixels = rng.uniform(0, SIZE - 1, (30, 2))
+        rays = np.c_[pixels, np.ones(30)] @ np.linalg.inv(narrow).T @ rotation
+        points = rays * ((rng.uniform(-0.01, 0.01, 30) - 150) / rays[:, 2])[:, None]
+        pose = solve_pose(points, pixels + rng.normal(0, 0.7, pixels.shape), narrow)
+        if pose is None:
+            refused += 1
+            continue
+        turn = cv2.Rodrigues(rotation @ pose.rotation.T)[0][:, 0]
+        assert turn @ np.linalg.solve(pose.covariance[3:, 3:], turn) < 25
+    assert 0 < refused < 60
+
+
+# Wrong use.
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"reprojection_px": 0}, "reprojection_px: expected a positive number, got 0"),
+        ({"confidence": 1.0}, "confidence: expected a number in (0, 1), got 1.0"),
+        ({"max_iterations": 0}, "max_iterations: expected at least 1, got 0"),
+        ({"distinct_px": -1}, "distinct_px: expected a positive number, got -1"),
+        ({"min_inliers": 3}, "min_inliers: expected at least 4, got 3"),
+        ({"max_log10_nfa": math.nan}, "max_log10_nfa: expected a number, got nan"),
+        ({"seed": -1}, "seed: expected at least 0, got -1"),
+        ({"noise_floor_px": math.inf}, "noise_floor_px: expected a positive number, got inf"),
+    ],
+)
+def test_wrong_options_are_named(options, text):
+    with pytest.raises(OptionError) as caught:
+        PoseOptions(**options)
+    assert str(caught.value) == text
+
+
+def test_wrong_arrays_are_named():
+    points, pixels = np.zeros((8, 3)), np.zeros((8, 2))
+    with pytest.raises(ShapeError, match=r"points_m: expected \(8, 3\), got \(8, 2\)"):
+        solve_pose(np.zeros((8, 2)), pixels, K)
+    with pytest.raises(ShapeError, match=r"points_px: expected \(8, 2\), got \(7, 2\)"):
+        solve_pose(points, pixels[:7], K)
+    with pytest.raises(ShapeError, match="camera_matrix"):
+        solve_pose(points, pixels, np.eye(4))
+    with pytest.raises(ShapeError, match="weights"):
+        solve_pose(points, pixels, K, weights=np.ones(3))
+    with pytest.raises(DtypeError, match="points_px: expected real numbers"):
+        solve_pose(points, pixels.astype(complex), K)
+    with pytest.raises(ShapeError, match="rotation"):
+        AttitudePrior(rotation=np.eye(2), sigma_deg=1)
+    with pytest.raises(ShapeError, match=r"axes: expected \(3, 3\), got \(3,\)"):
+        AttitudePrior(rotation=np.eye(3), sigma_deg=1, axes=np.zeros(3))
+    with pytest.raises(OptionError, match="sigma_deg"):
+        AttitudePrior(rotation=np.eye(3), sigma_deg=0)
+
+
+# From a start
+
+
+def test_from_a_near_start_one_match_in_six_is_enough_and_from_a_far_one_nothing_is_found():
+    s = scene(np.random.default_rng(41), 180, noise_px=0.5, wrong=5 / 6, relief_m=5.0)
+    turned = cv2.Rodrigues(np.deg2rad([1.0, -2.0, 1.5]))[0] @ s.rotation
+    prior = AttitudePrior(turned, 4.0)
+    near = PoseStart(turned, s.center_m + np.array([4.0, -3.0, 2.0]), 20.0)
+    found = solve_pose(s.points_m, s.points_px, K, start=near, prior=prior)
+    assert np.linalg.norm(found.center_m - s.center_m) < 2.0
+    assert np.count_nonzero(found.inliers & s.wrong) <= 3
+    far = PoseStart(turned, s.center_m + np.array([90.0, 90.0, 0.0]), 20.0)
+    assert solve_pose(s.points_m, s.points_px, K, start=far, prior=prior) is None
+
+
+def test_where_both_poses_of_a_plane_fit_the_covariance_covers_both_from_a_start():
+    """Where the place is known by a vote an unknown tilt makes it vague; it is no reason to refuse."""
+    rng = np.random.default_rng(20)
+    narrow = np.array([[9000.0, 0, 149.5], [0, 9000.0, 149.5], [0, 0, 1]])
+    rotation = cv2.Rodrigues(np.deg2rad([8.0, 0, 0]))[0] @ np.diag([1.0, -1, -1])
+    points = np.c_[rng.uniform(-2, 2, (60, 2)), np.zeros(60)]
+    center = -rotation[2] * 150
+    x = (points - center) @ rotation.T
+    pixels = (x @ narrow.T)[:, :2] / x[:, 2:] + rng.normal(0, 0.7, (60, 2))
+    mirrored = cv2.Rodrigues(np.deg2rad([-8.0, 0, 0]))[0] @ np.diag([1.0, -1, -1])
+    for wrong_or_right in (rotation, mirrored):
+        start = PoseStart(wrong_or_right, -wrong_or_right[2] * 150, 20.0)
+        found = solve_pose(points, pixels, narrow, start=start)
+        error = found.center_m - center
+        assert error @ np.linalg.solve(found.covariance_center_m2, error) < chi2.ppf(0.999, 3)

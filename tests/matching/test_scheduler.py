@@ -1,0 +1,408 @@
+"""The scheduler: what is done of each method within a budget, and what is refused before it is begun."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import (
+    Budget,
+    Fix,
+    MatcherOptions,
+    Navigator,
+    NccOptions,
+    NoFix,
+    Prior,
+    Reason,
+    SceneMatcher,
+)
+from engine.budget import Deadline
+from engine.matching.ncc import Ncc
+from engine.matching.refinement import Refinement
+from engine.matching.sift import Sift
+from engine.runtime import scheduler, threads
+from engine.runtime.device import Device
+from engine.runtime.scheduler import Costs, OutOfTime, Scheduler
+
+NADIR = np.array([315.0, 296.0])
+HURRY = Budget(total_ms=1e6)  # finite, so that costs count, and never over
+
+
+class FixedCosts:
+    """Costs that a test sets, per step and unit of work; nothing is learned."""
+
+    def __init__(self, **per_unit):
+        self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
+        self.stages_ms, self.longest_wait_ms = [], 0.0
+
+    def needed_ms(self, step, work):
+        step = step if isinstance(step, str) else step[0]  # one variant of it
+        if not isinstance(step, str):
+            return 0.0  # a stage of a step
+        for suffix in (" at once", " of sift", " by few features"):  # other ways of the same step
+            step = step.removesuffix(suffix)
+        return self.per_unit.get(step, 0.0) * work
+
+    def learn(self, *_, **__):
+        pass
+
+    note_refusal = learn
+
+    def load(self):
+        return 1.0
+
+    def wait_ms(self):
+        return self.longest_wait_ms
+
+
+@pytest.fixture
+def make(site, camera):
+    def made(method, **per_unit):
+        matcher = SceneMatcher(site, camera, method, "cpu")
+        matcher._costs = FixedCosts(**per_unit)
+        return matcher
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def frame(ground, camera):
+    return ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0, timestamp_ns=77)
+
+
+@pytest.fixture(scope="module")
+def prior(ground):
+    return ground.prior(NADIR)
+
+
+def off_m(ground, fix):
+    assert isinstance(fix, Fix), fix
+    return float(np.hypot(*(np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR))))
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift"])
+def test_with_time_the_finest_level(ground, make, frame, prior, method):
+    for budget in (None, HURRY):
+        fix = make(method).locate(frame, prior, budget)
+        assert off_m(ground, fix) < 1.0
+        assert fix.stage == "refined"
+
+
+def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, prior):
+    fix, fine = make("ncc", refinement=1e9).locate(frame, prior, HURRY), make("ncc").locate(frame, prior, HURRY)
+    assert isinstance(fix, Fix)
+    assert isinstance(fine, Fix)
+    assert (fix.stage, fix.up_m, fine.stage) == ("fine", None, "refined")
+    assert fine.sigma_m <= fix.sigma_m
+
+
+@pytest.mark.parametrize(("method", "step"), [("ncc", "ncc"), ("sift", "sift")])
+def test_with_less_time_a_coarse_fix_of_the_same_place(ground, make, frame, prior, method, step):
+    per_unit = {step: cost_of_the_finest(make, frame, prior, method, step)}
+    fix = make(method, **per_unit, refinement=1e9).locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert fix.stage == "coarse"
+
+
+def cost_of_the_finest(make, frame, prior, method, step):
+    """Per unit of work, so that the finest variant of a step takes 1.5 times the budget."""
+    probe, work = make(method, refinement=1e9), []
+    known = probe._costs.needed_ms
+
+    def noting(name, amount):
+        work.extend([amount] if name[0] == step else [])
+        return known(name, amount)
+
+    probe._costs.needed_ms = noting
+    probe.locate(frame, prior, HURRY)
+    return 1.5 * HURRY.total_ms / max(work)
+
+
+def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, frame, prior, monkeypatch):
+    """Where there is no time for the finest level; and where there is, the coarse one is enough."""
+    hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc", "ncc")).locate(frame, prior, HURRY)
+    by_coarse = make("ncc").locate(frame, prior)
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda self, query: None)
+    by_fine = make("ncc").locate(frame, prior)
+    for fix in (hurried, by_coarse, by_fine):
+        assert off_m(ground, fix) < 0.3
+        assert fix.stage == "refined"
+    apart_m = math.hypot(by_coarse.east_m - by_fine.east_m, by_coarse.north_m - by_fine.north_m)
+    assert apart_m < by_fine.relative_sigma_m
+
+
+def test_a_refinement_that_is_abandoned_leaves_the_coarse_fix(ground, make, frame, prior, monkeypatch):
+    def out_of_time(self, fix):
+        raise OutOfTime
+
+    monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
+    fix = make("ncc").locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert fix.stage == "coarse"
+
+
+@pytest.mark.parametrize(
+    ("reason", "off_m", "is_fixed"),
+    [
+        (Reason.LATE, None, True),
+        (Reason.AMBIGUOUS, 1.0, True),  # a finer peak at the same place does not contradict
+        (Reason.AMBIGUOUS, 8.0, False),  # a rival is farther off than 6 m
+        (Reason.AMBIGUOUS, 60.0, False),
+        (Reason.LOW_SCORE, None, False),
+    ],
+)
+def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
+    make, frame, prior, monkeypatch, reason, off_m, is_fixed
+):
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    coarse = make("ncc")._method._by_coarse_peak
+
+    def refused(self, query, level, **_):
+        fix = coarse(query)
+        candidates = () if off_m is None else (replace(fix, east_m=fix.east_m + off_m),)
+        return replace(query.refuse(reason, "of the finer peak", "ncc"), candidates=candidates)
+
+    monkeypatch.setattr(Ncc, "correlate", refused)
+    result = make("ncc").locate(frame, prior, HURRY)
+    assert isinstance(result, Fix) == is_fixed
+    if is_fixed:  # refinement did not confirm the tilt, and a refused peak makes nothing more certain
+        assert result.confidence == (0.99 if off_m else pytest.approx(1.0, abs=1e-3))
+        assert result.sigma_m > 1.5 * coarse(make("ncc")._query(frame, prior, Deadline(HURRY))).sigma_m
+    assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
+
+
+@pytest.mark.parametrize("finer", [(), (1,), (1, 0)])
+def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
+    make, frame, prior, monkeypatch, finer
+):
+    """And no level is correlated twice."""
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    monkeypatch.setattr(Refinement, "refine", lambda _self, fix: fix)
+    correlated, find = [], Ncc.find
+
+    def noted(self, query, *, coarser=0, **options):
+        correlated.append(coarser)
+        return find(self, query, coarser=coarser, **options)
+
+    monkeypatch.setattr(Ncc, "find", noted)
+    matcher = make("ncc")
+    affordable = {2: 0, **dict.fromkeys(finer, 0)}
+    monkeypatch.setattr(
+        Scheduler,
+        "first_affordable",
+        lambda _self, _step, works: next((w for w in works if w in affordable), None),
+    )
+    fix = matcher.locate(frame, prior, HURRY)
+    assert correlated == [2, *finer[-1:]]
+    assert (fix.relative_sigma_m > 3.5) == (fix.stage == "coarse")
+
+
+def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, make, frame, prior, monkeypatch):
+    """What comes before it may have taken longer than thought."""
+    matcher = make("ncc")
+    by_coarse_peak = Ncc._by_coarse_peak
+
+    def slow(self, query):
+        found = by_coarse_peak(self, query)
+        matcher._costs.per_unit = {"refinement": 1e9, "ncc": 1e9}
+        return found
+
+    monkeypatch.setattr(Ncc, "_by_coarse_peak", slow)
+    fix = matcher.locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert fix.stage == "coarse"
+
+
+def test_a_refinement_at_once_that_was_too_dear_once_is_tried_again(site, camera, frame, prior):
+    """Without it every frame takes the long way, which is dearer yet."""
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    for _ in range(2):
+        matcher._costs.learn("refinement at once", 9e4, 1e7, 1e7)
+    before_ms = matcher._costs.needed_ms("refinement at once", 9e4)
+    for _ in range(40):
+        matcher.locate(frame, prior, Budget(total_ms=0.9 * before_ms))
+    assert matcher._costs.needed_ms("refinement at once", 9e4) < 0.5 * before_ms
+
+
+def test_beside_a_fix_a_step_leaves_room_for_a_preemption(ground, make, frame, prior):
+    """Which would lose the fix; without one the step is tried all the same."""
+    matcher = make("auto")
+    assert matcher.locate(frame, prior, HURRY).stage == "verified"
+    matcher._costs.longest_wait_ms = 0.9 * HURRY.total_ms
+    assert matcher.locate(frame, prior, HURRY).stage == "verified"
+    matcher._costs.longest_wait_ms = HURRY.total_ms
+    fix = matcher.locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 3.0
+    assert (fix.method, fix.stage) == ("ncc", "coarse")
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_what_cannot_be_in_time_is_not_begun(make, frame, prior, method):
+    result = make(method, ncc=1e9, sift=1e9).locate(frame, prior, HURRY)
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.LATE
+    assert "takes longer" in result.detail
+    assert list(result.timings.stages_ms) == ["grey"]
+
+
+def test_both_methods_verify_each_other(ground, make, frame, prior):
+    fix = make("auto").locate(frame, prior)
+    assert off_m(ground, fix) < 1.0
+    assert fix.stage == "verified"
+
+
+@pytest.mark.parametrize(("costs", "method"), [({"sift": 1e9}, "ncc"), ({"ncc": 1e9}, "sift")])
+def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, costs, method):
+    fix = make("auto", **costs).locate(frame, prior, HURRY)
+    assert off_m(ground, fix) < 1.0
+    assert (fix.stage, fix.method) == ("refined", method)
+
+
+def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):
+    honest = Sift.confirm
+
+    def elsewhere(*args, **named):
+        fix = honest(*args, **named)
+        return replace(fix, east_m=fix.east_m + 40.0)
+
+    monkeypatch.setattr(Sift, "confirm", elsewhere)
+    result = make("auto").locate(frame, prior)
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.INCONSISTENT
+    assert "m apart" in result.detail
+
+
+def test_unknown_height_leaves_features(ground, make, frame, prior):
+    fix = make("auto").locate(replace(frame, height_agl_m=None), prior)
+    assert off_m(ground, fix) < 1.5
+    assert (fix.stage, fix.method) == ("fine", "sift")
+
+
+def test_a_search_of_the_whole_map_has_a_budget_of_its_own(ground, make, frame):
+    dear = {"ncc_search": 1.0}
+    result = make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4))
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.LATE
+    fix = make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4, search_ms=math.inf))
+    assert off_m(ground, fix) < 1.5
+
+
+def test_costs_are_learned_and_then_kept_to(ground, camera, frame, prior):
+    matcher = SceneMatcher(ground.site, camera, "auto", "cpu")
+    matcher.warmup()
+    for step, work in (("ncc", 1e5), ("sift", 22_500.0), ("ncc search", 1e5), ("sift search", 22_500.0)):
+        assert all(matcher._costs.needed_ms(key, work) > 0.0 for key in known_steps(matcher) if key[0] == step)
+    assert isinstance(matcher.locate(frame, prior, Budget(total_ms=1e4)), Fix)
+    refused = matcher.locate(frame, prior, Budget(total_ms=0.3))
+    assert isinstance(refused, NoFix)
+    assert refused.reason is Reason.LATE
+
+
+def known_steps(matcher):
+    return [key for key in matcher._costs._runs if isinstance(key, tuple) and isinstance(key[0], str)]
+
+
+def test_a_cost_that_is_refused_fades_until_it_is_tried_again(ground, camera, frame, prior):
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
+    for level in (0, 1, 2):
+        for _ in range(9):  # the machine was slow
+            matcher._costs.learn(("ncc", level), 1.0, 2.0, 2.0)
+    results = [matcher.locate(frame, prior, Budget(total_ms=2e4)) for _ in range(300)]
+    assert isinstance(results[0], NoFix)
+    assert isinstance(results[-1], Fix)
+
+
+def test_a_vague_prior_does_not_raise_the_cost_of_a_sharp_one(site, camera, frame, prior):
+    """A window is never larger than the map, whatever the prior says: neither is what it is thought to cost."""
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    for vague in (5.0, 1e6, 5.0, 1e6):
+        matcher.locate(frame, replace(prior, sigma_m=vague))
+    assert isinstance(matcher.locate(frame, prior, Budget(total_ms=3_600_000.0)), Fix)
+
+
+def test_after_warmup_nothing_is_created_in_flight(ground, site, camera):
+    matcher = SceneMatcher(site, camera, "auto", "cpu")
+    matcher.warmup()
+    before = matcher.cache_counters
+    assert all(count > 0 for count in before.values())
+    for number in range(8):
+        place = NADIR + np.array([4.0, -3.0]) * number
+        frame = ground.frame(camera, place, 120.0 + 8 * number, heading_deg=40.0 * number)
+        matcher.locate(frame, ground.prior(place, sigma_m=5.0 + number))
+    assert matcher.cache_counters == before
+
+
+def test_after_warmup_no_loop_is_compiled_for_a_refused_frame_or_one_without_tilt(site, camera, frame, prior):
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    matcher.warmup()
+    before = matcher.cache_counters
+    assert isinstance(matcher.locate(replace(frame, roll_deg=None, pitch_deg=None), prior), Fix)
+    noise = np.random.default_rng(0).integers(0, 255, frame.image.shape, np.uint8)
+    assert isinstance(matcher.locate(replace(frame, image=noise), prior), NoFix)
+    assert matcher.cache_counters == before
+
+
+def test_a_late_frame_is_no_sign_of_being_lost(ground, make, frame, prior):
+    matcher = make("ncc", ncc=1e9)
+    priors = []
+    honest = matcher.locate
+    matcher.locate = lambda *args: priors.append(args[1]) or honest(*args)
+    navigator = Navigator(matcher, prior, HURRY)
+    for number in range(30):
+        assert navigator.update(replace(frame, timestamp_ns=number)).reason is Reason.LATE
+    assert all(isinstance(p, Prior) for p in priors)
+
+
+@pytest.mark.parametrize(
+    "searched", [{"heading_search_deg": 20.0}, pytest.param({"height_search_share": 0.05}, marks=pytest.mark.slow)]
+)
+def test_warmup_knows_the_cost_of_a_search(site, camera, searched):
+    options = MatcherOptions(ncc=NccOptions(refine=False, **searched))
+    matcher = SceneMatcher(site, camera, "ncc", "cpu", options)
+    matcher.warmup()
+    assert matcher._costs.needed_ms(("ncc hypotheses", 0), 1e5) > 0.0
+
+
+@pytest.mark.parametrize(("count", "used_ms"), [(1, 1.0), (2, 9.0)])
+def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monkeypatch):
+    """A thread that lets others work is off the processor for as long as they work."""
+    monkeypatch.setattr(threads, "count", lambda: count)
+    clock_ns, processor_ns = iter([0, 0, 0, 9_000_000]), iter([0, 1_000_000])
+    monkeypatch.setattr(scheduler.time, "thread_time_ns", lambda: next(processor_ns))
+    learned, costs = [], Costs()
+    monkeypatch.setattr(costs, "learn", lambda *run: learned.append(run))
+    one = Scheduler(Deadline(HURRY, lambda: next(clock_ns)), Device("cpu"), costs)
+    with one.costed("step", 5.0):
+        pass
+    assert learned == [("step", 5.0, pytest.approx(used_ms), pytest.approx(9.0))]
+
+
+def test_what_compiled_is_nobodys_cost(monkeypatch):
+    compiled = iter([0, 1, 1, 1])
+    monkeypatch.setattr(scheduler, "loops_compiled", lambda: next(compiled))
+    costs = Costs()
+    for _ in range(2):
+        with Scheduler(Deadline(HURRY), Device("cpu"), costs).costed("step", 5.0):
+            pass
+    assert len(costs._runs["step"]) == 1
+
+
+def test_a_late_frame_that_compiled_says_so(site, camera, frame, prior, monkeypatch):
+    """And only that one."""
+    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    compiled = iter([0, 1])
+    monkeypatch.setattr("engine.matching.matcher.loops_compiled", lambda: next(compiled, 1))
+    cold, warm = (matcher.locate(frame, prior, Budget(total_ms=1e-6)) for _ in range(2))
+    assert cold.reason is warm.reason is Reason.LATE
+    assert cold.detail.endswith("; compiling: call warmup() before take-off")
+    assert "compiling" not in warm.detail
+
+
+def test_warmup_reports_what_it_compiles(site, camera):
+    seen = []
+    SceneMatcher(site, camera, "ncc", "cpu").warmup(lambda done, total: seen.append((done, total)))
+    assert [done for done, _ in seen] == list(range(1, len(seen) + 1))
+    assert {total for _, total in seen} == {len(seen)}

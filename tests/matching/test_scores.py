@@ -1,0 +1,205 @@
+"""Scores: each is what its line says, respects nodata, finds its place, and survives what it is meant for."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from engine import Fix, Frame, MatcherOptions, OptionError, OrthoMap, SceneMatcher
+from engine.budget import Budget, Deadline
+from engine.kernels.scores import SCORES, enhance
+from engine.maps import prepared as prepared_map
+from engine.maps.prepared import PreparedMap
+from engine.matching.ncc import Ncc
+from engine.matching.query import Query
+from engine.options import NccOptions
+from engine.runtime.scheduler import Scheduler
+from engine.values import Window
+from tests.support.paths import ROOT
+
+CPU = torch.device("cpu")
+NADIR = np.array([310.0, 305.0])
+PIXELS = 0.5  # the most that a fix may be off, in map pixels
+
+
+def noise(shape=(60, 63), seed=0, top=256):
+    return np.random.default_rng(seed).integers(0, top, shape).astype(np.uint8)
+
+
+def binomial(gray):
+    """Rows and columns weighted 1-2-1, the border reflected about its pixels."""
+    wide = np.pad(gray.astype(float), 1, mode="reflect")
+    tall = wide[:-2] + 2 * wide[1:-1] + wide[2:]
+    return (tall[:, :-2] + 2 * tall[:, 1:-1] + tall[:, 2:]) / 16
+
+
+# What each score is
+
+
+def test_grey_is_the_smoothed_picture_about_middle_grey():
+    gray = noise()
+    np.testing.assert_allclose(enhance(gray, score="grey"), binomial(gray) - 127.5, atol=0.51)
+
+
+def test_local_is_what_is_taken_where_no_score_is_named():
+    np.testing.assert_array_equal(enhance(noise()), enhance(noise(), score="local"))
+    assert NccOptions().score == "local"
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_gradient_is_its_normalised_magnitude_as_written(masked):
+    gray = noise()
+    smooth = binomial(gray)
+    dy, dx = (np.gradient(smooth, axis=axis) for axis in (0, 1))  # central differences inside
+    magnitude = np.hypot(dx, dy)
+    valid = np.ones(gray.shape, bool) if masked else None
+    enhanced = enhance(gray, radius_px=3, score="gradient", valid=valid)
+    for y, x in ((10, 10), (20, 33), (50, 44)):
+        box = magnitude[y - 3 : y + 4, x - 3 : x + 4]
+        expected = (magnitude[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
+        assert enhanced[y, x] == pytest.approx(expected, abs=0.1)  # smoothed to whole grey levels
+
+
+def test_gradient_does_not_care_which_side_is_darker():
+    gray = noise()
+    np.testing.assert_allclose(enhance(255 - gray, score="gradient"), enhance(gray, score="gradient"), atol=0.2)
+    assert np.corrcoef(enhance(255 - gray).ravel(), enhance(gray).ravel())[0, 1] < -0.99
+
+
+def test_mixed_is_the_sum_of_local_and_gradient():
+    gray, valid = noise(), noise(seed=1) > 20
+    for mask in (None, valid):
+        both = enhance(gray, score="local", valid=mask) + enhance(gray, score="gradient", valid=mask)
+        np.testing.assert_allclose(enhance(gray, score="mixed", valid=mask), both, atol=1e-6)
+
+
+@pytest.mark.parametrize("score", ["local", "gradient", "mixed"])
+def test_no_neighbourhood_is_brighter_than_another(score):
+    """Texture on a ramp, and twice as strong on its right: neither is left."""
+    gray = np.rint(noise((120, 160), top=60) * np.linspace(0.5, 1.0, 160) + np.linspace(0, 180, 160)).astype(
+        np.uint8
+    )
+    enhanced = enhance(gray, score=score)
+    left, right = enhanced[10:-10, 10:70], enhanced[10:-10, 90:150]
+    assert abs(left.mean()) < 0.05
+    assert abs(right.mean()) < 0.05
+    assert 0.8 < left.std() / right.std() < 1.1
+    assert enhanced.dtype == np.float32
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_flat_ground_stays_flat_and_finite(score):
+    for level in (0, 17, 255):
+        assert np.ptp(enhance(np.full((30, 31), level, np.uint8), score=score)) < 0.02
+    assert not enhance(np.full((30, 31), 80, np.uint8), score=score, valid=np.zeros((30, 31), bool)).any()
+
+
+# Nodata
+
+
+@pytest.mark.parametrize("score", SCORES)
+@pytest.mark.parametrize("radius_px", [0, 5])
+def test_what_is_not_valid_is_not_seen(score, radius_px):
+    gray = noise()
+    valid = np.ones(gray.shape, bool)
+    valid[:, 40:] = False
+    valid[5:9, 5:8] = False
+    black, white = np.where(valid, gray, 0).astype(np.uint8), np.where(valid, gray, 255).astype(np.uint8)
+    first, second = (enhance(g, radius_px=radius_px, score=score, valid=valid) for g in (black, white))
+    np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-6)  # a few roundings of float32
+    assert not first[~valid].any()
+    far = np.s_[20:, : 40 - radius_px - 2]
+    whole = enhance(gray, radius_px=radius_px, score=score)
+    np.testing.assert_allclose(first[far], whole[far], atol=1.6 if radius_px == 0 or score == "grey" else 0.2)
+
+
+@pytest.mark.parametrize("score", ["gradient", "mixed"])
+def test_the_edge_of_nodata_is_no_edge_on_the_ground(score):
+    """Flat bright ground beside nodata: a gradient taken across would be the strongest of all."""
+    valid = np.ones((40, 40), bool)
+    valid[:, 20:] = False
+    assert np.abs(enhance(np.where(valid, 230, 0).astype(np.uint8), score=score, valid=valid)).max() < 1e-2
+
+
+@pytest.mark.parametrize("score", SCORES)
+@pytest.mark.parametrize("nodata", [False, True])
+def test_regions_of_a_large_map_join_without_a_seam(score, nodata, ground, monkeypatch):
+    gray = np.tile(ground.gray, (2, 2))
+    valid = None
+    if nodata:
+        valid = np.ones(gray.shape, bool)
+        valid[500:530, 490:540] = False
+    site = OrthoMap.from_arrays(gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", valid=valid)
+    inside = Window(512, 512, 512, 512)
+    whole = PreparedMap(site, CPU, 8, score).cut(inside, 0)
+    monkeypatch.setattr(prepared_map, "WHOLE_LEVEL_PX", 1)
+    part = PreparedMap(site, CPU, 8, score).cut(inside, 0)
+    # Whole grey levels where a region has no nodata, parts of them where it has: a rounding apart.
+    torch.testing.assert_close(part.search.image, whole.search.image, atol=1e-3 if not nodata else 0.6, rtol=0.0)
+
+
+# Finding a place
+
+
+def locate(ground, camera, frame, score):
+    """The NCC method on a map that was prepared for a score, at the first look."""
+    options = MatcherOptions(ncc=NccOptions(score=score, second_look=False))
+    scheduler = Scheduler(Deadline(Budget()), CPU)
+    query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, scheduler)
+    return Ncc(ground.site, CPU, options).locate(query)
+
+
+def assert_found(result):
+    assert isinstance(result, Fix), result
+    assert np.hypot(*(np.array(result.map_xy_px) - NADIR)) < PIXELS
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_every_score_finds_its_place(ground, camera, score):
+    frame = ground.frame(camera, NADIR, roll_deg=-5.0, pitch_deg=4.0, heading_deg=200.0)
+    assert_found(locate(ground, camera, frame, score))
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_a_matcher_prepares_its_map_for_its_score(ground, camera, score):
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(score=score)))
+    frame = ground.frame(camera, NADIR, heading_deg=30.0)
+    assert_found(matcher.locate(frame, ground.prior(NADIR)))
+    assert_found(matcher.locate(frame))  # whole map
+
+
+@pytest.mark.parametrize("score", ["local", "gradient", "mixed"])
+def test_a_frame_that_is_darker_to_one_side_is_found(ground, camera, score):
+    image = ground.picture(camera, NADIR, 150.0)
+    shaded = np.rint(image * np.linspace(0.25, 1.0, image.shape[1])).astype(np.uint8)
+    assert_found(locate(ground, camera, Frame(shaded, 0, 150.0, 0.0, 0.0, 0.0), score))
+
+
+def test_a_frame_whose_tones_are_turned_round_is_found_by_its_gradient_alone(ground, camera):
+    inverted = Frame(255 - ground.picture(camera, NADIR, 150.0), 0, 150.0, 0.0, 0.0, 0.0)
+    assert_found(locate(ground, camera, inverted, "gradient"))
+    assert not isinstance(locate(ground, camera, inverted, "local"), Fix)
+
+
+# Options and the page
+
+
+def test_a_score_that_does_not_exist_is_refused():
+    words = r"^score: expected one of grey, local, gradient, mixed, got 'census'"
+    with pytest.raises(OptionError, match=words):
+        NccOptions(score="census")
+    with pytest.raises(OptionError, match=words):
+        enhance(noise(), score="census")
+
+
+def test_the_page_lists_every_score_and_measures_it():
+    page = (ROOT / "docs" / "scores.md").read_text(encoding="utf-8")
+    assert re.findall(r'^\| `"(\w+)"` \|', page, re.MULTILINE) == list(SCORES)
+    measured = page.split("## Measured\n", 1)[1]
+    head, _, *rows = [line.strip("|").split("|") for line in measured.splitlines() if line.startswith("|")]
+    assert [cell.strip(' `"') for cell in head[1:]] == list(SCORES)
+    assert all(len(row) == len(head) and all(re.search(r"\d", cell) for cell in row[1:]) for row in rows)

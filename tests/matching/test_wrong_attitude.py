@@ -1,0 +1,65 @@
+"""A telemetry whose roll and pitch are wrong: the picture outweighs it, by each method."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import Fix, OrthoMap, SceneMatcher
+from engine.matching.refinement import Refinement
+from engine.runtime.scheduler import OutOfTime
+
+NADIR = np.array([310.0, 305.0])
+TRUE = {"roll_deg": 4.0, "pitch_deg": -3.0, "heading_deg": 20.0}
+
+
+@pytest.fixture(scope="module")
+def site(ground):
+    flat = np.zeros(ground.gray.shape, np.float32)
+    return OrthoMap.from_arrays(
+        ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat, georeference_sigma_m=0.1
+    )
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"roll_deg": 6.0, "pitch_deg": -1.0},  # a mount that is off
+        {"roll_deg": -3.0, "pitch_deg": 4.0},  # swapped
+        {"roll_deg": -4.0, "pitch_deg": 3.0},  # of the other sign
+        {"roll_deg": 0.07, "pitch_deg": -0.05},  # radians
+        {"roll_deg": 14.0, "pitch_deg": -3.0},
+        {"roll_deg": 4.0, "pitch_deg": 7.0},
+        {"roll_deg": 4.0, "pitch_deg": -13.0},
+        {"roll_deg": -6.0, "pitch_deg": -3.0},
+    ],
+)
+def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, method, stated):
+    frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), **stated)
+    fix = SceneMatcher(site, camera, method, "cpu").locate(frame, ground.prior(NADIR))
+    assert isinstance(fix, Fix)
+    off_m = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)
+    assert np.hypot(*off_m) < 1.0
+    assert np.hypot(*off_m) < 3.0 * fix.sigma_m
+    assert fix.attitude is not None
+    assert abs(fix.attitude.roll_deg - TRUE["roll_deg"]) < 0.5
+    assert abs(fix.attitude.pitch_deg - TRUE["pitch_deg"]) < 0.5
+
+
+@pytest.mark.parametrize("knows_better", [True, False, None])
+def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, camera, monkeypatch, knows_better):
+    """And stands where the doubt leads nowhere, or there is no time for it (None)."""
+
+    def through_all(self, fix):
+        if not self.knows_tilt and knows_better is None:
+            raise OutOfTime
+        better = replace(fix, stage="refined", score=0.9)
+        hardly = replace(fix, stage="refined", score=0.3)
+        return hardly if self.knows_tilt else better if knows_better else None
+
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    monkeypatch.setattr(Refinement, "_through_all", through_all)
+    frame = ground.frame(camera, NADIR, 150.0, **TRUE)
+    fix = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
+    assert (fix.stage, fix.score) == ("refined", 0.9 if knows_better else 0.3)

@@ -1,0 +1,385 @@
+"""The live pipeline: every frame answered once and in time, the newest first, and no fix under another's stamp."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from engine.errors import OptionError, StateError, TelemetryError
+from engine.navigation.live import Live, LiveOptions
+from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
+
+IMAGE = np.zeros((4, 4), np.uint8)
+
+
+def frame(number: int) -> Frame:
+    return Frame(IMAGE, number)
+
+
+def fix(of: Frame) -> Fix:
+    return Fix(
+        timestamp_ns=of.timestamp_ns, lat_deg=0.0, lon_deg=0.0, east_m=float(of.timestamp_ns or 0), north_m=0.0,
+        up_m=None, covariance_m2=np.eye(3), attitude=None, score=1.0, method="ncc", window=Window(0, 0, 1, 1),
+        timings=Timings(), map_xy_px=(0.0, 0.0),
+    )  # fmt: skip
+
+
+class Slow:
+    """A navigator that takes its time; on frames that are listed it does something else."""
+
+    def __init__(self, takes_ms: float, odd=None):
+        self.takes_ms, self.odd, self.budgets = takes_ms, odd or {}, []
+
+    def update(self, frame, prior=None, budget=None):
+        self.budgets.append(budget.total_ms)
+        if frame.timestamp_ns in self.odd:
+            self.odd[frame.timestamp_ns]()
+        time.sleep(self.takes_ms * 1e-3)
+        return fix(frame)
+
+
+class Sink:
+    """Collects answers and lets a test wait for them."""
+
+    def __init__(self):
+        self.answers, self.changed = [], threading.Condition()
+
+    def __call__(self, answer):
+        with self.changed:
+            self.answers.append(answer)
+            self.changed.notify_all()
+
+    def wait_for(self, count: int, timeout_s: float = 60.0):
+        with self.changed:
+            assert self.changed.wait_for(lambda: len(self.answers) >= count, timeout_s), self.answers
+            return list(self.answers)
+
+
+def reasons(answers):
+    return [a.result.reason if isinstance(a.result, NoFix) else "fix" for a in answers]
+
+
+def no_threads():
+    return not [thread for thread in threading.enumerate() if thread.name.startswith("scenematch-_")]
+
+
+def wait_until(condition, timeout_s: float = 60.0):
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "it did not come to that"
+        time.sleep(0.005)
+
+
+def test_each_frame_has_its_own_fix():
+    sink, navigator = Sink(), Slow(0)
+    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
+        for number in range(20):
+            live.submit(frame(number))
+            sink.wait_for(number + 1)
+    assert [a.result.timestamp_ns for a in sink.answers] == list(range(20))
+    assert all(a.frame.timestamp_ns == a.result.timestamp_ns == a.result.east_m for a in sink.answers)
+    assert (live.counts.submitted, live.counts.answered, live.counts.dropped, live.counts.late) == (20, 20, 0, 0)
+
+
+def test_the_newest_wins_and_drops_are_counted():
+    gate, sink = threading.Event(), Sink()
+    navigator = Slow(0, {0: gate.wait})
+    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
+        live.submit(frame(0))
+        while not navigator.budgets:
+            time.sleep(0.001)
+        for number in range(1, 8):
+            live.submit(frame(number))
+        gate.set()
+        answers = sink.wait_for(2)
+    assert [a.frame.timestamp_ns for a in answers] == [0, 7]
+    assert live.counts.dropped == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [2, 5, 10])
+def test_more_frames_than_it_can_take(times):
+    """The age at output stays within the deadline and one frame, however many come."""
+    takes_ms, sink = 20.0, Sink()
+    options = LiveOptions(deadline_ms=60)
+    begun_ns = time.monotonic_ns()
+    with Live(lambda start: Slow(takes_ms), sink, options=options) as live:
+        for number in range(30 * times):
+            live.submit(frame(number))
+            time.sleep(takes_ms / times * 1e-3)
+        sink.wait_for(5)
+    counts, took_ms = live.counts, (time.monotonic_ns() - begun_ns) * 1e-6
+    assert counts.submitted == 30 * times == counts.answered + counts.dropped
+    assert counts.answered <= took_ms / takes_ms + took_ms / options.deadline_ms + 2  # one in work, one that waits
+    stamps = [a.frame.timestamp_ns for a in sink.answers]
+    assert stamps == sorted(set(stamps))
+    assert all(isinstance(a.result, NoFix) or a.age_ms <= 60 for a in sink.answers)
+
+
+def test_an_answer_comes_at_the_deadline_and_the_late_fix_never():
+    gate, sink = threading.Event(), Sink()
+    options = LiveOptions(deadline_ms=50, patience_ms=60_000)
+    with Live(lambda start: Slow(0, {0: gate.wait}), sink, options=options) as live:
+        live.submit(frame(0))
+        assert reasons(sink.wait_for(1)) == [Reason.LATE]
+        gate.set()
+        live.submit(frame(1))
+        sink.wait_for(2)
+    assert [a.frame.timestamp_ns for a in sink.answers] == [0, 1]
+    assert live.counts.workers_replaced == 0
+
+
+def test_the_navigator_is_given_what_is_left():
+    sink, navigator = Sink(), Slow(0)
+    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
+        live.submit(frame(0), captured_ns=time.monotonic_ns() - 3_000_000_000)
+        sink.wait_for(1)
+        live.submit(frame(1), captured_ns=time.monotonic_ns() - 61_000_000_000)
+        answers = sink.wait_for(2)
+    assert 0 < navigator.budgets[0] <= 57_000
+    assert len(navigator.budgets) == 1  # nothing is begun that cannot be in time
+    assert reasons(answers) == ["fix", Reason.LATE]
+    assert answers[0].age_ms >= 3000
+
+
+@pytest.mark.slow
+def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
+    gate, sink, starts = threading.Event(), Sink(), []
+
+    def make(start):
+        starts.append(start)
+        return Slow(0, {1: gate.wait} if len(starts) == 1 else {})
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=1000, patience_ms=1000)) as live:
+        live.submit(frame(0))
+        sink.wait_for(1)
+        live.submit(frame(1))
+        sink.wait_for(2)
+        while live.counts.workers_replaced == 0:
+            time.sleep(0.005)
+        number = 2
+        while reasons(sink.answers)[-1] != "fix":  # until the new worker has begun
+            live.submit(frame(number))
+            sink.wait_for(number + 1)
+            number += 1
+        gate.set()  # the one that hung comes back, and is not heard
+        time.sleep(0.05)
+    assert reasons(sink.answers)[:2] == ["fix", Reason.LATE]
+    assert live.counts.workers_replaced == 1
+    assert starts[0] is None
+    assert starts[1].east_m == 0.0
+    assert starts[1].sigma_m > 1.0
+    assert [a.frame.timestamp_ns for a in sink.answers] == list(range(number))
+
+
+def test_a_worker_that_dies_is_replaced_and_its_frame_answered():
+    def die():
+        raise ZeroDivisionError("a bug")
+
+    sink, made = Sink(), []
+
+    def make(start):
+        made.append(Slow(0, {} if made else {0: die}))
+        return made[-1]
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=60_000)) as live:
+        live.submit(frame(0))
+        sink.wait_for(1)
+        live.submit(frame(1))
+        answers = sink.wait_for(2)
+    assert reasons(answers) == [Reason.FAILED, "fix"]
+    assert "ZeroDivisionError: a bug" in answers[0].result.detail
+    assert len(made) == 2
+    assert live.counts.workers_replaced == 1
+
+
+def test_a_frame_that_cannot_be_used_costs_no_worker():
+    def refuse():
+        raise TelemetryError("timestamp_ns: expected later than 5, got 0")
+
+    sink = Sink()
+    with Live(lambda start: Slow(0, {0: refuse}), sink, options=LiveOptions(deadline_ms=60_000)) as live:
+        live.submit(frame(0))
+        answers = sink.wait_for(1)
+    assert reasons(answers) == [Reason.FAILED]
+    assert live.counts.workers_replaced == 0
+
+
+@pytest.mark.slow
+def test_a_maker_that_fails_is_asked_again(caplog):
+    sink, calls = Sink(), []
+
+    def die():
+        raise ZeroDivisionError
+
+    def make(start):
+        calls.append(start)
+        if len(calls) == 2:
+            raise OSError("map is gone")
+        return Slow(0, {0: die} if len(calls) == 1 else {})
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=1000, patience_ms=1000)) as live:
+        live.submit(frame(0))
+        sink.wait_for(1)
+        number = 1
+        while reasons(sink.answers)[-1] != "fix":
+            live.submit(frame(number))
+            sink.wait_for(number + 1)
+            number += 1
+    assert len(calls) == 3
+    assert "make_navigator failed" in caplog.text
+
+
+def test_a_receiver_that_fails_stops_nothing(caplog):
+    sink = Sink()
+
+    def deliver(answer):
+        sink(answer)
+        raise ValueError("the receiver's own")
+
+    with Live(lambda start: Slow(0), deliver, options=LiveOptions(deadline_ms=60_000)) as live:
+        for number in range(3):
+            live.submit(frame(number))
+            sink.wait_for(number + 1)
+    assert reasons(sink.answers) == ["fix"] * 3
+    assert "deliver failed" in caplog.text
+
+
+def test_after_closing_there_is_nothing_more():
+    live = Live(lambda start: Slow(0), lambda answer: None)
+    live.close()
+    with pytest.raises(StateError, match="submit: expected an open pipeline"):
+        live.submit(frame(0))
+    wait_until(no_threads)
+
+
+def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it():
+    begun, gate, over, sink = threading.Event(), threading.Event(), [], Sink()
+
+    def work():
+        begun.set()
+        gate.wait(60.0)
+        over.append(True)
+
+    navigator = Slow(0, dict.fromkeys(range(1000), work))
+    live = Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=60_000))
+    for number in range(1000):
+        live.submit(frame(number))
+        assert reasons(sink.wait_for(number + 1)) == [Reason.LATE] * (number + 1)
+        if begun.is_set():  # on a machine that is busy a frame may be due before its work begins
+            break
+    threading.Timer(0.1, gate.set).start()
+    live.close()
+    assert over
+
+
+def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
+    calls, sink = [], Sink()
+
+    def die():
+        raise ZeroDivisionError
+
+    def make(start):
+        calls.append(start)
+        if len(calls) > 1:
+            raise OSError("map is gone")
+        return Slow(0, {0: die})
+
+    live = Live(make, sink, options=LiveOptions(deadline_ms=60_000, patience_ms=60))
+    live.submit(frame(0))
+    sink.wait_for(1)
+    wait_until(lambda: len(calls) > 1)
+    live.close()
+    wait_until(no_threads, timeout_s=60.0)
+    made, replaced = len(calls), live.counts.workers_replaced
+    time.sleep(0.15)
+    assert (len(calls), live.counts.workers_replaced) == (made, replaced)
+
+
+def test_closing_waits_for_a_worker_that_was_given_up():
+    """A process that ends while a thread of its is within compiled code is aborted."""
+    gate, over, sink = threading.Event(), [], Sink()
+
+    begun = threading.Event()
+
+    def slow():
+        begun.set()
+        gate.wait(60.0)
+        time.sleep(0.3)
+        over.append(True)
+
+    navigator = Slow(0, dict.fromkeys(range(1000), slow))
+    with Live(lambda _: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=30)) as live:
+        for number in range(1000):
+            live.submit(frame(number))
+            sink.wait_for(number + 1)
+            if begun.is_set():
+                break
+        wait_until(lambda: live.counts.workers_replaced > 0)
+        assert not over
+        gate.set()
+    assert over
+
+
+@pytest.mark.parametrize("name", ["deadline_ms", "patience_ms"])
+def test_nothing_is_waited_for_longer_than_a_minute(name):
+    with pytest.raises(OptionError, match=f"{name}: expected at most 60000, got 1e\\+13"):
+        LiveOptions(**{name: 1e13})
+
+
+@pytest.mark.slow
+def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
+    monkeypatch.setattr("engine.navigation.live._JOIN_S", 0.05)
+    gate, sink, starts = threading.Event(), Sink(), []
+
+    def make(start):
+        starts.append(start)
+        return Slow(0, {0: gate.wait})
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=500, patience_ms=2000)) as live:
+        live.submit(frame(0))
+        assert reasons(sink.wait_for(1)) == [Reason.LATE]
+    time.sleep(2.5)
+    assert len(starts) == 1
+    assert live.counts.workers_replaced == 0
+    gate.set()
+    wait_until(no_threads)
+
+
+@pytest.mark.slow
+def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
+    gate, sink, calls = threading.Event(), Sink(), []
+
+    def die():
+        raise ZeroDivisionError
+
+    def make(start):
+        calls.append(time.monotonic())
+        if 1 < len(calls) < 4:
+            gate.wait()
+        return Slow(0, {0: die} if len(calls) == 1 else {})
+
+    with Live(make, sink, options=LiveOptions(deadline_ms=100, patience_ms=10)) as live:
+        live.submit(frame(0))
+        answers, number = sink.wait_for(1), 1
+        while reasons(answers)[-1] != "fix":
+            assert number < 200, "it is waited for without end"
+            live.submit(frame(number))
+            answers, number = sink.wait_for(number + 1), number + 1
+        gate.set()  # those that hung come back, and are not heard
+        live.submit(frame(number))
+        assert reasons(sink.wait_for(number + 1))[-1] == "fix"
+    assert set(reasons(answers)[1:-1]) == {Reason.LATE}  # nothing waits for longer than its deadline
+    assert len(calls) == 4
+    assert live.counts.workers_replaced == 3
+    # A maker that is only slow comes through in the end: each is waited for twice as long as the one before.
+    assert calls[2] - calls[1] > 0.08
+    assert calls[3] - calls[2] > 0.18
+
+
+def test_options_are_checked():
+    with pytest.raises(OptionError, match="deadline_ms: expected a number above 0, got 0"):
+        LiveOptions(deadline_ms=0)

@@ -1,0 +1,105 @@
+"""The map's own error: one for all fixes of a map, and what another source says of it in flight."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from engine import Fix, Frame, Navigator, Prior, Timings, Window
+from engine.geo import LocalFrame
+from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
+from engine.navigation.motion import PositionEstimate
+
+IMAGE = np.zeros((8, 8), np.uint8)
+SECOND = 1_000_000_000
+STILL = {"east_velocity_mps": 0.0, "north_velocity_mps": 0.0}
+
+
+def fix_at(east_m, north_m, sigma_m=0.5, map_sigma_m=3.0):
+    return Fix(
+        timestamp_ns=None, lat_deg=48.0, lon_deg=15.0, east_m=east_m, north_m=north_m, up_m=None,
+        covariance_m2=(sigma_m**2 + map_sigma_m**2) * np.eye(3), attitude=None, score=0.9, method="sift",
+        window=Window(0, 0, 1000, 1000), timings=Timings(), map_xy_px=(0.0, 0.0), confidence=0.9999,
+        map_sigma_m=map_sigma_m,
+    )  # fmt: skip
+
+
+class Script:
+    """A matcher that answers with places on a map that states nothing of its accuracy."""
+
+    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=None)
+
+    def __init__(self, *places):
+        self.places, self.priors = list(places), []
+
+    def locate(self, frame, prior=None, budget=None):
+        self.priors.append(prior)
+        return replace(fix_at(*self.places.pop(0)), timestamp_ns=frame.timestamp_ns)
+
+
+def fly(places, given=None, seconds=1.0):
+    script = Script(*places)
+    navigator = Navigator(script, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0))
+    results = []
+    for k in range(len(places)):
+        frame = Frame(IMAGE, round(k * seconds * SECOND), 100.0, 0.0, **STILL)
+        results.append(navigator.update(frame, None if given is None else given[k]))
+    return results, script.priors, navigator
+
+
+def test_a_fix_tells_what_of_its_covariance_is_the_maps():
+    fix = fix_at(0.0, 0.0, sigma_m=0.5, map_sigma_m=3.0)
+    assert fix.sigma_m == pytest.approx(math.hypot(0.5, 3.0))
+    assert fix.relative_sigma_m == pytest.approx(0.5)
+    assert np.allclose(fix.relative_covariance_m2, 0.25 * np.eye(2))
+
+
+def test_the_maps_error_cancels_between_fixes_on_it():
+    """The window of the next frame is not wider for it, and a match 5 m off contradicts a fix known to 0.5 m."""
+    results, priors, navigator = fly([(0.0, 0.0), (5.0, 0.0)])
+    assert [isinstance(result, Fix) for result in results] == [True, False]
+    assert priors[1].sigma_m == pytest.approx(math.hypot(0.5, 0.5))
+    assert navigator.prediction.sigma_m == pytest.approx(math.sqrt(0.5 + 9.0))  # of a place in the world
+
+
+def test_a_position_of_another_source_is_searched_with_the_maps_error():
+    """Known to centimetres in the world, it is known to 3 m on a map that states nothing."""
+    centimetres = [Prior(east_m=4.0, north_m=3.0, sigma_m=0.02)]
+    script = Script((0.0, 0.0))
+    navigator = Navigator(script)
+    assert isinstance(navigator.update(Frame(IMAGE, 0, 100.0, 0.0, **STILL), centimetres[0]), Fix)
+    assert script.priors[0].sigma_m == pytest.approx(3.0, rel=1e-3)
+
+
+def test_the_offset_is_estimated_in_flight_and_moves_no_fix():
+    rng = np.random.default_rng(1)
+    places = rng.normal([2.0, -1.0], 0.3, (300, 2))
+    given = [Prior(east_m=float(e), north_m=float(n), sigma_m=0.5) for e, n in places]
+    results, _, navigator = fly([(0.0, 0.0)] * 300, given)
+    assert all(isinstance(result, Fix) and result.east_m == 0.0 for result in results)
+    offset = navigator.map_offset
+    sigma_m = np.sqrt(np.diag(offset.covariance_m2))
+    assert (np.abs(offset.en_m - [2.0, -1.0]) < 3.0 * sigma_m).all()
+    assert sigma_m.min() > 0.1  # five minutes count as some six differences
+    assert sigma_m.max() < 0.5
+
+
+def test_without_another_source_nothing_is_known_of_the_offset():
+    assert fly([(0.0, 0.0)] * 3)[2].map_offset is None
+    estimator = MapOffsetEstimator()
+    estimator.add(fix_at(0.0, 0.0, map_sigma_m=0.0), PositionEstimate(np.ones(2), 1.0), 0.0)
+    assert estimator.offset is None
+
+
+def test_a_corrected_fix_is_moved_in_all_its_coordinates():
+    frame = LocalFrame(48.0, 15.0)
+    fix = fix_at(0.0, 0.0)
+    moved = MapOffset(np.array([30.0, -40.0]), 0.04 * np.eye(2)).corrected(fix, frame)
+    assert (moved.east_m, moved.north_m, moved.map_sigma_m) == (30.0, -40.0, 0.0)
+    assert np.allclose(frame.enu_from_geodetic(moved.lat_deg, moved.lon_deg), [30.0, -40.0], atol=1e-6)
+    assert moved.sigma_m == pytest.approx(math.hypot(0.5, 0.2))
+    assert moved.covariance_m2[2, 2] == fix.covariance_m2[2, 2]

@@ -1,0 +1,337 @@
+"""Visual odometry: pictures of a plane by two known poses, what must be refused, and dead reckoning by it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
+from engine.navigation.motion import DeadReckoning, DriftModel, GroundMotion
+from engine.navigation.odometry import NoMotion, OdometryOptions, VisualOdometry
+from scenematch.runs.settings import TrackSettings, load_settings
+
+CAMERA = Camera.from_fov(320, 240, 60.0)
+HEIGHT_M, GROUND_M_PER_PX = 120.0, 0.25
+SIDE_PX = 1600
+LEVEL = Attitude(0.0, 0.0, 0.0)
+INTERVAL_S = 0.5
+
+
+def texture(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    layers = [cv2.resize(rng.normal(size=(n, n)), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_CUBIC)
+              for n in (50, 200, 800)]  # fmt: skip
+    total = sum(layer / np.sqrt(k + 1.0) for k, layer in enumerate(layers))
+    return np.clip(128.0 + 40.0 * total, 0, 255).astype(np.uint8)
+
+
+GROUND = texture(0)
+
+
+def picture(place_m, attitude: Attitude, height_m=HEIGHT_M, ground=GROUND, camera=CAMERA):
+    """What a pinhole camera shows of the ground, whose middle is the origin of east and north."""
+    turn = camera.enu_from_camera(attitude)
+    middle = (SIDE_PX - 1) / 2
+    enu = np.array([[GROUND_M_PER_PX, 0, -middle * GROUND_M_PER_PX - place_m[0]],
+                    [0, -GROUND_M_PER_PX, middle * GROUND_M_PER_PX - place_m[1]],
+                    [0, 0, -height_m]])  # fmt: skip
+    image_from_ground = camera.matrix @ turn.T @ enu
+    size = (camera.width_px, camera.height_px)
+    return cv2.warpPerspective(ground, image_from_ground, size, flags=cv2.INTER_AREA)
+
+
+def frame(image, seconds=0.0, attitude=LEVEL, height_m=HEIGHT_M, **more):
+    angles_deg = attitude.heading_deg, attitude.roll_deg, attitude.pitch_deg
+    return Frame(image, round(seconds * 1e9), height_m, *angles_deg, **more)
+
+
+def motion_between(first: Frame, second: Frame, options=None, camera=CAMERA):
+    odometry = VisualOdometry(camera, options)
+    assert isinstance(odometry.update(first), NoMotion)
+    return odometry.update(second)
+
+
+def seen(moved_m, begin=LEVEL, end=None):
+    end = end or begin
+    shown = (
+        frame(picture((0.0, 0.0), begin), 0.0, begin),
+        frame(noisy(picture(moved_m, end), 1.0), INTERVAL_S, end),
+    )
+    return motion_between(*shown)
+
+
+def noisy(image, sigma, rng=np.random.default_rng(9)):  # noqa: B008
+    return np.clip(np.round(image + rng.normal(0.0, sigma, image.shape)), 0, 255).astype(np.uint8)
+
+
+def refused(first, second, reason):
+    motion = motion_between(first, second)
+    assert isinstance(motion, NoMotion)
+    assert reason in motion.reason
+
+
+# What is measured
+
+
+angles = st.floats(-12.0, 12.0)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0), st.floats(0.0, 360.0), angles, angles, st.floats(-8.0, 8.0))
+def test_a_known_motion_is_found_at_every_attitude(east_m, north_m, heading_deg, roll_deg, pitch_deg, turn_deg):
+    begin = Attitude(roll_deg, pitch_deg, heading_deg)
+    end = Attitude(pitch_deg, roll_deg, (heading_deg + turn_deg) % 360.0)
+    motion = seen((east_m, north_m), begin, end)
+    assert isinstance(motion, GroundMotion)
+    off_m = motion.moved_m - [east_m, north_m]
+    assert np.hypot(*off_m) < 0.3  # three quarters of a pixel on the ground
+    assert motion.velocity_mps == pytest.approx(motion.moved_m / INTERVAL_S)
+
+
+def test_a_climb_is_no_motion_over_the_ground():
+    first = frame(picture((0.0, 0.0), LEVEL))
+    second = frame(picture((4.0, -3.0), LEVEL, 1.05 * HEIGHT_M), INTERVAL_S, height_m=1.05 * HEIGHT_M)
+    assert motion_between(first, second).moved_m == pytest.approx([4.0, -3.0], abs=0.2)
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    """Telemetry that is off by what the engine assumes of any, ground in noise: 2 if exact."""
+    rng, nees = np.random.default_rng(5), []
+    for _ in range(60):
+        moved_m, true = rng.uniform(-15.0, 15.0, 2), Attitude(*rng.normal(0.0, 3.0, 2), rng.uniform(0.0, 360.0))
+        off, shown = rng.normal(size=3) * [0.37, 0.37, 1.0], []
+        for place_m, seconds in (((0.0, 0.0), 0.0), (moved_m, INTERVAL_S)):
+            image = noisy(picture(place_m, true), 4.0, rng)
+            stated = Attitude(true.roll_deg + off[0], true.pitch_deg + off[1], (true.heading_deg + off[2]) % 360.0)
+            height_m = HEIGHT_M + (shown[0].height_agl_m - HEIGHT_M if shown else rng.normal(0.0, 1.3))
+            shown.append(frame(image, seconds, stated, height_m))
+        motion = motion_between(*shown)
+        assert isinstance(motion, GroundMotion), motion
+        off_mps = motion.velocity_mps - moved_m / INTERVAL_S
+        nees.append(off_mps @ np.linalg.solve(motion.velocity_covariance_m2ps2, off_mps))
+    assert 0.5 < np.mean(nees) < 3.0
+    assert np.max(nees) < 18.4  # what chance exceeds once in ten thousand
+
+
+def test_a_distorting_lens_shows_the_same_motion():
+    lens = replace(CAMERA, distortion=np.array([-0.15, 0.02, 0.0, 0.0, 0.0]))
+    rows, columns = np.indices((240, 320), np.float32)
+    flat = lens.undistort_points(np.column_stack([columns.ravel(), rows.ravel()]))
+    rays, zero = np.column_stack([flat, np.ones(len(flat))]), np.zeros(3)
+    again, _ = cv2.projectPoints(rays, zero, zero, lens.matrix, lens.distortion)
+    assert again[:, 0] == pytest.approx(np.column_stack([columns.ravel(), rows.ravel()]), abs=0.01)
+    wide = Camera.from_fov(480, 360, 80.0)
+    at = (flat @ wide.matrix[:2, :2].T + wide.matrix[:2, 2]).astype(np.float32).reshape(240, 320, 2)
+    images = [
+        cv2.remap(picture(place, LEVEL, camera=wide), at, None, cv2.INTER_LINEAR) for place in ((0, 0), (9, 5))
+    ]
+    motion = motion_between(frame(images[0]), frame(images[1], INTERVAL_S), camera=lens)
+    assert motion.moved_m == pytest.approx([9.0, 5.0], abs=0.3)
+
+
+def test_large_pictures_are_followed_smaller_with_the_same_answer():
+    camera = Camera.from_fov(1280, 960, 60.0)
+    images = [picture(place, LEVEL, camera=camera) for place in ((0, 0), (6, -7))]
+    motion = motion_between(frame(images[0]), frame(images[1], INTERVAL_S), camera=camera)
+    assert motion.moved_m == pytest.approx([6.0, -7.0], abs=0.3)
+
+
+def test_something_fixed_to_the_camera_does_not_stop_the_ground():
+    moved = [picture(place, LEVEL) for place in ((0, 0), (10, 0))]
+    for image in moved:
+        image[:80, :120] = GROUND[:80, :120]
+    assert motion_between(frame(moved[0]), frame(moved[1], INTERVAL_S)).moved_m == pytest.approx([10, 0], abs=0.3)
+
+
+# What is refused
+
+
+def test_pictures_that_show_no_one_motion_are_refused():
+    rng = np.random.default_rng(1)
+    ground = picture((0, 0), LEVEL)
+    refused(
+        frame(np.full((240, 320), 90, np.uint8)), frame(np.full((240, 320), 91, np.uint8), INTERVAL_S), "0 points"
+    )
+    waves = [picture((0, 0), LEVEL, ground=texture(seed)) for seed in (1, 2)]
+    refused(frame(waves[0]), frame(waves[1], INTERVAL_S), "agree on one motion")
+    dark = [np.clip(rng.normal(6.0, 2.0, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2)]
+    refused(frame(dark[0]), frame(dark[1], INTERVAL_S), "agree on one motion")
+    refused(frame(ground), frame(ground, INTERVAL_S), "the last one again")
+
+
+def test_what_is_fixed_to_the_camera_over_water_is_no_hover():
+    """An overlay in a corner is all that can be followed: it stands still, whatever the vehicle does."""
+    shown = [np.full((240, 320), grey, np.uint8) for grey in (90, 92)]
+    for image in shown:
+        image[:80, :100] = GROUND[:80, :100]
+    refused(frame(shown[0]), frame(shown[1], INTERVAL_S), "small part")
+
+
+def test_telemetry_that_does_not_support_a_motion_is_refused():
+    first, second = frame(picture((0, 0), LEVEL)), frame(picture((5, 0), LEVEL), INTERVAL_S)
+    refused(replace(first, height_agl_m=None), second, "height or heading")
+    refused(first, replace(second, heading_deg=None), "height or heading")
+    refused(replace(first, timestamp_ns=None), second, "no stamp")
+    refused(first, replace(second, timestamp_ns=9_000_000_000), "9.0 s apart")
+    refused(first, replace(second, east_velocity_mps=1.0, north_velocity_mps=1.0), "velocity is known")
+    refused(replace(first, pitch_deg=55.0), replace(second, pitch_deg=55.0), "too obliquely")  # 78 at an edge
+    assert isinstance(
+        motion_between(replace(first, pitch_deg=40.0), replace(second, pitch_deg=40.0)), GroundMotion
+    )
+
+
+def test_a_velocity_that_is_too_uncertain_is_refused():
+    shown = frame(picture((0, 0), LEVEL)), frame(picture((5, 0), LEVEL), INTERVAL_S)
+    assert "uncertain" in motion_between(*shown, OdometryOptions(max_sigma_mps=1e-6)).reason
+
+
+def test_a_buffer_that_is_filled_again_is_no_picture_that_repeats():
+    odometry = VisualOdometry(CAMERA)
+    buffer = picture((0, 0), LEVEL)
+    odometry.update(frame(buffer))
+    buffer[:] = picture((5, 0), LEVEL)
+    assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
+
+
+def test_the_same_holds_of_a_tensors_memory():
+    odometry, buffer = VisualOdometry(CAMERA), torch.from_numpy(picture((0, 0), LEVEL))
+    odometry.update(frame(buffer))
+    buffer[:] = torch.from_numpy(picture((5, 0), LEVEL))
+    assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
+
+
+def test_the_way_after_a_picture_that_repeats_is_unknown():
+    odometry = VisualOdometry(CAMERA)
+    shown = [picture((3.0 * k, 0.0), LEVEL) for k in (0, 0, 2, 3)]
+    motions = [odometry.update(frame(image, k * INTERVAL_S)) for k, image in enumerate(shown)]
+    assert [isinstance(motion, GroundMotion) for motion in motions] == [False, False, False, True]
+    assert motions[3].moved_m == pytest.approx([3.0, 0.0], abs=0.2)
+
+
+@pytest.mark.parametrize("name", OdometryOptions.__dataclass_fields__)
+def test_options_are_refused_by_name(name):
+    with pytest.raises(OptionError, match=f"^{name}: expected a number above 0"):
+        OdometryOptions(**{name: 0})
+    with pytest.raises(OptionError, match=r"^min_share: expected at most 1, got 1.5"):
+        OdometryOptions(min_share=1.5)
+
+
+# Dead reckoning
+
+
+def still(seconds, **velocity):
+    return Frame(np.zeros((2, 2), np.uint8), round(seconds * 1e9), **velocity)
+
+
+def test_motions_add_up_and_so_do_their_errors():
+    reckoning, drift = DeadReckoning(2.0, 0.2), DriftModel(0.5, 3.0, 15.0)
+    begin = reckoning.sample(still(0.0), None)
+    reckoning.append(still(0.0), begin)
+    step = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+    for k in range(1, 5):
+        sample = reckoning.sample(still(k), None, step)
+        reckoning.append(still(k), sample)
+    assert sample.moved_m == pytest.approx([12.0, 16.0])
+    assert sample.blind_s == 0.0
+    assert drift.sigma_m(begin, sample) == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
+
+
+def test_a_motion_counts_over_its_own_interval_only():
+    reckoning = DeadReckoning(2.0, 0.2)
+    reckoning.append(still(0.0), reckoning.sample(still(0.0), None))
+    step = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+    after = reckoning.sample(still(2.0), None, step)  # the frame at 1 s failed
+    assert (after.time_s, after.blind_s, list(after.moved_m)) == (2.0, 2.0, [0.0, 0.0])
+
+
+def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word():
+    drift = DriftModel(0.5, 3.0, 15.0)
+    for sigma_mps, expected_m in ((None, 0.5), (0.1, 0.1), (2.0, 2.0)):
+        reckoning = DeadReckoning(2.0, 0.2)
+        stated = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
+        begin = reckoning.sample(still(0.0, **stated), None)
+        reckoning.append(still(0.0, **stated), begin)
+        assert drift.sigma_m(begin, reckoning.sample(still(1.0, **stated), None)) == pytest.approx(expected_m)
+
+
+class Blind:
+    """A matcher that refuses all."""
+
+    def __init__(self):
+        self.camera = CAMERA
+        self.site = SimpleNamespace(
+            is_searchable=False, has_surface=False, gsd_m_per_px=1.0, georeference_sigma_m=0.0
+        )
+
+    def locate(self, frame, prior=None, budget=None):
+        self.budget = budget
+        return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_a_navigator_follows_the_ground_where_it_is_asked_to(odometry):
+    navigator = Navigator(
+        Blind(), Prior(east_m=0.0, north_m=0.0, sigma_m=2.0), options=NavigatorOptions(odometry=odometry)
+    )
+    for k in range(6):
+        navigator.update(frame(picture((3.0 * k, -2.0 * k), LEVEL), INTERVAL_S * k))
+    predicted = navigator.prediction
+    assert (navigator.ground_motion is not None) == odometry
+    if odometry:
+        assert (predicted.east_m, predicted.north_m) == pytest.approx((15.0, -10.0), abs=0.5)
+        assert predicted.sigma_m < 3.0
+    else:
+        assert (predicted.east_m, predicted.north_m) == (0.0, 0.0)
+        assert predicted.sigma_m > 15.0
+
+
+START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
+
+
+def test_only_odometry_needs_a_camera_of_the_matcher():
+    matcher = Blind()
+    del matcher.camera
+    assert isinstance(Navigator(matcher, START).update(frame(picture((0, 0), LEVEL))), NoFix)
+    with pytest.raises(OptionError, match=r"^odometry: expected a matcher with a `camera`, got Blind without"):
+        Navigator(matcher, START, options=NavigatorOptions(odometry=True))
+
+
+@pytest.mark.parametrize(("total_ms", "search_ms"), [(1000.0, 2000.0), (1000.0, None), (50.0, None)])
+def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, search_ms):
+    def slow(*_):
+        time.sleep(0.1)
+        return NoMotion("slow")
+
+    matcher, limit = Blind(), Budget(total_ms=total_ms, search_ms=search_ms)
+    navigator = Navigator(matcher, START, limit, NavigatorOptions(odometry=True))
+    monkeypatch.setattr(VisualOdometry, "update", slow)
+    navigator.update(frame(picture((0, 0), LEVEL)))
+    assert 0.0 < matcher.budget.total_ms <= max(total_ms - 100.0, 1e-6)
+    assert matcher.budget.search_ms is None if search_ms is None else matcher.budget.search_ms <= 1900.0
+
+
+def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
+    navigator = Navigator(Blind(), START, options=NavigatorOptions(odometry=True))
+    errors = navigator._errors
+    errors._height_m = HEIGHT_M
+    for _ in range(5):
+        errors._note_height(0.2 * HEIGHT_M, HEIGHT_M)
+    for k in range(2):
+        navigator.update(frame(picture((5.0 * k, 0.0), LEVEL), k * INTERVAL_S))
+    assert navigator.ground_motion.moved_m[0] == pytest.approx(5.0 * 1.2, rel=0.05)
+
+
+def test_it_is_asked_for_by_a_setting_and_not_with_the_papers_recipe():
+    assert not TrackSettings().navigator.odometry
+    assert load_settings(None, odometry=True).navigator.odometry
+    with pytest.raises(OptionError, match=r"^odometry: expected with `profile` engine"):
+        load_settings(None, odometry=True, profile="paper")

@@ -1,0 +1,152 @@
+"""The guard before the autopilot: a shifted map is not followed, a covered camera is recovered from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine.navigation.motion import PositionEstimate
+from engine.navigation.track_guard import TrackGuard
+from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
+
+SPEED_MPS = 7.0
+STEP_S = 0.1
+
+
+def fix(east_m, north_m=0.0):
+    return Fix(
+        timestamp_ns=1, lat_deg=0.0, lon_deg=0.0, east_m=east_m, north_m=north_m, up_m=None,
+        covariance_m2=np.diag([0.09, 0.09, 1e6]), attitude=None, score=0.9, method="ncc",
+        window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0),
+    )  # fmt: skip
+
+
+def refused(match):
+    return NoFix(reason=Reason.INCONSISTENT, candidates=(match,))
+
+
+class Flight:
+    """A flight to the east at 7 m/s; answers whether the guard trusts each result."""
+
+    def __init__(self, guard=None):
+        self.guard, self.time_s, self.east_m = guard or TrackGuard(), 0.0, 0.0
+
+    def step(self, result, *, velocity=True):
+        """The next frame; a number is a fix so far from the truth."""
+        self.time_s += STEP_S
+        self.east_m += SPEED_MPS * STEP_S
+        east_mps, north_mps = (SPEED_MPS, 0.0) if velocity else (None, None)
+        frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, east_mps, north_mps)
+        self.guard.advance(frame, round(self.time_s * 1e9))
+        trusted = self.guard.trusts(result(self.east_m))
+        self.guard.has_fix |= trusted
+        return trusted
+
+    def fly(self, seconds, result, *, velocity=True):
+        return [self.step(result, velocity=velocity) for _ in range(round(seconds / STEP_S))]
+
+
+def true(east_m):
+    return fix(east_m)
+
+
+def shifted(east_m):
+    return fix(east_m, 40.0)
+
+
+def covered(_):
+    return NoFix(reason=Reason.NO_TEXTURE)
+
+
+def test_true_fixes_are_trusted_with_and_without_a_measured_velocity():
+    flight = Flight()
+    assert all(flight.fly(20.0, true))
+    assert all(flight.fly(20.0, true, velocity=False))
+
+
+@pytest.mark.parametrize("cover_s", [5.0, 10.0, 20.0])
+def test_the_first_fix_after_a_covered_camera_is_trusted(cover_s):
+    flight = Flight()
+    flight.fly(5.0, true)
+    flight.fly(min(cover_s, 7.0), covered)
+    flight.fly(cover_s - min(cover_s, 7.0), covered, velocity=False)
+    assert flight.step(true, velocity=cover_s <= 7.0)
+
+
+@pytest.mark.slow
+def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_with_itself():
+    flight = Flight()
+    flight.fly(5.0, true)
+    answers = flight.fly(7.0, lambda east_m: refused(shifted(east_m)))
+    answers += flight.fly(8.0, lambda east_m: refused(shifted(east_m)), velocity=False)
+    answers += flight.fly(60.0, shifted, velocity=False)  # the navigator has given in
+    assert not any(answers)
+    assert flight.guard.is_disputed
+
+
+def test_matches_that_return_to_the_track_end_the_dispute():
+    flight = Flight()
+    flight.fly(5.0, true)
+    assert not any(flight.fly(2.0, lambda east_m: refused(shifted(east_m))))
+    answers = flight.fly(1.0, true)
+    assert answers[:2] == [False, False]
+    assert all(answers[3:])
+
+
+def test_an_operators_word_ends_the_dispute():
+    flight = Flight()
+    flight.fly(5.0, true)
+    assert not any(flight.fly(20.0, shifted))
+    flight.guard.confirm()
+    assert all(flight.fly(5.0, shifted))
+
+
+def test_a_contradiction_below_the_tolerance_is_left_to_the_estimator():
+    flight = Flight()
+    flight.fly(5.0, true)
+    assert all(flight.fly(1.0, lambda east_m: fix(east_m, 4.0)))
+
+
+def test_the_first_fix_must_agree_with_the_start_or_the_receiver():
+    assert not Flight(TrackGuard(PositionEstimate(np.array([0.0, 0.0]), 3.0))).step(shifted)
+    flight = Flight()
+    for _ in range(100):
+        flight.guard.anchor(PositionEstimate(np.array([flight.east_m, 0.0]), 1.5))
+        assert not flight.step(shifted)
+    assert flight.guard.is_disputed
+    for _ in range(3):
+        flight.guard.anchor(PositionEstimate(np.array([flight.east_m, 0.0]), 1.5))
+        flight.step(true)
+    assert flight.step(true)
+    flight.guard.anchor(PositionEstimate(np.array([1000.0, 0.0]), 1.5))  # a receiver that is led astray later
+    assert flight.step(true)
+
+
+def test_single_wrong_matches_are_no_dispute():
+    flight = Flight()
+    flight.fly(5.0, true)
+    for _ in range(10):
+        assert not flight.step(shifted)
+        assert flight.step(true)
+
+
+def test_one_wrong_fix_is_no_track():
+    """It agrees with a vague track, and what contradicts it afterwards is the truth."""
+    flight = Flight()
+    flight.fly(5.0, true)
+    flight.guard._track.append(
+        replace(flight.guard._track[-1], estimate=PositionEstimate(np.array([0.0, 99.0]), 0.3))
+    )
+    assert all(flight.fly(5.0, true))
+
+
+@pytest.mark.parametrize(("sigma_mps", "contradicts"), [(None, True), (0.1, True), (5.0, False)])
+def test_a_velocity_counts_with_the_accuracy_that_it_states(sigma_mps, contradicts):
+    """10 s without a fix, then matches 40 m aside: too far for 0.5 m/s, not for 5."""
+    guard = TrackGuard(PositionEstimate(np.zeros(2), 1.0))
+    frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, SPEED_MPS, 0.0)
+    for k in range(101):
+        guard.advance(replace(frame, velocity_sigma_mps=sigma_mps), round(k * STEP_S * 1e9))
+    assert guard.trusts(fix(SPEED_MPS * 10.0, 40.0)) != contradicts

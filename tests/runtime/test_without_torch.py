@@ -1,0 +1,122 @@
+"""A flight by NCC on the CPU loads no torch: the rule that keeps it so, and flights that show it."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
+from tests.support.towns import drawn_town
+
+ROOT = Path(__file__).parents[2]
+ENGINE = ROOT / "engine"
+SAY = "\nimport sys; print('TORCH', 'torch' in sys.modules)"
+FLIGHT = """
+import numpy as np, cv2
+from engine import Budget, Camera, Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
+rng = np.random.default_rng(3)
+gray = cv2.GaussianBlur(rng.normal(128, 300, (500, 500)), (0, 0), 2.5).clip(0, 255).astype(np.uint8)
+valid = np.ones(gray.shape, bool)
+valid[:150, :180] = False  # within the windows, so that some are masked
+site = OrthoMap.from_arrays(gray, [[0.5, 0, 500_000], [0, -0.5, 5_000_000]], "EPSG:32633", valid=valid)
+camera = Camera.from_fov(120, 120, 60.0)
+matcher = SceneMatcher(site, camera)
+def taken(image, index):
+    return Frame(image.copy(), index * 10**9, 0.5 * camera.focal_px, 0.0, 0.0, 0.0)
+def frame(index):
+    x, y = 200 + 4 * index, 190
+    east, north = site.enu_from_pixel(np.array([x + 59.5, y + 59.5]))
+    return taken(gray[y : y + 120, x : x + 120], index), Prior(east_m=east, north_m=north, sigma_m=3)
+navigator = Navigator(matcher, frame(0)[1])
+fixes = 0
+for index in range(6):
+    shown, prior = frame(index)
+    fixes += isinstance(matcher.locate(shown, prior), Fix)
+    fixes += isinstance(matcher.locate(shown, prior, Budget(total_ms=60_000)), Fix)
+    fixes += isinstance(navigator.update(shown), Fix)
+fixes += isinstance(matcher.locate(frame(3)[0]), Fix)  # of the whole map
+matcher.locate(taken(gray[:120:-1, 380:][:120], 0), frame(0)[1])  # of no place, upside down
+print(fixes)
+"""
+
+
+def run(program, *words):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", program + SAY, *words],
+        capture_output=True, text=True, check=True, env=environment,
+    )  # fmt: skip
+    return done.stdout.split()
+
+
+def imported(path: Path, *, at_top: bool) -> Iterator[str]:
+    """Modules that a file imports when it runs, everywhere or at its top; those for types alone are not run."""
+
+    def walk(node: ast.AST) -> Iterator[str]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+                continue
+            if isinstance(child, ast.Import):
+                yield from (alias.name for alias in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                yield child.module or ""
+            elif not (at_top and isinstance(child, ast.FunctionDef | ast.ClassDef)):
+                yield from walk(child)
+
+    return walk(ast.parse(path.read_text()))
+
+
+def test_one_module_imports_torch():
+    found = {
+        str(path.relative_to(ENGINE))
+        for path in ENGINE.rglob("*.py")
+        if "torch" in path.read_text()  # few are worth parsing
+        and any(name.split(".")[0] == "torch" for name in imported(path, at_top=False))
+    }
+    assert found == {"runtime/tensors.py"}
+
+
+def test_modules_of_the_way_load_no_torch():
+    names = (
+        "engine.matching.matcher",
+        "engine.navigation.navigator",
+        "engine.navigation.live",
+        "engine.matching.ncc",
+    )
+    names += ("scenematch.runs.tracking", "scenematch.runs.mavlink_bridge", "scenematch.report.page")
+    assert run("".join(f"import {name}\n" for name in names)) == ["TORCH", "False"]
+
+
+def test_a_flight_by_ncc_on_the_cpu_loads_no_torch():
+    """By the matcher and by the navigator, with a budget and without, masked, refused, and over the whole map."""
+    assert run(FLIGHT) == ["19", "TORCH", "False"]
+
+
+@pytest.mark.slow
+def test_tracking_by_ncc_loads_no_torch(tmp_path):
+    folder = tmp_path / "flight"
+    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+    program = "import sys; from scenematch.cli.app import run; assert run(sys.argv[1:]) == 0"
+    given = {
+        "map": folder / "map.tif", "surface": folder / "dsm.tif", "camera": folder / "camera.yaml",
+        "frames": folder / "frames", "telemetry": folder / "telemetry.csv", "out": tmp_path / "out",
+    }  # fmt: skip
+    words = ["--method=ncc", *(f"--{name}={value}" for name, value in given.items())]
+    assert run(program, "track", *words)[-2:] == ["TORCH", "False"]
+    assert (tmp_path / "out" / "report.html").exists()
+
+
+@pytest.mark.slow
+def test_torch_takes_the_threads_that_were_chosen_before_it_was_loaded():
+    program = (
+        "import sys, engine; engine.set_threads(3); assert 'torch' not in sys.modules\n"
+        "from engine.runtime.tensors import torch; print(torch.get_num_threads())"
+    )
+    assert run(program)[0] == "3"

@@ -1,0 +1,298 @@
+"""The reference filter: derivatives against differences, consistency over seeds, and delayed measurements."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from engine.errors import StateError
+from engine.geo import enu_from_body
+from engine.values import Attitude, Fix, Timings, Window
+from scenematch.simulator.ekf import (
+    ACCEL,
+    COMPASS,
+    GYRO,
+    POSITION,
+    STATES,
+    TURN,
+    VELOCITY,
+    FilterState,
+    correct,
+    fix_chi_square,
+    fuse_fix,
+    fuse_gps,
+    fuse_heading,
+    fuse_height,
+    initial_state,
+    predict,
+)
+from scenematch.simulator.history import History
+from scenematch.simulator.pilot import Pilot, plan_route
+from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
+from scenematch.simulator.rotations import rotation, rotation_vector
+from scenematch.simulator.sensors import GpsSample, Instruments, SensorSuite
+
+SUITE = SensorSuite()
+SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
+
+
+def some_belief() -> FilterState:
+    rng = np.random.default_rng(2)
+    spread = rng.normal(0.0, 0.3, (STATES, STATES))
+    return FilterState(
+        4.0,
+        np.array([10.0, -5.0, 120.0]),
+        np.array([6.0, 2.0, -0.5]),
+        enu_from_body(4.0, -9.0, 130.0),
+        np.array([0.05, -0.02, 0.03]),
+        np.array([0.001, 0.002, -0.001]),
+        0.4,
+        0.02,
+        spread @ spread.T + 0.01 * np.eye(STATES),
+    )
+
+
+def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
+    """The truth where the estimate is off by an error."""
+    return replace(
+        estimate,
+        position_m=estimate.position_m + error[POSITION],
+        velocity_mps=estimate.velocity_mps + error[VELOCITY],
+        enu_from_body=rotation(error[TURN]) @ estimate.enu_from_body,
+        accel_bias_mps2=estimate.accel_bias_mps2 + error[ACCEL],
+        gyro_bias_rps=estimate.gyro_bias_rps + error[GYRO],
+        baro_drift_m=estimate.baro_drift_m + error[15],
+        compass_bias_rad=estimate.compass_bias_rad + error[COMPASS],
+    )
+
+
+def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
+    """The error (17,) of a estimate."""
+    return np.concatenate(
+        [
+            truth.position_m - estimate.position_m,
+            truth.velocity_mps - estimate.velocity_mps,
+            rotation_vector(truth.enu_from_body @ estimate.enu_from_body.T),
+            truth.accel_bias_mps2 - estimate.accel_bias_mps2,
+            truth.gyro_bias_rps - estimate.gyro_bias_rps,
+            [truth.baro_drift_m - estimate.baro_drift_m, truth.compass_bias_rad - estimate.compass_bias_rad],
+        ]
+    )
+
+
+def a_fix(east_m, north_m, up_m=None, sigma_m=0.5) -> Fix:
+    return Fix(
+        timestamp_ns=0, lat_deg=0.0, lon_deg=0.0, east_m=east_m, north_m=north_m, up_m=up_m,
+        covariance_m2=sigma_m**2 * np.eye(3), attitude=None, score=1.0, method="ncc", window=Window(0, 0, 1, 1),
+        timings=Timings(), map_xy_px=(0.0, 0.0),
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------- derivatives and algebra
+
+
+def test_prediction_carries_errors_as_differences_say():
+    estimate, step = some_belief(), 1e-5
+    expected = predict(estimate, SAMPLE, SUITE)
+    F = np.empty((STATES, STATES))
+    for k in range(STATES):
+        error = np.zeros(STATES)
+        error[k] = step
+        F[:, k] = apart(predict(moved(estimate, error), SAMPLE, SUITE), expected) / step
+    added = expected.covariance - F @ estimate.covariance @ F.T
+    np.testing.assert_allclose(added - np.diag(np.diag(added)), 0.0, atol=2e-5)
+    assert np.diag(added).min() > -2e-5  # noise is white: on the diagonal
+    baro = SUITE.barometer
+    assert added[15, 15] == pytest.approx(2.0 * STEP_S * baro.drift_m**2 / baro.drift_time_s, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("fuse", "measured", "variance"),
+    [
+        (
+            partial(fuse_height, suite=SUITE),
+            lambda b: b.position_m[2] + b.baro_drift_m,
+            SUITE.barometer.noise_m**2,
+        ),
+        (
+            partial(fuse_heading, suite=SUITE),
+            lambda b: math.degrees(math.atan2(*b.enu_from_body[:2, 0]) + b.compass_bias_rad),
+            SUITE.compass.noise_deg**2,
+        ),
+    ],
+    ids=["barometer", "compass"],
+)
+def test_a_measurement_moves_the_belief_as_its_differences_say(fuse, measured, variance):
+    estimate, step = some_belief(), 1e-6
+    H = np.empty(STATES)
+    for k in range(STATES):
+        error = np.zeros(STATES)
+        error[k] = step
+        H[k] = (measured(moved(estimate, error)) - measured(estimate)) / step
+    gain = estimate.covariance @ H / (H @ estimate.covariance @ H + variance)
+    np.testing.assert_allclose(apart(fuse(estimate, measured(estimate) + 0.01), estimate), 0.01 * gain, atol=2e-6)
+
+
+def test_a_heading_is_compared_the_short_way_round():
+    estimate = replace(some_belief(), enu_from_body=enu_from_body(0.0, 0.0, 359.8), compass_bias_rad=0.0)
+    turned = rotation_vector(fuse_heading(estimate, 0.2, SUITE).enu_from_body @ estimate.enu_from_body.T)
+    assert np.linalg.norm(turned) < math.radians(0.6)
+
+
+def test_joseph_is_the_textbook_where_that_is_exact():
+    estimate = some_belief()
+    H = np.random.default_rng(1).normal(size=(2, STATES))
+    R = np.diag([0.3, 0.7])
+    after = correct(estimate, np.zeros(2), H, R)
+    P = estimate.covariance
+    expected = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
+    np.testing.assert_allclose(after.covariance, expected, atol=1e-9)
+    np.testing.assert_allclose(after.position_m, estimate.position_m)
+
+
+def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
+    estimate = replace(some_belief(), covariance=np.eye(STATES))
+    np.testing.assert_allclose(
+        fuse_fix(estimate, a_fix(12.0, -5.0, sigma_m=1.0)).position_m, [11.0, -5.0, 120.0], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        fuse_fix(estimate, a_fix(10.0, -5.0, 122.0, sigma_m=1.0)).position_m, [10.0, -5.0, 121.0], atol=1e-9
+    )
+    assert fix_chi_square(estimate, a_fix(14.0, -2.0, sigma_m=1.0)) == pytest.approx(25.0 / 2.0)
+
+
+def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
+    state, rng = hovering(np.array([0.0, 0.0, 100.0]), 200.0), np.random.default_rng(9)
+    estimate = replace(initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
+    air = WindField(Wind(), rng)
+    for k in range(500):
+        state, felt = advance(
+            state, np.array([1.0, math.cos(k / 60), 0.1]), 200.0 + 0.1 * k, Airframe(), air.next()
+        )
+        estimate = predict(estimate, felt, SUITE)
+    np.testing.assert_allclose(estimate.position_m, state.position_m, atol=1e-6)
+    np.testing.assert_allclose(estimate.enu_from_body, state.enu_from_body, atol=1e-9)
+
+
+# -------------------------------------------------------------------------------------------------- consistency
+
+
+def fly(seed, seconds, gps_until_s=math.inf):
+    """A flight steered by the filter: every second its error (17,), covariance, and the sigma of the position."""
+    route = plan_route(np.array([[-40.0, -40.0], [-40.0, 30.0], [30.0, 30.0]]))
+    winds, sensors, start, shakes = np.random.default_rng(seed).spawn(4)
+    air, carried, pilot, frame = WindField(Wind(), winds), Instruments(SUITE, sensors), Pilot(), Airframe()
+    state = hovering(route.position_m[0], float(route.heading_deg[0]))
+    off = start.standard_normal(8)
+    state = replace(state, velocity_mps=0.1 * off[:3])
+    believed = Attitude(0.5 * off[3], 0.5 * off[4], carried.heading_deg(state))
+    history = History(initial_state(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
+    kicks, receiver, rows = list(route.kicks_s), [], []
+    for k in range(1, round(seconds / STEP_S) + 1):
+        target, estimate = route.at(k * STEP_S), history.now
+        if kicks and k * STEP_S >= kicks[0]:
+            kicks.pop(0)
+            state = shaken(state, frame, shakes)
+        wanted = pilot.steer(target, estimate.position_m, estimate.velocity_mps)
+        state, felt = advance(state, wanted, target.heading_deg, frame, air.next())
+        history.advance(carried.imu(felt))
+        if k % 5 == 0:
+            height_m = carried.height_m(state)
+            history.fuse(partial(fuse_height, height_m=height_m, suite=SUITE), state.time_s)
+        if k % 10 == 0:
+            heading_deg = carried.heading_deg(state)
+            history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=SUITE), state.time_s)
+        if k % 20 == 0 and state.time_s < gps_until_s:
+            receiver.append(carried.gps(state))
+        if receiver and state.time_s >= receiver[0].time_s + SUITE.gps.latency_s:
+            sample = receiver.pop(0)
+            history.fuse(partial(fuse_gps, sample=sample, suite=SUITE), sample.time_s)
+        if k % 100 == 0:
+            now = history.now
+            truth = FilterState(
+                state.time_s, state.position_m, state.velocity_mps, state.enu_from_body, carried.accel_bias_mps2,
+                carried.gyro_bias_rps, carried.baro_drift_m, math.radians(carried.compass_bias_deg),
+                np.eye(STATES),
+            )  # fmt: skip
+            rows.append((apart(truth, now), now.covariance, now.sigma_m))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [fly(seed, 12.0) for seed in range(200, 210)]
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_the_covariance_says(flights):
+    """The NEES at the end of every flight lies in the 99.9 % interval of its chi-square, whole and by parts."""
+    parts = [POSITION, VELOCITY, TURN, ACCEL, GYRO, slice(0, STATES)]
+    for part in parts:
+        squares = [e[part] @ np.linalg.solve(P[part, part], e[part]) for rows in flights for e, P, _ in rows[-1:]]
+        freedom = len(squares) * (part.stop - part.start)
+        spread = 3.29 * math.sqrt(2.0 / freedom)  # the chi-square is near enough to a normal one
+        assert 1.0 - spread < np.sum(squares) / freedom < 1.0 + spread, part
+
+
+def test_the_covariance_stays_positive_definite_and_symmetric():
+    for rows in [fly(seed, 12.0) for seed in (210, 211)]:
+        for _, P, _ in rows:
+            np.testing.assert_array_equal(P, P.T)
+            assert np.linalg.eigvalsh(P)[0] > 0.0
+
+
+@pytest.mark.slow
+def test_without_positions_the_sigma_grows_and_holds_the_error():
+    squares, sigmas = [], []
+    for seed in range(300, 304):
+        rows = fly(seed, 12.0, gps_until_s=6.0)
+        sigma = [s for *_, s in rows]
+        assert (np.diff(sigma[7:]) > 0.0).all()
+        error, P, _ = rows[-1]
+        squares.append(error[:2] @ np.linalg.solve(P[:2, :2], error[:2]))
+        sigmas.append(sigma[-1] / sigma[5])
+    assert np.mean(sigmas) > 2.0
+    assert np.sum(squares) < 26.1  # chi-square of 8 degrees of freedom, 99.9 %
+
+
+# ------------------------------------------------------------------------------------------------------ history
+
+
+def test_a_measurement_that_comes_late_does_what_it_would_have_done_in_time():
+    rng = np.random.default_rng(6)
+    samples = [IdealImu(SAMPLE.force_mps2 + 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=3)) for _ in range(60)]
+    fix = partial(fuse_fix, fix=a_fix(11.0, -4.0))
+    prompt, late = (History(replace(some_belief(), time_s=0.0), SUITE) for _ in range(2))
+    for k, sample in enumerate(samples):
+        for history in (prompt, late):
+            history.advance(sample)
+            if k % 7 == 0:
+                history.fuse(partial(fuse_height, height_m=120.0, suite=SUITE), history.now.time_s)
+        if k == 29:
+            prompt.fuse(fix, prompt.now.time_s)
+            moment = prompt.now.time_s
+    late.fuse(fix, moment)
+    np.testing.assert_allclose(late.now.position_m, prompt.now.position_m, atol=1e-12)
+    np.testing.assert_allclose(late.now.covariance, prompt.now.covariance, atol=1e-12)
+    np.testing.assert_allclose(late.at(moment).position_m, prompt.at(moment).position_m, atol=1e-12)
+
+
+def test_the_start_can_be_corrected_too_and_no_other_moment():
+    history = History(replace(some_belief(), time_s=0.0), SUITE, keep_s=0.2)
+    for _ in range(10):
+        history.advance(SAMPLE)
+    before = history.now.sigma_m
+    history.fuse(partial(fuse_fix, fix=a_fix(10.0, -5.0)), 0.0)
+    assert history.now.sigma_m < before
+    for _ in range(20):
+        history.advance(SAMPLE)
+    for moment in (0.0, 0.31):
+        with pytest.raises(StateError, match="time_s"):
+            history.fuse(partial(fuse_fix, fix=a_fix(10.0, -5.0)), moment)
+    sample = GpsSample(0.2, np.array([10.0, -5.0, 120.0]), np.zeros(3))
+    history.fuse(partial(fuse_gps, sample=sample, suite=SUITE), sample.time_s)
+    assert history.at(0.2).sigma_m < SUITE.gps.noise_m

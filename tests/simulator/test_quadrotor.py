@@ -1,0 +1,213 @@
+"""The quadrotor: rotations, physics against closed forms, what an IMU feels, and the pilot along a route."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from engine.errors import OptionError
+from engine.geo import attitude_from_rotation, enu_from_body
+from scenematch.simulator.pilot import Gains, Pilot, plan_rounds, plan_route
+from scenematch.simulator.quadrotor import (
+    GRAVITY,
+    STEP_S,
+    Airframe,
+    Wind,
+    WindField,
+    advance,
+    aim,
+    hovering,
+    shaken,
+)
+from scenematch.simulator.rotations import cross_matrix, rotation, rotation_vector
+from scenematch.simulator.vehicle import GRAVITY_MPS2, FlightStyle
+
+FRAME = Airframe()
+CALM = np.zeros(3)
+SQUARE = np.array([[-60.0, -40.0], [-60.0, 40.0], [60.0, 40.0]])
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 1.5, 3.1])
+def test_rotation_vectors_go_there_and_back(angle):
+    axis = np.array([0.48, -0.6, 0.64])
+    turned = rotation(angle * axis)
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation_vector(turned), angle * axis, atol=1e-9)
+    np.testing.assert_allclose(turned @ axis, axis, atol=1e-12)
+
+
+def test_rotation_is_the_one_of_the_attitude():
+    # Heading is a turn clockwise, seen from above: about down.
+    for heading in (20.0, 160.0):
+        turned = enu_from_body(0.0, 0.0, 0.0) @ rotation(np.array([0.0, 0.0, math.radians(heading)]))
+        np.testing.assert_allclose(turned, enu_from_body(0.0, 0.0, heading), atol=1e-12)
+    v, w = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, 4.0])
+    np.testing.assert_allclose(cross_matrix(v) @ w, np.cross(v, w), atol=1e-12)
+
+
+def test_what_hovers_stays_and_feels_its_weight():
+    state = hovering(np.array([3.0, -4.0, 150.0]), 77.0)
+    for _ in range(300):
+        state, felt = advance(state, CALM, 77.0, FRAME, CALM)
+    np.testing.assert_allclose(state.position_m, [3.0, -4.0, 150.0], atol=1e-9)
+    np.testing.assert_allclose(felt.force_mps2, [0.0, 0.0, -GRAVITY_MPS2], atol=1e-9)
+    assert state.time_s == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("heading", [0.0, 135.0, 300.0])
+def test_the_attitude_gives_the_acceleration_that_is_asked_for(heading):
+    wanted = np.array([1.2, -0.7, 0.4])
+    attitude, force = aim(wanted, heading, FRAME)
+    np.testing.assert_allclose(attitude.T @ attitude, np.eye(3), atol=1e-12)
+    assert np.linalg.det(attitude) == pytest.approx(1.0)
+    np.testing.assert_allclose(-attitude[:, 2] * np.linalg.norm(force) + GRAVITY, wanted, atol=1e-12)
+    # The body's right stays level across the heading.
+    sine, cosine = math.sin(math.radians(heading)), math.cos(math.radians(heading))
+    assert attitude[:, 1] @ (sine, cosine, 0.0) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_it_noses_down_to_speed_up():
+    state = hovering(np.zeros(3), 0.0)
+    for _ in range(400):
+        state, _ = advance(state, np.array([0.0, 1.0, 0.0]), 0.0, FRAME, state.velocity_mps)  # air moves along
+    assert state.attitude.pitch_deg == pytest.approx(-math.degrees(math.atan(1.0 / GRAVITY_MPS2)), abs=0.1)
+    assert state.attitude.roll_deg == pytest.approx(0.0, abs=0.05)
+    assert state.velocity_mps[1] > 1.0
+
+
+def test_tilt_is_limited_and_thrust_never_pushes_down():
+    for wanted in ([40.0, 0.0, 0.0], [3.0, 3.0, -30.0]):
+        attitude, force = aim(np.array(wanted), 10.0, FRAME)
+        assert math.degrees(math.acos(-attitude[2, 2])) <= FRAME.max_tilt_deg + 1e-9
+        assert force[2] > 0.0
+
+
+@pytest.mark.slow
+def test_drag_ends_where_the_air_and_the_push_balance():
+    air = np.array([4.0, -2.0, 0.0])
+    state = hovering(np.zeros(3), 0.0)
+    for _ in range(round(100.0 / STEP_S)):
+        state, _ = advance(state, np.array([0.5, 0.0, 0.0]), 0.0, FRAME, air)
+    np.testing.assert_allclose(state.velocity_mps, air + np.array([0.5, 0.0, 0.0]) / FRAME.drag_per_s, atol=0.01)
+
+
+def test_an_imu_that_is_integrated_gives_the_path():
+    rng = np.random.default_rng(3)
+    state = hovering(np.array([0.0, 0.0, 100.0]), 40.0)
+    air = WindField(Wind(), rng)
+    place, speed, attitude = state.position_m, state.velocity_mps, state.enu_from_body
+    for k in range(1000):
+        if k % 250 == 0:
+            state = shaken(state, FRAME, rng)
+        state, felt = advance(state, np.array([math.sin(k / 90), 1.0, 0.2]), 40.0 + k / 10, FRAME, air.next())
+        half = attitude @ rotation(0.5 * STEP_S * felt.rates_rps)
+        push = half @ felt.force_mps2 + GRAVITY
+        place, speed = place + STEP_S * speed + 0.5 * STEP_S**2 * push, speed + STEP_S * push
+        attitude = attitude @ rotation(STEP_S * felt.rates_rps)
+    np.testing.assert_allclose(place, state.position_m, atol=1e-6)
+    np.testing.assert_allclose(attitude, state.enu_from_body, atol=1e-9)
+
+
+def test_a_shake_swings_to_its_size_and_dies_away():
+    for seed in range(5):
+        state = shaken(hovering(np.zeros(3), 0.0), FRAME, np.random.default_rng(seed))
+        tilts = []
+        for _ in range(300):
+            state, _ = advance(state, CALM, 0.0, FRAME, CALM)
+            tilts.append(math.degrees(math.acos(min(1.0, -state.enu_from_body[2, 2]))))
+        assert 0.55 * FRAME.shake_deg < max(tilts) < 1.05 * FRAME.shake_deg
+        assert max(tilts[-50:]) < 0.05 * max(tilts)
+
+
+def test_gusts_have_their_size_and_their_length():
+    wind = Wind(mean_east_mps=3.0, mean_north_mps=-1.0, gust_sd_mps=2.0, gust_time_s=0.5)
+    air = WindField(wind, np.random.default_rng(1))
+    blown = np.array([air.next() for _ in range(60000)])
+    np.testing.assert_allclose(blown.mean(axis=0), [3.0, -1.0, 0.0], atol=0.3)
+    np.testing.assert_allclose(blown.std(axis=0), [2.0, 2.0, 1.0], rtol=0.12)
+    lag = round(0.5 / STEP_S)
+    east = blown[:, 0] - blown[:, 0].mean()
+    assert (east[lag:] * east[:-lag]).mean() / (east * east).mean() == pytest.approx(math.exp(-1.0), abs=0.12)
+
+
+# --------------------------------------------------------------------------------------------------- the pilot
+
+
+def test_a_route_stops_at_its_waypoints_and_its_velocity_is_its_derivative():
+    route = plan_route(SQUARE, FlightStyle(height_agl_m=80.0))
+    assert (route.position_m[:, 2] == 80.0).all()
+    np.testing.assert_allclose(np.gradient(route.position_m, 0.01, axis=0), route.velocity_mps, atol=0.02)
+    for corner in SQUARE:
+        away = np.hypot(*(route.position_m[:, :2] - corner).T)
+        near = away < 0.2
+        assert near.any()
+        assert np.hypot(*route.velocity_mps[near, :2].T).min() < 0.1
+
+
+def test_a_route_at_half_its_pace_is_flown_at_half_the_speed():
+    route = plan_route(SQUARE)
+    full, half = route.at(20.0), route.at(20.0, 0.5)
+    np.testing.assert_allclose(half.velocity_mps, 0.5 * full.velocity_mps)
+    np.testing.assert_allclose(half.acceleration_mps2, 0.25 * full.acceleration_mps2)
+    # While the pace drops the speed does, by the chain rule; checked against differences of the velocity.
+    paces = [0.6 - 0.2 * STEP_S, 0.6, 0.6 + 0.2 * STEP_S]
+    clocks = [20.0 - 0.6 * STEP_S, 20.0, 20.0 + 0.6 * STEP_S]
+    speeds = [p * np.array([np.interp(c, np.arange(len(v)) * 0.01, v) for v in route.velocity_mps.T])
+              for p, c in zip(paces, clocks, strict=True)]  # fmt: skip
+    slope = (speeds[2] - speeds[0]) / (2.0 * STEP_S)
+    np.testing.assert_allclose(route.at(20.0, 0.6, 0.2).acceleration_mps2, slope, atol=0.02)
+
+
+@pytest.mark.parametrize("clock_s", [-5.0, 1e6])
+def test_beyond_its_ends_a_route_hovers(clock_s):
+    point = plan_route(SQUARE).at(clock_s)
+    assert np.abs(point.velocity_mps).max() < 0.05
+    assert np.hypot(*(SQUARE - point.position_m[:2]).T).min() < 0.2
+
+
+@pytest.mark.slow
+def test_the_pilot_keeps_the_route_in_gusts_and_shakes():
+    route, rng = plan_route(SQUARE), np.random.default_rng(5)
+    state, air, pilot = hovering(route.position_m[0], float(route.heading_deg[0])), WindField(Wind(), rng), Pilot()
+    off, tilts, kicks = [], [], list(route.kicks_s)
+    for k in range(round(route.duration_s / STEP_S)):
+        target = route.at(k * STEP_S)
+        if kicks and k * STEP_S >= kicks[0]:
+            kicks.pop(0)
+            state = shaken(state, FRAME, rng)
+        wanted = pilot.steer(target, state.position_m, state.velocity_mps)
+        state, _ = advance(state, wanted, target.heading_deg, FRAME, air.next())
+        off.append(state.position_m - target.position_m)
+        tilts.append(math.degrees(math.acos(min(1.0, -state.enu_from_body[2, 2]))))
+    assert np.hypot(*np.array(off)[:, :2].T).max() < 0.6
+    assert np.abs(np.array(off)[:, 2]).max() < 0.2
+    assert 7.0 < max(tilts) < 16.0
+    nose = attitude_from_rotation(state.enu_from_body)[2]
+    assert abs((nose - route.heading_deg[-1] + 180.0) % 360.0 - 180.0) < 2.0
+
+
+def test_rounds_last_as_long_as_they_should():
+    route = plan_rounds((50.0, 30.0), 100.0)
+    assert 100.0 <= route.duration_s < 130.0
+    assert np.abs(route.position_m[:, 0]).max() < 50.5
+    assert np.abs(route.position_m[:, 1]).max() < 30.5
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: Airframe(mass_kg=-1.0), "mass_kg"),
+        (lambda: Airframe(max_thrust_n=10.0), "max_thrust_n"),
+        (lambda: Wind(gust_time_s=0.0), "gust_time_s"),
+        (lambda: Wind(mean_east_mps=math.nan), "wind"),
+        (lambda: Gains(velocity_per_s=0.0), "velocity_per_s"),
+        (lambda: plan_route(np.zeros((1, 2))), "waypoints_m"),
+        (lambda: plan_route(np.zeros((3, 2))), "waypoints_m"),
+        (lambda: plan_rounds((4.0, 50.0), 60.0), "half_m"),
+    ],
+)
+def test_what_cannot_fly_is_refused_by_name(make, named):
+    with pytest.raises(OptionError, match=named):
+        make()
