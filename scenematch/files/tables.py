@@ -1,4 +1,4 @@
-"""CSV tables: the one reader and writer that telemetry, truth, track and the data sets share.
+"""CSV tables: the one reader and writer that telemetry, truth and track share.
 
 Convention:
     A blank cell is unknown; columns that were not requested are ignored. A byte order mark and either line ending
