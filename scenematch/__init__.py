@@ -17,7 +17,6 @@ from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from scenematch.files.corrections import Corrections
-    from scenematch.runs.bag_conversion import convert_to_bag
     from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.checking import diagnose_flight
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
@@ -60,7 +59,6 @@ __all__ = [
     "WorldSettings",
     "audit_map",
     "compare",
-    "convert_to_bag",
     "diagnose_flight",
     "evaluate",
     "export_track",
@@ -80,7 +78,6 @@ __all__ = [
 
 _NAMES = {
     "scenematch.files.corrections": "Corrections",
-    "scenematch.runs.bag_conversion": "convert_to_bag",
     "scenematch.runs.checking": "diagnose_flight",
     "scenematch.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
     "scenematch.runs.comparison": "compare parse_runs",

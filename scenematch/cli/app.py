@@ -20,7 +20,6 @@ from scenematch.cli.argument_names import (
     urls_as_typed,
 )
 from scenematch.cli.commands import (
-    bag,
     bridge,
     check,
     compare,
@@ -57,7 +56,6 @@ app.command(cls=Command)(simulate.simulate)
 app.command(cls=Command)(evaluate.evaluate)
 app.command(cls=Command)(report.report)
 app.command(cls=Command)(export.export)
-app.command(cls=Command)(bag.bag)
 app.command(cls=Command)(doctor.doctor)
 map_app.command("info", cls=Command)(map_commands.info)
 map_app.command("audit", cls=Command)(map_commands.audit)

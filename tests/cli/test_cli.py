@@ -342,7 +342,6 @@ def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
         ["simulate"],
         ["compare"],
         ["init"],
-        ["bag"],
         ["doctor"],
     ],
 )
