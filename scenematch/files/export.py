@@ -1,4 +1,4 @@
-"""A finished track in the formats of other programs: GPX, GeoJSON, KML, TUM and NMEA.
+"""A finished track in the formats of other programs: GPX, GeoJSON and TUM.
 
 Convention:
     GPX defines a height as one above the sea: it has none where that of the track is in another datum.
