@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from engine.errors import MapError, OptionError
 from engine.maps.rasters import open_source, vertical_datum
 from engine.maps.xyz_tiles import TileCache
+from scenematch.fetch.grid import reason_of
 from scenematch.fetch.place import Bounds
-from scenematch.fetch.servers import reason_of
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
 
 if TYPE_CHECKING:

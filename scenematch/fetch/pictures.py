@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
-from scenematch.fetch.servers import Grid, reason_of
+from scenematch.fetch.grid import Grid, reason_of
 from scenematch.fetch.urls import shown
 
 ATTEMPTS = 5
@@ -57,12 +57,8 @@ def fetch_pictures(
     """
     import rasterio
     from rasterio.errors import RasterioError
-    from rasterio.windows import Window
 
     part = out.with_name(f"{out.name}.part")
-    (width, height), (across, down) = grid.size_px, grid.tile_px
-    places = [(x, y) for y in range(0, height, down) for x in range(0, width, across)]
-    known = 0
     level = {} if grid.overview is None else {"overview_level": grid.overview}
     try:
         with (
@@ -70,28 +66,41 @@ def fetch_pictures(
             rasterio.open(grid.source, **level) as source,
             rasterio.open(part, "w", **_profile(grid)) as file,
         ):
-            for k, (x, y) in enumerate(places):
-                if k > cached:
-                    time.sleep(pause_s)
-                size = min(across, width - x), min(down, height - y)
-                there = Window(grid.offset_px[0] + x, grid.offset_px[1] + y, *size)
-                rgba = _read(source, there, url, say)
-                valid = rgba[3] >= _OPAQUE
-                file.write(rgba[:3] * valid, window=Window(x, y, *size))
-                file.write_mask(valid * np.uint8(255), window=Window(x, y, *size))
-                known += int(valid.sum())
-                yield int(valid.sum())
-            if known == 0:
-                raise MapError(
-                    f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; "
-                    "it may have some with a larger `gsd_m_per_px`"
-                )
+            yield from _copied(source, file, grid, lambda k: pause_s * (k > cached), url, say)
             file.update_tags(**{name: str(value) for name, value in tags.items()})
         os.replace(part, out)
     except (RasterioError, OSError) as error:
         raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
     finally:
         part.unlink(missing_ok=True)
+
+
+def _copied(
+    source: Any, file: Any, grid: Grid, pause_s: Callable[[int], float], url: str, say: Callable[[str], None]
+) -> Iterator[int]:
+    """Copy picture by picture; how many pixels of each have data.
+
+    Raises:
+        MapError: none has.
+    """
+    from rasterio.windows import Window
+
+    (width, height), (across, down), known = grid.size_px, grid.tile_px, 0
+    places = [(x, y) for y in range(0, height, down) for x in range(0, width, across)]
+    for k, (x, y) in enumerate(places):
+        time.sleep(pause_s(k))
+        size = min(across, width - x), min(down, height - y)
+        rgba = _read(source, Window(grid.offset_px[0] + x, grid.offset_px[1] + y, *size), url, say)
+        valid = rgba[3] >= _OPAQUE
+        file.write(rgba[:3] * valid, window=Window(x, y, *size))
+        file.write_mask(valid * np.uint8(255), window=Window(x, y, *size))
+        known += int(valid.sum())
+        yield int(valid.sum())
+    if known == 0:
+        raise MapError(
+            f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; it may "
+            "have some with a larger `gsd_m_per_px`"
+        )
 
 
 def _read(source: Any, window: Any, url: str, say: Callable[[str], None]) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
+from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid
 from scenematch.fetch.heights import (
     GLO30,
     GLO30_SLOPE_SIGMA_DEG,
@@ -24,8 +25,9 @@ from scenematch.fetch.heights import (
 )
 from scenematch.fetch.pictures import fetch_pictures, kept_pictures, remove_pictures
 from scenematch.fetch.place import Bounds, Place, Wanted
-from scenematch.fetch.servers import FINE_ENOUGH, Access, Grid, is_template, plan
+from scenematch.fetch.servers import plan
 from scenematch.fetch.urls import check_url, shown
+from scenematch.fetch.xyz import is_template
 from scenematch.files.photos import exif_telemetry
 from scenematch.runs.arguments import check_above, parse_place
 from scenematch.runs.folders import StrPath, check_file

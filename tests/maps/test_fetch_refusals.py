@@ -13,8 +13,8 @@ from engine.errors import MapError, OptionError
 from scenematch.fetch.crs import chosen_crs
 from scenematch.fetch.heights import files_for, read_part
 from scenematch.fetch.place import Place
-from scenematch.fetch.servers import _extra_query
 from scenematch.fetch.urls import check_url, shown
+from scenematch.fetch.wmts import _extra_query
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 
 TILES = "http://127.0.0.1:9/{z}/{x}/{y}.png"  # nobody listens there

@@ -279,7 +279,7 @@ def test_a_busy_server_is_waited_for(server, settings, tmp_path, monkeypatch):
     server.trouble[:] = [("/tiles/", (429, {})), ("/tiles/", (503, {})), ("/tiles/", (502, {}))]
     facts = fetch_map(settings(f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", pause_ms=250.0), tmp_path / "map.tif")
     assert len(server.asked) == facts["tiles"] + 3
-    assert waits == pytest.approx([0.01, 0.02, 0.04] + [0.25] * (facts["tiles"] - 1))
+    assert waits == pytest.approx([0.0, 0.01, 0.02, 0.04] + [0.25] * (facts["tiles"] - 1))
     assert len(server.agents) == 1
     assert server.agents.pop().startswith("scenematch")
     server.trouble[:] = [("/tiles/", (503, {}))] * 5
