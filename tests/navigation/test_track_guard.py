@@ -129,12 +129,13 @@ def test_the_first_fix_must_agree_with_the_start_or_the_receiver():
     assert flight.step(true)
 
 
-def test_single_wrong_matches_are_no_dispute():
+@pytest.mark.parametrize("velocity", [True, False])
+def test_single_wrong_matches_are_held_back_and_no_dispute(velocity):
     flight = Flight()
-    flight.fly(5.0, true)
+    flight.fly(5.0, true, velocity=velocity)
     for _ in range(10):
-        assert not flight.step(shifted)
-        assert flight.step(true)
+        assert not flight.step(shifted, velocity=velocity)
+        assert flight.step(true, velocity=velocity)
 
 
 @pytest.mark.parametrize("cover_s", [0.0, 10.0])
