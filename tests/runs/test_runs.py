@@ -6,12 +6,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
-import torch
 
 import scenematch.runs
 from engine import OptionError, TelemetryError
 from engine.errors import BackendError, MissingExtraError, require
-from engine.features import sift
 from scenematch import (
     BridgeFiles,
     BridgeSettings,
@@ -230,10 +228,6 @@ def cluster():
         pass
 
 
-def local_affine_frames():
-    sift(torch.zeros(1, 1, 64, 64)).lafs()
-
-
 @pytest.mark.parametrize(
     ("module", "package", "extra", "use"),
     [
@@ -244,7 +238,6 @@ def local_affine_frames():
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
         ("pyulog", "pyulog", "logs", ulog),
         ("ray", "ray", "ray", cluster),
-        ("kornia.feature", "kornia", "learned", local_affine_frames),
         ("matplotlib", "matplotlib", "desk", lambda: run_demo("demo")),
         ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),
     ],
