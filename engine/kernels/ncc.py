@@ -1,13 +1,11 @@
 """The interface to NCC's kernels: a function with several kernels selects one with plain ifs.
 
-Arrays are the CPU's, and go to OpenCV and to compiled loops; tensors go to tensor ops, or to Triton. Kernels are
+Arrays are the CPU's, and go to OpenCV and to compiled loops; tensors go to tensor ops. Kernels are
 imported where they are selected: torch and numba take a while.
 """
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,13 +22,10 @@ __all__ = [
     "LocalScores",
     "counts",
     "halved",
-    "integrals",
     "inverse_norm",
     "masked_ncc_surface",
     "ncc_surface",
-    "peak",
     "prepared_surface",
-    "rival",
 ]
 
 
@@ -116,7 +111,7 @@ def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Pict
 
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
-        running: :func:`integrals` (2, H+1, W+1) of a tensor, or a crop of a larger picture's; None of an array.
+        running: (2, H+1, W+1) sums of a tensor and its square, or a crop of a larger one's; None of an array.
         h: rows of a patch.
         w: columns of a patch.
 
@@ -133,20 +128,6 @@ def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Pict
     return eager.inverse_norm(running, h, w)
 
 
-def integrals(image: Tensor) -> Tensor:
-    """Integral images of a picture and of its square.
-
-    Args:
-        image: (H, W) floating point.
-
-    Returns:
-        (2, H+1, W+1) float64 running sums; the first row and column are 0.
-    """
-    from engine.kernels import eager
-
-    return eager.integrals(image)
-
-
 def halved(image: Picture) -> Picture:
     """Means (H // 2, W // 2) of 2 x 2 pixels of a picture (H, W) float32."""
     if isinstance(image, np.ndarray):
@@ -154,52 +135,3 @@ def halved(image: Picture) -> Picture:
     from engine.kernels import eager
 
     return eager.halved(image)
-
-
-def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum of every template's surface; nothing is copied from the device.
-
-    Args:
-        products: (T, H', W') float32 from :func:`engine.kernels.eager.products`.
-        inverse_norms: (H', W') float32, or (T, H', W').
-
-    Returns:
-        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
-    """
-    if _by_triton(products):
-        from engine.kernels import triton_peak
-
-        return triton_peak.peak(products, inverse_norms)
-    from engine.kernels import eager
-
-    return eager.peak(products, inverse_norms)
-
-
-def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
-    """Maximum of every template's surface outside a disc.
-
-    Args:
-        products: (T, H', W') float32 from :func:`engine.kernels.eager.products`.
-        inverse_norms: (H', W') float32, or (T, H', W').
-        winner: (T,) int64, the flat index of the disc's centre, on the device.
-        radius_squared: positions of at most this squared distance are inside, in squared pixels.
-
-    Returns:
-        (T,) float32; -1 where nothing is outside.
-    """
-    if _by_triton(products):
-        from engine.kernels import triton_peak
-
-        return triton_peak.rival(products, inverse_norms, winner, radius_squared)
-    from engine.kernels import eager
-
-    return eager.rival(products, inverse_norms, winner, radius_squared)
-
-
-def _by_triton(tensor: Tensor) -> bool:
-    return tensor.device.type == "cuda" and _has_triton()
-
-
-@cache
-def _has_triton() -> bool:
-    return find_spec("triton") is not None
