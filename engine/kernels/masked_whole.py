@@ -34,8 +34,26 @@ class _Model(NamedTuple):
     squares: Array
 
 
-def surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_overlap: float) -> NDArray[Any]:
-    """Zero-mean NCC over the valid pixels.
+def ncc_surface(
+    search: NDArray[Any], search_valid: Mask, templates: NDArray[Any], *, min_overlap: float
+) -> NDArray[Any]:
+    """Zero-mean NCC over the valid pixels of windows.
+
+    Args:
+        search: (B, H, W).
+        search_valid: (B, H, W) bool.
+        templates: (B, T, h, w).
+        min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
+
+    Returns:
+        (B, T, H-h+1, W-w+1) in [-1, 1]: float32 where both pictures are, else float64.
+    """
+    windows = zip(search, search_valid, templates, strict=True)
+    return np.stack([_surfaces(*window, min_overlap) for window in windows])
+
+
+def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_overlap: float) -> NDArray[Any]:
+    """The same of one window.
 
     Args:
         window: (H, W).

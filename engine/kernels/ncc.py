@@ -13,7 +13,7 @@ import numpy as np
 from engine.kernels import sums
 from engine.kernels.local import LocalScores
 from engine.kernels.sums import counts
-from engine.runtime.device import Picture
+from engine.runtime.device import Picture, as_tensor
 
 if TYPE_CHECKING:
     from engine.runtime.tensors import Tensor
@@ -63,24 +63,25 @@ def masked_ncc_surface(
         search: (B, H, W).
         search_valid: (B, H, W) bool, of the same kind.
         templates: (B, T, h, w), of the same kind.
-        templates_valid: (B, T, h, w) bool, of the same kind.
+        templates_valid: (B, T, h, w) bool, of the same kind; arrays that are not all valid go to the tensor ops.
         min_overlap: positions with a smaller share of the template's valid pixels in common score -1.
 
     Returns:
-        (B, T, H-h+1, W-w+1) float64 in [-1, 1].
+        (B, T, H-h+1, W-w+1) in [-1, 1].
 
     Raises:
         OptionError: NaN or infinity.
     """
-    if isinstance(search, np.ndarray):
-        from engine.kernels import masked_by_opencv
+    if isinstance(search, np.ndarray) and templates_valid.all():
+        from engine.kernels import masked_whole
 
         sums.check_finite(search=search, templates=templates)
-        return masked_by_opencv.ncc_surface(
-            search, search_valid, templates, templates_valid, min_overlap=min_overlap
-        )
+        return masked_whole.ncc_surface(search, search_valid, templates, min_overlap=min_overlap)
     from engine.kernels import eager, masked
 
+    search, search_valid, templates, templates_valid = map(
+        as_tensor, (search, search_valid, templates, templates_valid)
+    )
     scores = masked.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
     eager.check_finite(search=search, templates=templates)  # last: the host waits for it
     return scores

@@ -72,7 +72,7 @@ def test_the_division_changes_no_score(kind, monkeypatch):
     monkeypatch.setattr(masked_whole, "_SMALL_PX", 0)
     for divisions in ((1,), (3,), (16,)):
         monkeypatch.setattr(masked_whole, "_DIVISIONS", divisions)
-        found.append(masked_whole.surfaces(window, valid, templates, 0.5))
+        found.append(masked_whole.ncc_surface(window[None], valid[None], templates[None], min_overlap=0.5)[0])
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], rtol=0, atol=1e-10)
 
@@ -95,9 +95,10 @@ def test_flat_templates_and_flat_ground_score_zero_also_across_an_edge(level):
     window, valid, templates = drawn("border", (120, 130), (30, 31))
     for dtype in (np.float32, np.float64):
         flat = np.full((1, 30, 31), level, dtype)
-        scores = masked_whole.surfaces(window.astype(dtype), valid, flat, 0.5)
+        scores = masked_whole.ncc_surface(window.astype(dtype)[None], valid[None], flat[None], min_overlap=0.5)[0]
         assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6
         half = window.astype(dtype)
         half[:, :80] = level
-        scores = masked_whole.surfaces(half, valid, templates.astype(dtype), 0.5)[:, :, : 80 - 31]
+        scores = masked_whole.ncc_surface(half[None], valid[None], templates.astype(dtype)[None], min_overlap=0.5)
+        scores = scores[0, :, :, : 80 - 31]
         assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6

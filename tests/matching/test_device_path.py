@@ -151,21 +151,6 @@ def test_a_batch_needs_as_many_templates_as_parts():
         match_templates([prepare(torch.rand(20, 20))], [torch.rand(5, 5)] * 2, exclusion_px=3.0)
 
 
-def test_a_large_window_is_matched_in_blocks_on_a_device_too(monkeypatch):
-    from engine.kernels import eager
-
-    images = [picture(300, 310, i) for i in range(2)]
-    templates = [cut(image, (20, 22), 3) for image in images]
-    monkeypatch.setattr(eager, "_MIN_BLOCKED_PX", 1)
-    monkeypatch.setattr(eager, "_MIN_BLOCK_PX", 60)
-    with pretended_device() as crossings:
-        searches = [prepare(image.to(DEVICE)) for image in images]
-        found = match_templates(searches, [t.to(DEVICE) for t in templates], exclusion_px=5.0)
-        assert crossings.waits == []
-    for peak, image, template in zip(found, images, templates, strict=True):
-        assert_same_peak(peak, match_template(prepare(image), template, exclusion_px=5.0, exhaustive=True))
-
-
 @pytest.mark.parametrize("zero_mean", [True, False])
 def test_the_surface_waits_for_the_check_of_its_arguments_alone(zero_mean):
     windows = torch.stack([picture(70, 81, i) for i in range(2)]) + 3.0
