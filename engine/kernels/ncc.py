@@ -44,13 +44,13 @@ def ncc_surface(search: Picture, templates: Picture, *, zero_mean: bool) -> Pict
         OptionError: NaN or infinity.
     """
     if isinstance(search, np.ndarray):
-        from engine.kernels import by_opencv
+        from engine.kernels import blocks
 
-        return by_opencv.ncc_surface(search, templates, zero_mean=zero_mean)
-    from engine.kernels import eager
+        return blocks.ncc_surface(search, templates, zero_mean=zero_mean)
+    from engine.kernels import tensors
 
-    scores = eager.ncc_surface(search, templates, zero_mean=zero_mean)
-    eager.check_finite(search=search, templates=templates)  # last: the host waits for it
+    scores = tensors.ncc_surface(search, templates, zero_mean=zero_mean)
+    tensors.check_finite(search=search, templates=templates)  # last: the host waits for it
     return scores
 
 
@@ -73,17 +73,17 @@ def masked_ncc_surface(
         OptionError: NaN or infinity.
     """
     if isinstance(search, np.ndarray) and templates_valid.all():
-        from engine.kernels import masked_whole
+        from engine.kernels import masked_blocks
 
         sums.check_finite(search=search, templates=templates)
-        return masked_whole.ncc_surface(search, search_valid, templates, min_overlap=min_overlap)
-    from engine.kernels import eager, masked
+        return masked_blocks.ncc_surface(search, search_valid, templates, min_overlap=min_overlap)
+    from engine.kernels import masked_tensors, tensors
 
     search, search_valid, templates, templates_valid = map(
         as_tensor, (search, search_valid, templates, templates_valid)
     )
-    scores = masked.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
-    eager.check_finite(search=search, templates=templates)  # last: the host waits for it
+    scores = masked_tensors.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
+    tensors.check_finite(search=search, templates=templates)  # last: the host waits for it
     return scores
 
 
@@ -99,12 +99,12 @@ def prepared_surface(image: Picture, inverse_norms: Picture, templates: Picture)
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
     if isinstance(image, np.ndarray):
-        from engine.kernels import by_opencv
+        from engine.kernels import blocks
 
-        return by_opencv.prepared_surface(image, inverse_norms, templates)
-    from engine.kernels import eager
+        return blocks.prepared_surface(image, inverse_norms, templates)
+    from engine.kernels import tensors
 
-    return eager.prepared_surface(image, inverse_norms, templates)
+    return tensors.prepared_surface(image, inverse_norms, templates)
 
 
 def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Picture:
@@ -120,19 +120,19 @@ def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Pict
         (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
     if isinstance(image, np.ndarray):
-        from engine.kernels import by_opencv
+        from engine.kernels import blocks
 
-        return by_opencv.inverse_norm(image, h, w)
-    from engine.kernels import eager
+        return blocks.inverse_norm(image, h, w)
+    from engine.kernels import tensors
 
     assert running is not None
-    return eager.inverse_norm(running, h, w)
+    return tensors.inverse_norm(running, h, w)
 
 
 def halved(image: Picture) -> Picture:
     """Means (H // 2, W // 2) of 2 x 2 pixels of a picture (H, W) float32."""
     if isinstance(image, np.ndarray):
         return sums.halved(image)
-    from engine.kernels import eager
+    from engine.kernels import tensors
 
-    return eager.halved(image)
+    return tensors.halved(image)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from engine.errors import ShapeError
-from engine.kernels import eager
+from engine.kernels import tensors
 from engine.kernels.peaks import find_peak
 from engine.ncc_fft import Search, match_template, match_templates, prepare, surface
 
@@ -30,7 +30,7 @@ def whole_surface(search, template):
 def of_tensors(search):
     """A map that is prepared as arrays, as the tensors that a device has."""
     image = torch.as_tensor(search.image)
-    return Search(image, sums=eager.integrals(image))
+    return Search(image, sums=tensors.integrals(image))
 
 
 def on_device(search, template, exclusion_px):
@@ -56,7 +56,7 @@ def scores_of(products, norms):
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_the_peak_is_numpys(shape):
     given = draw(shape)
-    best, places = eager.peak(*given)
+    best, places = tensors.peak(*given)
     assert (best.dtype, places.dtype) == (torch.float32, torch.int64)
     flat = scores_of(*given).reshape(shape[0], -1)
     np.testing.assert_array_equal(places, flat.argmax(axis=1))
@@ -72,7 +72,7 @@ def test_the_rival_is_numpys(shape):
     for place in {0, width - 1, height * width // 2, height * width - 1}:
         distance = (rows - place // width) ** 2 + (columns - place % width) ** 2
         for radius_squared in (0, 2, 25, 1000, 10**10):
-            best = eager.rival(*given, torch.tensor([place]).expand(shape[0]), radius_squared)
+            best = tensors.rival(*given, torch.tensor([place]).expand(shape[0]), radius_squared)
             outside = np.where(distance > radius_squared, scores, np.float32(-1.0))
             np.testing.assert_array_equal(best, outside.max(axis=(1, 2)))
 
@@ -82,10 +82,10 @@ def test_of_equal_scores_the_first_is_the_peak():
     products[0, 50, 7] = products[0, 50, 8] = products[0, 69, 89] = 0.5
     products[1] = 7.0  # all of them 1 once they are cut off
     products[2] = -7.0
-    best, places = eager.peak(products, norms)
+    best, places = tensors.peak(products, norms)
     assert best.tolist() == [0.5, 1.0, -1.0]
     assert places.tolist() == [50 * 90 + 7, 0, 0]
-    assert eager.rival(products, norms, places, 10**10).tolist() == [-1.0] * 3
+    assert tensors.rival(products, norms, places, 10**10).tolist() == [-1.0] * 3
 
 
 def test_nan_never_wins():
@@ -94,10 +94,10 @@ def test_nan_never_wins():
     products[0, 5, 6:9], products[1], products[2, 62, 64] = math.nan, math.nan, math.inf
     norms[62, 64] = 1.0
     expected = torch.nan_to_num(products * norms, nan=-1.0).clamp(-1.0, 1.0).flatten(1).max(dim=1)
-    best, places = eager.peak(products, norms)
+    best, places = tensors.peak(products, norms)
     torch.testing.assert_close(best, expected.values, rtol=0, atol=0)
     assert (best[1].item(), places[1].item(), best[2].item()) == (-1.0, 0, 1.0)
-    assert eager.rival(products, norms, places, 30)[1].item() == -1.0
+    assert tensors.rival(products, norms, places, 30)[1].item() == -1.0
 
 
 def test_a_batch_is_matched_as_its_templates_one_by_one():
@@ -105,12 +105,12 @@ def test_a_batch_is_matched_as_its_templates_one_by_one():
     drawn = [draw((1, 41, 53)) for _ in range(4)]
     products = torch.cat([p.roll(i, 1) for i, (p, _) in enumerate(drawn)])
     norms = torch.stack([n.roll(2 * i, 0) for i, (_, n) in enumerate(drawn)])
-    best, places = eager.peak(products, norms)
-    second = eager.rival(products, norms, places, 25)
+    best, places = tensors.peak(products, norms)
+    second = tensors.rival(products, norms, places, 25)
     for i in range(4):
         one = products[i : i + 1], norms[i]
-        torch.testing.assert_close(eager.peak(*one), (best[i : i + 1], places[i : i + 1]), rtol=0, atol=0)
-        torch.testing.assert_close(eager.rival(*one, places[i : i + 1], 25), second[i : i + 1], rtol=0, atol=0)
+        torch.testing.assert_close(tensors.peak(*one), (best[i : i + 1], places[i : i + 1]), rtol=0, atol=0)
+        torch.testing.assert_close(tensors.rival(*one, places[i : i + 1], 25), second[i : i + 1], rtol=0, atol=0)
 
 
 def picture(size, model, device="cpu"):
