@@ -13,8 +13,8 @@ from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
 
-OF_DESKS = ("matplotlib", "kornia")
-"""The packages of the extras `desk` and `learned`."""
+OF_DESKS = ("matplotlib",)
+"""The packages of the extra `desk`."""
 PROGRAM = """
 import json, sys
 for name in {absent}:
@@ -98,7 +98,7 @@ def test_what_draws_names_its_extra_before_it_begins(command, flight, files, tmp
 def test_the_extras_of_a_desk_are_all_that_is_missing_here():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    named = " ".join(extras["desk"] + extras["learned"])
+    named = " ".join(extras["desk"])
     assert all(name in named for name in OF_DESKS)
     assert not [line for line in project["dependencies"] if line.startswith(OF_DESKS)]
     assert "scenematch-engine[desk]" in extras["test"]

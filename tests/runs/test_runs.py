@@ -6,12 +6,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
-import torch
 
 import scenematch.runs
 from engine import OptionError, TelemetryError
 from engine.errors import BackendError, MissingExtraError, require
-from engine.features import sift
 from scenematch import (
     BridgeFiles,
     BridgeSettings,
@@ -224,10 +222,6 @@ def ulog():
         read_ulog(Path(file.name))
 
 
-def local_affine_frames():
-    sift(torch.zeros(1, 1, 64, 64)).lafs()
-
-
 @pytest.mark.parametrize(
     ("module", "package", "extra", "use"),
     [
@@ -237,7 +231,6 @@ def local_affine_frames():
         ("rosbags", "rosbags", "bags", import_rosbags),
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
         ("pyulog", "pyulog", "logs", ulog),
-        ("kornia.feature", "kornia", "learned", local_affine_frames),
         ("matplotlib", "matplotlib", "desk", lambda: run_demo("demo")),
         ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),
     ],
