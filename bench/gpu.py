@@ -20,7 +20,7 @@ from torch import Tensor
 from bench.inputs.scenes import flight, pair
 from bench.pages.text import table
 from engine import Fix, SceneMatcher
-from engine.kernels.summits import match as match_on_device
+from engine.kernels.peak_tensors import match as match_on_device
 from engine.ncc_fft import Search, match_template, match_templates, prepare
 from engine.runtime.device import resolve, synchronise
 from engine.values import Peak

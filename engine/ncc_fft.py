@@ -243,7 +243,7 @@ def _check_template(search: Search, template: Picture) -> None:
 
 def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], exclusion_px: float) -> list[Peak]:
     """:func:`find_peak` of the surfaces, bit for bit; 28 numbers a surface are copied from the device, at once."""
-    from engine.kernels.summits import of_groups
+    from engine.kernels.peak_tensors import of_groups
 
     groups: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = {}
     for index, (search, template) in enumerate(zip(searches, templates, strict=True)):

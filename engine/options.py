@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from engine.errors import OptionError
 from engine.kernels.scores import check_score
 from engine.learned.pairs import PairMatcher
+from engine.sift import BACKENDS
 from engine.values import MAX_SIGMA_M, Frame, GridPose, check_positive
 
 PROFILES = ("engine", "paper")
@@ -224,6 +225,8 @@ class SiftOptions:
         scale: the frame is reduced to this before detection; the paper's 0.5.
         max_keypoints: features taken from a frame of usual size; the map's are as dense.
         keypoints_per_px: features taken from a larger one, per pixel of the map's level that it covers.
+        backend: of the features of frame and map: "compiled" loops (CPU) or "kornia" (any device); "auto" takes
+            "compiled" on the CPU, else "kornia".
         upsample: samples per pixel of the first octave of a frame that is drawn in the map's pixels: with 2 small
             keypoints are found more exactly, at three times the time. The map's always have 2.
         contrast_threshold: Lowe's, of frame and map; bare ground has little contrast.
@@ -258,6 +261,7 @@ class SiftOptions:
     scale: float = 0.5
     max_keypoints: int = 300
     keypoints_per_px: float = 0.01
+    backend: str = "auto"
     upsample: int = 2
     contrast_threshold: float = 0.005
     map_features: str = "prepared"
@@ -304,10 +308,9 @@ class SiftOptions:
                 raise OptionError(f"{name}: expected above {minimum:g}, got {value}")
         if self.upsample not in (1, 2):
             raise OptionError(f"upsample: expected 1 or 2, got {self.upsample}")
-        if self.map_features not in MAP_FEATURES:
-            raise OptionError(
-                f"map_features: expected one of {', '.join(MAP_FEATURES)}, got {self.map_features!r}"
-            )
+        for name, known in (("map_features", MAP_FEATURES), ("backend", BACKENDS)):
+            if getattr(self, name) not in known:
+                raise OptionError(f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
         for name in ("max_keypoints", "max_map_keypoints"):
             if not getattr(self, name) >= 4:
                 raise OptionError(f"{name}: expected 4 or more, got {getattr(self, name)}")

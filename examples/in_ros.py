@@ -1,6 +1,7 @@
 """In ROS: in_ros.py 1|2 [NAME:=VALUE ...], a node of your own, run where the map and camera.yaml lie."""
 
 import sys
+from contextlib import suppress
 from importlib import import_module
 
 from engine import Camera, Navigator, OrthoMap, SceneMatcher
@@ -17,7 +18,8 @@ topics = RosTopics(
     image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt"
 )  # "" leaves one out
 try:
-    node.spin(bridge.handlers(topics), bridge.check_input, None)  # until ROS ends it
+    with suppress(KeyboardInterrupt):  # the usual end
+        node.spin(bridge.handlers(topics), bridge.check_input, None)
 finally:
     bridge.close()
 print(bridge.status)

@@ -20,7 +20,6 @@ from bench.accuracy.quality import Gray, Keypoints
 from engine.features import Features, sift
 
 MAX_KEYPOINTS = 300
-KORNIA_MAGNIFICATION = 6.0  # its frames are so many sigmas large
 Extract = Callable[[Gray, float], Any]
 
 
@@ -40,8 +39,8 @@ class Detector:
     batch: Callable[[list[Gray]], Any] | None = None
 
 
-def _first(xy_px: Any, scale_px: Any, descriptors: Any) -> Keypoints:
-    parts = (np.asarray(part)[:MAX_KEYPOINTS] for part in (xy_px, scale_px, descriptors))
+def _first(xy_px: Any, scale_px: Any, descriptors: Any, count: int = MAX_KEYPOINTS) -> Keypoints:
+    parts = (np.asarray(part)[:count] for part in (xy_px, scale_px, descriptors))
     xy, scale, words = parts
     return Keypoints(xy.astype(np.float64).reshape(-1, 2), scale.astype(np.float64), words)
 
@@ -49,38 +48,43 @@ def _first(xy_px: Any, scale_px: Any, descriptors: Any) -> Keypoints:
 # -------------------------------------------------------------------------------------------------- engine
 
 
-def _tensor(grays: list[Gray]) -> torch.Tensor:
+def picture_tensor(grays: list[Gray]) -> torch.Tensor:
+    """Pictures as :func:`engine.features.sift` takes them."""
     return torch.from_numpy(np.stack(grays))[:, None].float() / 255.0
 
 
-def _ours(gray: Gray, up_deg: float, *, upright: bool) -> Features:
+def _ours(gray: Gray, up_deg: float, *, upright: bool, backend: str) -> Features:
     up = {"upright": True, "up_deg": up_deg} if upright else {}
-    return sift(_tensor([gray]), max_keypoints=MAX_KEYPOINTS, **up)
+    return sift(picture_tensor([gray]), max_keypoints=MAX_KEYPOINTS, backend=backend, **up)
 
 
-def _ours_batch(grays: list[Gray], *, upright: bool) -> Features:
-    return sift(_tensor(grays), max_keypoints=MAX_KEYPOINTS, upright=upright)
+def _ours_batch(grays: list[Gray], *, upright: bool, backend: str) -> Features:
+    return sift(picture_tensor(grays), max_keypoints=MAX_KEYPOINTS, backend=backend, upright=upright)
 
 
-def _of_ours(found: Features) -> Keypoints:
+def keypoints_of_features(found: Features) -> Keypoints:
+    """Those of one picture."""
     kept = found.valid[0]
-    return _first(found.xy_px[0, kept], found.scale_px[0, kept], found.descriptors[0, kept])
+    columns = (found.xy_px[0, kept], found.scale_px[0, kept], found.descriptors[0, kept])
+    return _first(*columns, found.valid.shape[1])
 
 
-def _engine(*, upright: bool) -> Detector:
-    extract: Extract = partial(_ours, upright=upright)
-    return Detector(lambda: extract, _of_ours, partial(_ours_batch, upright=upright))
+def _engine(*, upright: bool = False, backend: str = "compiled") -> Detector:
+    extract: Extract = partial(_ours, upright=upright, backend=backend)
+    batch = partial(_ours_batch, upright=upright, backend=backend)
+    return Detector(lambda: extract, keypoints_of_features, batch)
 
 
 # -------------------------------------------------------------------------------------------------- OpenCV
 
 
-def _of_opencv(found: tuple[Any, Any]) -> Keypoints:
+def keypoints_of_opencv(found: tuple[Any, Any], count: int = MAX_KEYPOINTS) -> Keypoints:
+    """The best by response."""
     points, words = found
     if not points:
         return _first(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 1), np.float32))
     best = np.argsort([-point.response for point in points], kind="stable")  # each orientation is a keypoint
-    return _first([points[i].pt for i in best], [points[i].size / 2 for i in best], words[best])
+    return _first([points[i].pt for i in best], [points[i].size / 2 for i in best], words[best], count)
 
 
 def _opencv(create: Callable[[], Any]) -> Detector:
@@ -88,28 +92,10 @@ def _opencv(create: Callable[[], Any]) -> Detector:
         detector = create()
         return lambda gray, _up: detector.detectAndCompute(gray, None)
 
-    return Detector(make, _of_opencv)
+    return Detector(make, keypoints_of_opencv)
 
 
-# -------------------------------------------------------------------------------------- kornia and pycolmap
-
-
-def _kornia() -> Detector:
-    from kornia.feature import SIFTFeature, get_laf_center, get_laf_scale
-
-    feature = SIFTFeature(MAX_KEYPOINTS).eval()  # takes one picture at a time
-
-    def extract(gray: Gray, _up: float) -> Any:
-        with torch.inference_mode():
-            return feature(_tensor([gray]))
-
-    def keypoints(found: Any) -> Keypoints:
-        lafs, responses, words = (part[0] for part in found)
-        kept = responses > 0  # it fills up with nothing
-        scale = get_laf_scale(lafs[None])[0, :, 0, 0] / KORNIA_MAGNIFICATION
-        return _first(get_laf_center(lafs[None])[0][kept], scale[kept], words[kept])
-
-    return Detector(lambda: extract, keypoints)
+# ------------------------------------------------------------------------------------------------ pycolmap
 
 
 def _colmap() -> Detector:
@@ -140,10 +126,10 @@ def detectors() -> dict[str, Callable[[], Detector]]:
         "OpenCV SIFT, contrast 0.02": lambda: _opencv(
             lambda: cv2.SIFT_create(nfeatures=MAX_KEYPOINTS, contrastThreshold=0.02)
         ),
-        "scenematch": lambda: _engine(upright=False),
+        "scenematch": _engine,
         "scenematch, upright": lambda: _engine(upright=True),
         "COLMAP SIFT": _colmap,
-        "kornia SIFT": _kornia,
+        "kornia SIFT": lambda: _engine(backend="kornia"),
         "OpenCV ORB": lambda: _opencv(lambda: cv2.ORB_create(nfeatures=MAX_KEYPOINTS)),
         "OpenCV AKAZE": lambda: _opencv(cv2.AKAZE_create),
     }

@@ -1,8 +1,8 @@
-"""Kernels: NCC's are tensor ops behind :mod:`engine.kernels.ncc`, the others loops that numba compiles.
+"""Kernels: NCC's are tensor ops and compiled loops behind :mod:`engine.kernels.ncc`, all others compiled loops.
 
 Tests compare every kernel of NCC with :mod:`engine.kernels.reference`, which is slow, float64 and obvious.
 
 Loops compiled by numba (SIFT from picture to votes, dense refinement, surfaces and the georeference of maps) are
-imported where they are called, since numba takes a while to import. Tests compare SIFT's with the equivalent
-tensor ops, the others with OpenCV, NumPy and difference quotients.
+imported where they are called, since numba takes a while to import. Tests compare SIFT's with the paper written
+out in float64, the others with OpenCV, NumPy and difference quotients.
 """

@@ -1,13 +1,11 @@
 """The interface to NCC's kernels: a function with several kernels selects one with plain ifs.
 
-Arrays are the CPU's, and go to OpenCV and to compiled loops; tensors go to tensor ops, or to Triton. Kernels are
+Arrays are the CPU's, and go to OpenCV and to compiled loops; tensors go to tensor ops. Kernels are
 imported where they are selected: torch and numba take a while.
 """
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +13,7 @@ import numpy as np
 from engine.kernels import sums
 from engine.kernels.local import LocalScores
 from engine.kernels.sums import counts
-from engine.runtime.device import Picture
+from engine.runtime.device import Picture, as_tensor
 
 if TYPE_CHECKING:
     from engine.runtime.tensors import Tensor
@@ -24,13 +22,10 @@ __all__ = [
     "LocalScores",
     "counts",
     "halved",
-    "integrals",
     "inverse_norm",
     "masked_ncc_surface",
     "ncc_surface",
-    "peak",
     "prepared_surface",
-    "rival",
 ]
 
 
@@ -49,13 +44,13 @@ def ncc_surface(search: Picture, templates: Picture, *, zero_mean: bool) -> Pict
         OptionError: NaN or infinity.
     """
     if isinstance(search, np.ndarray):
-        from engine.kernels import by_opencv
+        from engine.kernels import blocks
 
-        return by_opencv.ncc_surface(search, templates, zero_mean=zero_mean)
-    from engine.kernels import eager
+        return blocks.ncc_surface(search, templates, zero_mean=zero_mean)
+    from engine.kernels import tensors
 
-    scores = eager.ncc_surface(search, templates, zero_mean=zero_mean)
-    eager.check_finite(search=search, templates=templates)  # last: the host waits for it
+    scores = tensors.ncc_surface(search, templates, zero_mean=zero_mean)
+    tensors.check_finite(search=search, templates=templates)  # last: the host waits for it
     return scores
 
 
@@ -68,26 +63,27 @@ def masked_ncc_surface(
         search: (B, H, W).
         search_valid: (B, H, W) bool, of the same kind.
         templates: (B, T, h, w), of the same kind.
-        templates_valid: (B, T, h, w) bool, of the same kind.
+        templates_valid: (B, T, h, w) bool, of the same kind; arrays that are not all valid go to the tensor ops.
         min_overlap: positions with a smaller share of the template's valid pixels in common score -1.
 
     Returns:
-        (B, T, H-h+1, W-w+1) float64 in [-1, 1].
+        (B, T, H-h+1, W-w+1) in [-1, 1].
 
     Raises:
         OptionError: NaN or infinity.
     """
-    if isinstance(search, np.ndarray):
-        from engine.kernels import masked_by_opencv
+    if isinstance(search, np.ndarray) and templates_valid.all():
+        from engine.kernels import masked_blocks
 
         sums.check_finite(search=search, templates=templates)
-        return masked_by_opencv.ncc_surface(
-            search, search_valid, templates, templates_valid, min_overlap=min_overlap
-        )
-    from engine.kernels import eager, masked
+        return masked_blocks.ncc_surface(search, search_valid, templates, min_overlap=min_overlap)
+    from engine.kernels import masked_tensors, tensors
 
-    scores = masked.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
-    eager.check_finite(search=search, templates=templates)  # last: the host waits for it
+    search, search_valid, templates, templates_valid = map(
+        as_tensor, (search, search_valid, templates, templates_valid)
+    )
+    scores = masked_tensors.ncc_surface(search, search_valid, templates, templates_valid, min_overlap=min_overlap)
+    tensors.check_finite(search=search, templates=templates)  # last: the host waits for it
     return scores
 
 
@@ -103,12 +99,12 @@ def prepared_surface(image: Picture, inverse_norms: Picture, templates: Picture)
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
     if isinstance(image, np.ndarray):
-        from engine.kernels import by_opencv
+        from engine.kernels import blocks
 
-        return by_opencv.prepared_surface(image, inverse_norms, templates)
-    from engine.kernels import eager
+        return blocks.prepared_surface(image, inverse_norms, templates)
+    from engine.kernels import tensors
 
-    return eager.prepared_surface(image, inverse_norms, templates)
+    return tensors.prepared_surface(image, inverse_norms, templates)
 
 
 def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Picture:
@@ -116,7 +112,7 @@ def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Pict
 
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
-        running: :func:`integrals` (2, H+1, W+1) of a tensor, or a crop of a larger picture's; None of an array.
+        running: (2, H+1, W+1) sums of a tensor and its square, or a crop of a larger one's; None of an array.
         h: rows of a patch.
         w: columns of a patch.
 
@@ -124,82 +120,19 @@ def inverse_norm(image: Picture, running: Tensor | None, h: int, w: int) -> Pict
         (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
     if isinstance(image, np.ndarray):
-        from engine.kernels import by_opencv
+        from engine.kernels import blocks
 
-        return by_opencv.inverse_norm(image, h, w)
-    from engine.kernels import eager
+        return blocks.inverse_norm(image, h, w)
+    from engine.kernels import tensors
 
     assert running is not None
-    return eager.inverse_norm(running, h, w)
-
-
-def integrals(image: Tensor) -> Tensor:
-    """Integral images of a picture and of its square.
-
-    Args:
-        image: (H, W) floating point.
-
-    Returns:
-        (2, H+1, W+1) float64 running sums; the first row and column are 0.
-    """
-    from engine.kernels import eager
-
-    return eager.integrals(image)
+    return tensors.inverse_norm(running, h, w)
 
 
 def halved(image: Picture) -> Picture:
     """Means (H // 2, W // 2) of 2 x 2 pixels of a picture (H, W) float32."""
     if isinstance(image, np.ndarray):
         return sums.halved(image)
-    from engine.kernels import eager
+    from engine.kernels import tensors
 
-    return eager.halved(image)
-
-
-def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum of every template's surface; nothing is copied from the device.
-
-    Args:
-        products: (T, H', W') float32 from :func:`engine.kernels.eager.products`.
-        inverse_norms: (H', W') float32, or (T, H', W').
-
-    Returns:
-        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones.
-    """
-    if _by_triton(products):
-        from engine.kernels import triton_peak
-
-        return triton_peak.peak(products, inverse_norms)
-    from engine.kernels import eager
-
-    return eager.peak(products, inverse_norms)
-
-
-def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
-    """Maximum of every template's surface outside a disc.
-
-    Args:
-        products: (T, H', W') float32 from :func:`engine.kernels.eager.products`.
-        inverse_norms: (H', W') float32, or (T, H', W').
-        winner: (T,) int64, the flat index of the disc's centre, on the device.
-        radius_squared: positions of at most this squared distance are inside, in squared pixels.
-
-    Returns:
-        (T,) float32; -1 where nothing is outside.
-    """
-    if _by_triton(products):
-        from engine.kernels import triton_peak
-
-        return triton_peak.rival(products, inverse_norms, winner, radius_squared)
-    from engine.kernels import eager
-
-    return eager.rival(products, inverse_norms, winner, radius_squared)
-
-
-def _by_triton(tensor: Tensor) -> bool:
-    return tensor.device.type == "cuda" and _has_triton()
-
-
-@cache
-def _has_triton() -> bool:
-    return find_spec("triton") is not None
+    return tensors.halved(image)

@@ -81,7 +81,7 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     if scores.ndim != 2 or 0 in scores.shape:
         raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
     if not isinstance(scores, np.ndarray) and scores.device.type != "cpu":
-        from engine.kernels.summits import of_surface
+        from engine.kernels.peak_tensors import of_surface
 
         return peak_of(of_surface(scores, exclusion_px), *scores.shape)
     values = on_host(scores)
@@ -98,7 +98,7 @@ def peak_of(summit: NDArray[np.float64], height: int, width: int) -> Peak:
     """The peak of one surface.
 
     Args:
-        summit: (28,) of :func:`engine.kernels.summits.summits`, on the CPU.
+        summit: (28,) of :func:`engine.kernels.peak_tensors.summits`, on the CPU.
         height: of the surface.
         width: of the surface.
 

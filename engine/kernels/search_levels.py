@@ -75,5 +75,7 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
     if halvings > 0 and min(image.shape) >= 2 * COARSE_TEMPLATE_PX:
         half = prepare(kernels.halved(image), halvings=halvings - 1)
     if not isinstance(image, np.ndarray):
-        return Search(image, half, sums=kernels.integrals(image))
+        from engine.kernels.tensors import integrals
+
+        return Search(image, half, sums=integrals(image))
     return Search(image, half, counts=None if valid is None else kernels.counts(valid))

@@ -9,11 +9,10 @@ import math
 
 import numpy as np
 
+from engine.kernels.transform_sizes import FLAT_SHARE
 from engine.runtime.jit import compiled, inlined
 
-# A patch is flat where its sum of squares is below this share of the window's, which is rounding.
-_FLAT_SHARE = 1e-12
-# The same for a template, by the squares that its mean alone would have.
+# The same as :data:`FLAT_SHARE` for a template, by the squares that its mean alone would have.
 _FLAT_TEMPLATE = 1e-24
 
 
@@ -71,7 +70,7 @@ def inverse_norms(window, mean, energy, h, w, zero_mean):
     """
     columns, height, width = window.shape[1], window.shape[0] - h + 1, window.shape[1] - w + 1
     out = np.empty((height, width), np.float32)
-    floor, share = _FLAT_SHARE * energy, 1.0 / (1.0 * h * w) if zero_mean else 0.0
+    floor, share = FLAT_SHARE * energy, 1.0 / (1.0 * h * w) if zero_mean else 0.0
     down, down_squares = np.zeros(columns), np.zeros(columns)
     along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)
     spreads, (unit_energy, unit_norm) = np.empty(width, np.float32), _units(energy)

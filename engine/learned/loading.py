@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from engine.errors import OptionError, require
+from engine.errors import OptionError
 from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
 from engine.learned.matchers import KeypointMatcher, Loftr
 from engine.learned.superpoint import SuperPoint
@@ -38,7 +39,6 @@ def load_matcher(
         OptionError: a file is missing, is not one of tensors, holds no known network or does not fit it, or the
             files do not make a matcher.
         DeviceError: the device is not there.
-        MissingExtraError: kornia is not installed.
     """
     if max_keypoints < 2:
         raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
@@ -72,7 +72,6 @@ def load_loftr(path: str | Path, *, device: str | torch.device = "auto", min_con
     Raises:
         OptionError: the file is missing, is not one of tensors, or does not fit the network.
         DeviceError: the device is not there.
-        MissingExtraError: kornia is not installed.
     """
     if not 0.0 <= min_confidence <= 1.0:
         raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
@@ -93,7 +92,6 @@ def load_disk_lightglue(
     Raises:
         OptionError: a file is missing, is not one of tensors, or does not fit its network.
         DeviceError: the device is not there.
-        MissingExtraError: kornia is not installed.
     """
     if max_keypoints < 2:
         raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
@@ -120,8 +118,8 @@ def _keypoint_matcher(
 
 
 def _kornia() -> Any:
-    """Kornia's networks; an extra, since most vehicles match without."""
-    return require("kornia.feature", "learned")
+    """Kornia's networks, which take a second to import."""
+    return importlib.import_module("kornia.feature")
 
 
 def _loftr(weights: Weights, device: torch.device) -> nn.Module:
@@ -134,15 +132,13 @@ def _disk(weights: Weights, device: torch.device) -> nn.Module:
 
 def _aliked(weights: Weights, device: torch.device) -> nn.Module:
     """ALIKED of the size that its tensors have."""
-    if not hasattr(features := _kornia(), "ALIKED"):
-        raise OptionError("weights: ALIKED takes kornia 0.9 or later, got an older one")
     if len(weights.tensors["block1.conv1.weight"]) == 8:
         name = "aliked-t16"
     else:
         offsets = weights.tensors.get("desc_head.agg_weights")
         name = "aliked-n32" if offsets is not None and len(offsets) == 32 else "aliked-n16"
     # Without a threshold every local maximum is a keypoint; how many are taken is said picture by picture.
-    return fill(features.ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
+    return fill(_kornia().ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
 
 
 def _superpoint(weights: Weights, device: torch.device) -> nn.Module:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.features import Features, sift
+from engine.features import Features, chosen_backend, sift
 from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.maps.recently_used import RecentlyUsed
 from engine.runtime.tensors import download, torch, upload
@@ -78,10 +78,12 @@ class LandmarkMap:
     Args:
         site: the map.
         device: of detection and of the returned features; the cache is in the CPU's memory.
+        backend: of :func:`engine.features.sift`.
     """
 
-    def __init__(self, site: OrthoMap, device: str | torch.device) -> None:
+    def __init__(self, site: OrthoMap, device: str | torch.device, backend: str = "auto") -> None:
         self._site, self._device = site, device
+        self._backend = chosen_backend(backend, torch.device(device))
         self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
         self._max_landmarks = MAX_LANDMARKS
 
@@ -134,7 +136,7 @@ class LandmarkMap:
             for key in keys:
                 self._tile(key)
             return
-        settings = (DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
+        settings = (self._backend, DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
         name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
         stored = load_arrays(name, _STORED)
         if stored is None:
@@ -166,6 +168,7 @@ class LandmarkMap:
         found = sift(
             as_picture(self._site.gray(wide, level), self._device),
             max_keypoints=_SLOTS,
+            backend=self._backend,
             upright=upright,
             mask=torch.from_numpy(mask)[None, None].to(self._device),
             contrast_threshold=MIN_CONTRAST,

@@ -138,6 +138,7 @@ def _feature_pairs(
         features = sift(
             gray[None, None].float() / 255.0,
             max_keypoints=keypoints,
+            backend=options.backend,
             upright=True,
             mask=valid[None, None],
             upsample=options.upsample if shown_px <= _UPSAMPLED_PX else 1,
@@ -218,7 +219,13 @@ def _by_frame(
     upright = options.upright and turn is not None
     with query.scheduler.stage("frame features"):
         reduced = _reduce(query, options.scale)
-        features = sift(reduced.picture, max_keypoints=options.max_keypoints, upright=upright, up_deg=turn or 0.0)
+        features = sift(
+            reduced.picture,
+            max_keypoints=options.max_keypoints,
+            backend=options.backend,
+            upright=upright,
+            up_deg=turn or 0.0,
+        )
     matched = []
     for view in views:
         with query.scheduler.stage("map features"):
@@ -280,7 +287,7 @@ def _map_features(
     if not site.fully_valid:
         mask = torch.from_numpy(site.valid(crop, view.level)).to(query.device)[None, None]
     picture = as_picture(site.gray(crop, view.level), query.device)
-    features = sift(picture, max_keypoints=int(count), upright=upright, mask=mask)
+    features = sift(picture, max_keypoints=int(count), backend=options.backend, upright=upright, mask=mask)
     xy_px = download([features.xy_px[0]])[0]
     return Landmarks(features, xy_px, lifted(site, site.full_from_level(xy_px + view.corner_px, view.level)))
 

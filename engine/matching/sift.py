@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from engine.features import prepare_plans
+from engine.features import chosen_backend, prepare_plans
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.prepared import enhanced_part
 from engine.maps.samples import SampleMap
@@ -59,7 +59,7 @@ class Sift(Method):
         self, site: OrthoMap, device: Device, options: MatcherOptions, samples: SampleMap | None = None
     ) -> None:
         self.options = options.sift
-        self.landmarks = LandmarkMap(site, device)
+        self.landmarks = LandmarkMap(site, device, self.options.backend)
         self._few = replace(
             self.options,
             max_keypoints=max(MIN_VOTES, round(self.options.max_keypoints * _FEW_SHARE)),
@@ -86,7 +86,8 @@ class Sift(Method):
         """Run every variant of every step, so that it is compiled and its cost known."""
         # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
         longest_px = 3 * max(query.gray.shape)
-        prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX), torch.device(query.device))
+        if chosen_backend(self.options.backend, torch.device(query.device)) == "compiled":
+            prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
         self._by_few_features(query)
         for share, work_px in self._work_px(query).items():
             with query.scheduler.costed(("sift", share), work_px):

@@ -25,7 +25,7 @@ _log = logging.getLogger("scenematch")
 _JOIN_S = 5.0  # that closing waits for abandoned workers; one that hangs for good is left behind
 _MAX_MS = 60_000.0  # of any wait in flight
 _MAX_DOUBLINGS = 10  # how often the time to create a navigator is doubled at most
-_LOOK_S = 0.02  # how often a clock of another speed is read while a frame is due
+_LOOK_S = 0.02  # how often a clock of another speed is read while something is due
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +83,7 @@ class _Job:
     frame: Frame
     prior: Prior | None
     captured_ns: int
-    submitted_s: float  # on time.monotonic, as a worker that hangs does so on this machine's time
+    submitted_ns: int  # on the machine's clock, as a worker that hangs does so on this machine's time
     answered: bool = False
 
 
@@ -97,6 +97,7 @@ class Live:
         start: where the flight begins.
         options: settings.
         clock_ns: on which frames are captured and grow old, such as a simulator's; None is ``time.monotonic_ns``.
+        machine_ns: by which a worker hangs; None is the same.
 
     Raises:
         OptionError, BackendError: real time was asked for, and the system is not Linux or does not permit it.
@@ -113,9 +114,11 @@ class Live:
         start: Prior | None = None,
         options: LiveOptions | None = None,
         clock_ns: Callable[[], int] | None = None,
+        machine_ns: Callable[[], int] | None = None,
     ) -> None:
         self._make_navigator, self._deliver = make_navigator, deliver
         self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
+        self._machine_ns = machine_ns or time.monotonic_ns
         self._last: tuple[Fix, int] | None = None
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
@@ -148,7 +151,7 @@ class Live:
         Raises:
             StateError: the pipeline was closed.
         """
-        job = _Job(frame, prior, self._clock_ns() if captured_ns is None else captured_ns, time.monotonic())
+        job = _Job(frame, prior, self._clock_ns() if captured_ns is None else captured_ns, self._machine_ns())
         with self._changed:
             if self._closed:
                 raise StateError("submit: expected an open pipeline, got one that was closed")
@@ -257,7 +260,7 @@ class Live:
                 if not due and not hung:
                     left_ms = min([hangs_in_ms, *(self._options.deadline_ms - self._age_ms(job) for job in jobs)])
                     wait_s = max(left_ms, 0.0) * 1e-3 if math.isfinite(left_ms) else None
-                    if wait_s is not None and self._clock_ns is not time.monotonic_ns:
+                    if wait_s is not None and {self._clock_ns, self._machine_ns} != {time.monotonic_ns}:
                         wait_s = min(wait_s, _LOOK_S)
                     self._changed.wait(wait_s)
                     continue
@@ -270,12 +273,12 @@ class Live:
         """Time until the worker counts as hanging, in an answered frame or in creating its navigator."""
         deadline_ms, patience_ms = self._options.deadline_ms, self._options.patience_ms
         if self._creating_since_ns is not None:
-            creating_for_ms = (time.monotonic_ns() - self._creating_since_ns) * 1e-6
+            creating_for_ms = (self._machine_ns() - self._creating_since_ns) * 1e-6
             # A creation that is only slow would never finish if each attempt got the same time.
             return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_creations, _MAX_DOUBLINGS) - creating_for_ms
         if self._working is None or not self._working.answered:
             return math.inf
-        return deadline_ms + patience_ms - (time.monotonic() - self._working.submitted_s) * 1e3
+        return deadline_ms + patience_ms - (self._machine_ns() - self._working.submitted_ns) * 1e-6
 
     def _answer(self, job: _Job, result: Result) -> None:
         """Deliver one answer a frame; a fix that came too late becomes a refusal."""
@@ -304,7 +307,7 @@ class Live:
             if self._closed:
                 return
             self._hung_creations += self._creating_since_ns is not None
-            self._creating_since_ns = time.monotonic_ns()
+            self._creating_since_ns = self._machine_ns()
             self._number += 1
             self._count("workers_replaced")
         self._start_thread(self._work, None, number + 1)

@@ -1,1 +1,4 @@
-"""The steps of SIFT, as tensor ops and as compiled loops: scale space, keypoints, descriptors, matching."""
+"""SIFT: compiled loops for the CPU, kornia's tensor ops for any device, and matching."""
+
+BACKENDS = ("auto", "compiled", "kornia")
+"""How features are found; "auto" takes the compiled loops on the CPU, else kornia."""

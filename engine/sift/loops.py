@@ -1,4 +1,4 @@
-"""SIFT on the CPU: compiled loops over one picture at a time, which find what the tensor ops find.
+"""SIFT on the CPU: compiled loops over one picture at a time, whose scale space fits into the cache.
 
 Keypoints are rows (K, 6) float32 in the pixels of their octave: x, y, sigma over that of the octave's first level,
 contrast, level, octave.
@@ -13,19 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.sift_descriptors import angles, descriptors
+from engine.kernels import sift_descriptors
 from engine.kernels.sift_extrema import TAPS, find_extrema
 from engine.kernels.sift_refinement import refine_extrema
 from engine.kernels.sift_selection import spread_out
 from engine.runtime import threads
+from engine.runtime.tensors import Tensor, torch
 from engine.sift.descriptors import CELL_SAMPLES, CELL_SIGMAS, ORIENT_STEP, orientation_weights, tents
-from engine.sift.keypoints import BORDER, EARLY, EDGE_RATIO, MAX_SHIFT, MOVES
-from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
+from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
+from engine.sift.values import Features, SiftChoice
 
 AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
 Filters = tuple[Floats, NDArray[np.int64], Floats]
 
+_BORDER = 4  # octave pixels along the edge without keypoints
+_EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
+_MOVES = 2  # times that a keypoint may move to a neighbouring voxel
+_MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 _PART_PX = 60_000  # pixels of an octave per thread, below which another thread does not pay
 _POINTS_PER_THREAD = 150
 _X, _Y, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
@@ -65,7 +70,7 @@ def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
         width: of the picture.
         upsample: 1 or 2.
     """
-    octaves = octaves_of(height, width, 1, upsample)
+    octaves = octaves_of(height, width, upsample)
     filtered = []
     for octave in octaves:
         down, across = (filters_of(octave, length) for length in octave.source)
@@ -116,6 +121,45 @@ def _weights(sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> tupl
     return weights.astype(np.float32), below
 
 
+def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Features:
+    """The strongest features of pictures, one at a time.
+
+    Args:
+        images: (B, H, W) float32 on the CPU.
+        mask: (B, 1, H, W) bool, True where keypoints are allowed; None is everywhere.
+        choice: what is kept and described.
+
+    Returns:
+        Features on the CPU.
+    """
+    slots = [np.zeros((len(images), choice.max_keypoints, *shape), np.float32) for shape in ((2,), (), (), (128,))]
+    valid = np.zeros((len(images), choice.max_keypoints), np.bool_)
+    pictures, allowed = images.detach().contiguous().numpy(), None if mask is None else mask.numpy()
+
+    def work(image: int) -> None:
+        found = _of_picture(pictures[image], None if allowed is None else allowed[image, 0], choice)
+        valid[image, : len(found[0])] = True
+        for slot, values in zip(slots, found, strict=True):
+            slot[image, : len(values)] = values
+
+    threads.in_parallel(work, range(len(images)))
+    return Features(*map(torch.from_numpy, (*slots, valid)))
+
+
+def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, choice: SiftChoice) -> tuple[Floats, ...]:
+    """Positions, scales, angles in degrees and descriptors of the keypoints of one picture (H, W)."""
+    plan = plan_loops(*image.shape, choice.upsample)
+    gaussians, keypoints = detect(image, plan, choice.contrast_threshold)
+    keypoints = strongest(keypoints, plan, mask, choice.max_keypoints, choice.spread)
+    if choice.up_rad is None:
+        angle_rad = dominant_angle(gaussians, keypoints, plan)
+    else:
+        angle_rad = np.full(len(keypoints), choice.up_rad, np.float32)
+    descriptors = describe(gaussians, keypoints, angle_rad, plan, root=choice.root)
+    angle_deg = np.remainder(np.rad2deg(angle_rad), np.float32(360))
+    return xy_px(keypoints, plan), scale_px(keypoints), angle_deg, descriptors
+
+
 def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Floats, Floats]:
     """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges.
 
@@ -129,25 +173,28 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     """
     buffer, found, source = _buffer(plan.size), [], image
     threshold = contrast_threshold / SCALES
-    limits = (SCALES, MOVES, threshold, MAX_SHIFT, EDGE_RATIO)
+    limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, EDGE_RATIO)
     for number, (octave, across, down) in enumerate(plan.octaves):
         layout = octave.layout
-        early = np.float32(EARLY * threshold)
+        early = np.float32(_EARLY * threshold)
         voxels = _in_parts(
-            lambda part: find_extrema(source, across, down, buffer, layout, part, BORDER, early),  # noqa: B023
+            lambda part: find_extrema(source, across, down, buffer, layout, part, _BORDER, early),  # noqa: B023
             threads.parts(octave.height, octave.height * octave.width // _PART_PX),
         )
         found.append(refine_extrema(buffer, layout, voxels, limits, number))
         start = octave.offset + SCALES * octave.per_level
-        level = buffer[start : start + octave.per_level].reshape(-1, octave.shape[3])
-        source = np.ascontiguousarray(level[: octave.height : 2, : octave.width : 2])
+        level = buffer[start : start + octave.per_level].reshape(octave.height, octave.width)
+        source = np.ascontiguousarray(level[::2, ::2])
     return buffer, np.concatenate(found)
 
 
 def strongest(
     keypoints: Floats, plan: LoopPlan, mask: NDArray[np.bool_] | None, max_keypoints: int, spread: int
 ) -> Floats:
-    """The keypoints to keep by precedence, as :func:`engine.sift.keypoints.strongest` ranks them.
+    """The keypoints to keep by precedence.
+
+    Strength is contrast times the root of scale, since of two keypoints of equal contrast the coarser is detected
+    more reliably.
 
     Args:
         keypoints: (K, 6).
@@ -191,7 +238,7 @@ def dominant_angle(gaussians: Floats, keypoints: Floats, plan: LoopPlan) -> Floa
     window, smooth = orientation_weights()
     step = np.float32(ORIENT_STEP) * plan.first_sigma
     return _in_parts(
-        lambda part: angles(gaussians, plan.table, keypoints[slice(*part)], step, window, smooth),
+        lambda part: sift_descriptors.angles(gaussians, plan.table, keypoints[slice(*part)], step, window, smooth),
         threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
     )
 
@@ -211,7 +258,7 @@ def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: Loop
     """
     step = np.float32(CELL_SIGMAS / CELL_SAMPLES) * plan.first_sigma
     return _in_parts(
-        lambda part: descriptors(
+        lambda part: sift_descriptors.descriptors(
             gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], step, tents(), root
         ),
         threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),

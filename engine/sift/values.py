@@ -4,8 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from engine.errors import require
 from engine.runtime.tensors import Tensor, torch
+
+
+@dataclass(frozen=True, slots=True)
+class SiftChoice:
+    """What of a picture is kept and how it is described; see :func:`engine.features.sift`.
+
+    Attributes:
+        max_keypoints: number of slots.
+        up_rad: angle of upright features, None the dominant gradient's.
+        upsample: samples per pixel of the first octave.
+        contrast_threshold: Lowe's.
+        root: RootSIFT.
+        spread: cells along each side of a picture.
+    """
+
+    max_keypoints: int
+    up_rad: float | None
+    upsample: int
+    contrast_threshold: float
+    root: bool
+    spread: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +58,14 @@ class Features:
         Returns:
             (B, N, 2, 3) affine matrices.
 
-        Raises:
-            MissingExtraError: kornia is not installed.
-
         Convention:
             The first two columns are the images of the patch's x and y axes, the third is the centre.
             kornia's own angles turn the other way, so ``kornia.feature.get_laf_orientation`` gives -angle_deg.
         """
-        kornia_feature = require("kornia.feature", "learned")
+        from kornia.feature import laf_from_center_scale_ori  # takes a second
+
         scale = (magnification * self.scale_px)[..., None, None]
-        lafs: Tensor = kornia_feature.laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
+        lafs: Tensor = laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
         return lafs
 
 

@@ -1,4 +1,4 @@
-"""The ROS 2 node of the bridge, by rclpy. On loopback, unless the environment sets otherwise."""
+"""The ROS 2 node of the bridge, by rclpy. Discovery stays on this machine unless the environment sets it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import array
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
-from engine.errors import BackendError
+from engine.errors import BackendError, OptionError
 from scenematch.bridges.ros import OUTPUTS, Handler, find_class
 from scenematch.files.ros.messages import MessageFactory
 
 __all__ = ["Node"]
-
-_LOOPBACK = {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}  # up to Humble; from Iron on
 
 
 class Node:
@@ -26,19 +25,31 @@ class Node:
 
     Raises:
         BackendError: rclpy is not installed.
+        OptionError: the arguments are none of ROS.
     """
 
     def __init__(self, name: str, arguments: Sequence[str] = ()) -> None:
-        if not any(variable in os.environ for variable in _LOOPBACK):
-            os.environ.update(_LOOPBACK)
+        if "ROS_LOCALHOST_ONLY" not in os.environ:  # deprecated, but it takes precedence
+            os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         try:
             import rclpy
+            from rcl_interfaces.msg import ParameterDescriptor
+            from rclpy.exceptions import NameValidationException
+            from rclpy.executors import ExternalShutdownException
             from rclpy.qos import qos_profile_sensor_data
+            from rclpy.signals import SignalHandlerOptions
         except ImportError as error:
             raise BackendError(f"bridge: expected rclpy to be importable (see docs/ros.md): {error}") from None
-        rclpy.init(args=list(arguments))
+        try:
+            # rclpy's own handlers would end its context in another thread, while this one publishes by it.
+            rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+            self._node = rclpy.create_node(name)
+        except RuntimeError as error:  # rclpy's errors are
+            reason = str(error).splitlines()[0]
+            raise OptionError(f"ros_arguments: expected arguments of ROS 2, got {reason}") from None
         self._rclpy, self._qos = rclpy, qos_profile_sensor_data
-        self._node = rclpy.create_node(name)
+        self._shutdown_error, self._name_error = ExternalShutdownException, NameValidationException
+        self._any_type = ParameterDescriptor(dynamic_typing=True)
         self.messages = MessageFactory(
             find_class,
             False,
@@ -51,8 +62,18 @@ class Node:
         }
 
     def parameter(self, name: str, default: Any) -> Any:
-        """The value of a ROS parameter of the default's type."""
-        return self._node.declare_parameter(name, default).value
+        """The value of a ROS parameter of the default's type; YAML makes integers of some numbers and texts.
+
+        Raises:
+            OptionError: it is of another type.
+        """
+        value, kind = self._node.declare_parameter(name, default, self._any_type).value, type(default)
+        if type(value) is kind:
+            return value
+        if type(value) in (int, float) and kind in (float, str):
+            return kind(value)
+        expected = {str: "text", float: "a number", int: "a whole number"}[kind]
+        raise OptionError(f"{name}: expected {expected}, got {value!r}")
 
     def now_ns(self) -> int:
         """ROS time in nanoseconds, simulated where the node is so configured."""
@@ -61,10 +82,13 @@ class Node:
     def wait_for(self, topic: str, msgtype: str, timeout_s: float) -> Any:
         """Wait for the next message of a topic; None after the timeout."""
         received: list[Any] = []
-        subscription = self._node.create_subscription(find_class(msgtype), topic, received.append, self._qos)
+        subscription = self._subscribe(topic, msgtype, received.append)
         end_s = time.monotonic() + timeout_s
-        while not received and self._rclpy.ok() and time.monotonic() < end_s:
-            self._rclpy.spin_once(self._node, timeout_sec=0.2)
+        while not received and time.monotonic() < end_s:
+            try:
+                self._rclpy.spin_once(self._node, timeout_sec=0.2)
+            except self._shutdown_error:
+                raise KeyboardInterrupt from None  # ended from outside, not timed out
         self._node.destroy_subscription(subscription)
         return received[0] if received else None
 
@@ -82,14 +106,21 @@ class Node:
     ) -> None:
         """Subscribe, and call ``every_second`` once a second until shutdown or for ``seconds``."""
         for topic, (msgtype, handler) in handlers.items():
-            # Best effort with a short queue also hears reliable publishers, and never waits for old messages.
-            self._node.create_subscription(find_class(msgtype), topic, handler, self._qos)
+            self._subscribe(topic, msgtype, handler)
         begin_s = called_s = time.monotonic()
-        while self._rclpy.ok() and (seconds is None or time.monotonic() - begin_s < seconds):
-            self._rclpy.spin_once(self._node, timeout_sec=0.2)
-            if time.monotonic() - called_s >= 1.0:
-                called_s = time.monotonic()
-                every_second()
+        with suppress(self._shutdown_error):
+            while seconds is None or time.monotonic() - begin_s < seconds:
+                self._rclpy.spin_once(self._node, timeout_sec=0.2)
+                if time.monotonic() - called_s >= 1.0:
+                    called_s = time.monotonic()
+                    every_second()
+
+    def _subscribe(self, topic: str, msgtype: str, handler: Handler) -> Any:
+        """Best effort with a short queue also hears reliable publishers, and never waits for old messages."""
+        try:
+            return self._node.create_subscription(find_class(msgtype), topic, handler, self._qos)
+        except self._name_error:
+            raise OptionError(f"topic: expected a name that ROS 2 permits, got {topic!r}") from None
 
 
 def _topic(output: str) -> str:

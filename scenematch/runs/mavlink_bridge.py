@@ -217,12 +217,12 @@ def run_mavlink_bridge(
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map).absolute()) if resumes else None
     )
+    end_on_sigterm()  # before there is a worker, which has it from its first instruction on
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
     start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
 
-    end_on_sigterm()
     # Before the link: an autopilot on the bench takes off when the bridge listens.
     pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
     with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_brid
 from scenematch.runs.mavlink_bridge import BridgeSettings
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
+from scenematch.runs.supervisor import end_on_sigterm
 
 _CAMERA_INFO_TIMEOUT_S = 30.0
 
@@ -102,7 +104,7 @@ def run_ros_bridge(
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     progress: Progress = SILENT,
 ) -> RosStatus:
-    """Run the node until ROS or the time ends it.
+    """Run the node until ROS, Ctrl-C, SIGTERM or the time ends it.
 
     Args:
         ros: what is heard and published.
@@ -119,6 +121,7 @@ def run_ros_bridge(
         OptionError, MapError, CalibrationError: an argument or a file is not as expected.
     """
     live_view.check()
+    end_on_sigterm()  # before rospy, which calls this handler, too
     settings = settings or BridgeSettings()
     start, options = parse_position("start", settings.start), ros.options()
     site = open_map(
@@ -140,7 +143,7 @@ def run_ros_bridge(
             if settings.realtime is not None:  # this thread, too, may hold Python's lock
                 set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
             report = status_reporter(lambda: bridge.status.line(), progress)
-            with running_service() as beat:
+            with running_service() as beat, suppress(KeyboardInterrupt):  # the usual end, with its counts
 
                 def every_second() -> None:
                     bridge.check_input()

@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 from engine.errors import OptionError
@@ -17,6 +18,7 @@ from scenematch.runs.progress import SILENT, Progress
 
 _PAUSE_S, _MAX_PAUSE_S = 0.05, 5.0  # before a worker is replaced; doubled where one after the other dies at once
 _SHORT_S = 5.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def check_supervision(device: Any) -> None:
@@ -41,13 +43,15 @@ def become_worker(progress: Progress = SILENT) -> None:
     reading, writing = os.pipe()  # its end is that of this process
     while True:
         begin = time.monotonic()
+        waiting = _Waiting()
         worker = os.fork()
         if worker == 0:
             os.close(writing)
             _die_with_the_writer_of(reading)
+            waiting.end()
             return
-        code, is_told = _wait(worker)
-        if code >= 0 or is_told:
+        code = waiting.for_end_of(worker)
+        if code >= 0 or waiting.is_told:
             os._exit(max(code, 0))
         pause_s = min(2.0 * pause_s, _MAX_PAUSE_S) if time.monotonic() - begin < _SHORT_S else _PAUSE_S
         progress.message(f"the worker was ended by signal {-code}; another takes over")
@@ -64,20 +68,44 @@ def _die_with_the_writer_of(pipe: int) -> None:
     threading.Thread(target=watch, name="scenematch-supervised", daemon=True).start()
 
 
-def _wait(worker: int) -> tuple[int, bool]:
-    """The exit code of a worker, below 0 the signal that killed it, and whether it was asked to end."""
-    asked = []
+class _Waiting:
+    """What signals do while a worker is waited for; it begins before the fork, so that none is lost in between.
 
-    def pass_on(number: int, _frame: object) -> None:
-        asked.append(number)
-        os.kill(worker, number)
+    They are blocked until the parent knows its worker, and the worker has its own handlers back.
+    """
 
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN), signal.signal(signal.SIGTERM, pass_on)
-    try:
-        return os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]), bool(asked)
-    finally:
-        signal.signal(signal.SIGINT, before[0])
-        signal.signal(signal.SIGTERM, before[1])
+    def __init__(self) -> None:
+        self.is_told = False  # to end
+        self._worker, self._is_passed_on = 0, False
+        self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+        self._handlers = {number: signal.signal(number, self._receive) for number in _SIGNALS}
+
+    def for_end_of(self, worker: int) -> int:
+        """Its exit code, below 0 the signal that killed it."""
+        self._worker = worker
+        self._pass_on()  # another thread may have taken a signal already
+        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
+        code = os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1])
+        self._worker = 0  # the number may become another process's
+        self.end()
+        return code
+
+    def end(self) -> None:
+        """Let signals do what they did before."""
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
+
+    def _receive(self, number: int, _frame: object) -> None:
+        if number == signal.SIGTERM:
+            self.is_told = True
+            self._pass_on()
+
+    def _pass_on(self) -> None:
+        if self.is_told and self._worker and not self._is_passed_on:
+            self._is_passed_on = True
+            with suppress(ProcessLookupError):  # it ended meanwhile
+                os.kill(self._worker, signal.SIGTERM)
 
 
 def end_on_sigterm() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import contextlib
 import math
+import signal
 import sys
 import threading
 import time
@@ -16,6 +17,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.navigation.live import LiveOptions
@@ -29,7 +31,6 @@ from scenematch.cli.argument_names import ros_arguments_last
 from scenematch.files.ros.messages import (
     NO_POSITION,
     ODOMETRY_TYPES,
-    MessageFactory,
     attitude_from_message,
     body_velocity_from_message,
     camera_from_message,
@@ -48,7 +49,7 @@ NOW_NS = 1_700_000_000_123_456_789
 
 
 def maker_of(name):
-    return MessageFactory(STORES[name].types.__getitem__, name == "ros1")
+    return BagMessages(STORES[name].types.__getitem__, name == "ros1")
 
 
 def wired(name, message):
@@ -788,18 +789,33 @@ def packages(monkeypatch):
         monkeypatch.delenv(variable)
 
 
-class Rclpy(ModuleType):
-    """As much of rclpy as the node uses: what is subscribed to is delivered once when it is spun."""
+class ShutdownError(Exception):
+    """As rclpy's ExternalShutdownException, which no other of its exceptions is an ancestor of."""
 
-    def __init__(self, messages):
+
+class NameValidationError(Exception):
+    """As rclpy's NameValidationException."""
+
+
+class Rclpy(ModuleType):
+    """As much of rclpy as the node uses: what is subscribed to is delivered once when it is spun.
+
+    Like rclpy's executor it raises once its context was shut down, here after some turns.
+    """
+
+    def __init__(self, messages, given=None, ends=ShutdownError):
         super().__init__("rclpy")
         self.messages, self.published, self.subscribed, self.turns = messages, {}, {}, 0
+        self.given, self.ends = given or {}, ends
 
-    def init(self, args):
-        self.arguments = args
+    def init(self, args, signal_handler_options):
+        if "wrong" in args:
+            raise RuntimeError("Failed to parse global arguments\nat rcl/arguments.c")
+        self.arguments, self.handles = args, signal_handler_options
 
-    def declare_parameter(self, name, default):
-        return SimpleNamespace(value={"method": "sift"}.get(name, default))
+    def declare_parameter(self, name, default, descriptor):
+        assert descriptor.dynamic_typing  # else an integer for a number with a point raises
+        return SimpleNamespace(value=self.given.get(name, default))
 
     def ok(self):
         return self.turns < 20
@@ -812,6 +828,8 @@ class Rclpy(ModuleType):
         return SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1, kind=kind)
 
     def create_subscription(self, kind, topic, handler, quality):
+        if " " in topic:
+            raise NameValidationError(topic)
         self.subscribed[topic] = handler
         return topic
 
@@ -823,31 +841,45 @@ class Rclpy(ModuleType):
 
     def spin_once(self, node, timeout_sec):
         self.turns += 1
+        if self.turns > 20:
+            raise self.ends
         for topic, handler in list(self.subscribed.items()):
             if topic in self.messages:
                 handler(self.messages.pop(topic))
         time.sleep(0.01)
 
 
-def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
+@pytest.fixture
+def rclpy_with(packages, monkeypatch):
+    def make(messages=(), **options):
+        rclpy = Rclpy(dict(messages), **options)
+        monkeypatch.setitem(sys.modules, "rclpy", rclpy)
+        for name, holds in {
+            "rclpy.qos": {"qos_profile_sensor_data": "best effort"},
+            "rclpy.exceptions": {"NameValidationException": NameValidationError},
+            "rclpy.executors": {"ExternalShutdownException": ShutdownError},
+            "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO="none")},
+            "rcl_interfaces.msg": {"ParameterDescriptor": SimpleNamespace},
+        }.items():
+            module = ModuleType(name)
+            vars(module).update(holds)
+            monkeypatch.setitem(sys.modules, name, module)
+        return rclpy
+
+    return make
+
+
+def test_the_ros2_node_hears_and_publishes_until_its_context_ends(rclpy_with, sim_site):
     maker, camera = maker_of("ros2"), Camera.from_fov(6, 4, 60.0)
-    rclpy = Rclpy({
+    rclpy = rclpy_with({
         RosTopics().camera_info: maker.camera_info(NOW_NS, "", camera),
         RosTopics().image: an_image(maker, NOW_NS),
     })  # fmt: skip
-    quality = ModuleType("rclpy.qos")
-    quality.qos_profile_sensor_data = "best effort"
-    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
-    monkeypatch.setitem(sys.modules, "rclpy.qos", quality)
     from scenematch.bridges import ros2
 
     node = ros2.Node("scenematch", ["--ros-args", "-r", "__ns:=/uav1"])
     assert rclpy.arguments == ["--ros-args", "-r", "__ns:=/uav1"]
-    assert (node.parameter("method", "auto"), node.parameter("start", "")) == ("sift", "")
-    assert (ros2.os.environ["ROS_LOCALHOST_ONLY"], ros2.os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]) == (
-        "1",
-        "LOCALHOST",
-    )
+    assert rclpy.handles == "none"
     stated = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
     assert np.array_equal(camera_from_message(stated).matrix, camera.matrix)
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
@@ -858,6 +890,67 @@ def test_the_ros2_node_hears_and_publishes(packages, monkeypatch, sim_site):
     }  # fmt: skip
     assert isinstance(rclpy.published["~/window"][0].data, array.array)
     assert rclpy.published["/diagnostics"][0].status[0].level == b"\x00"
+    with pytest.raises(KeyboardInterrupt):  # and not "got none within 30 s"
+        node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 5.0)
+
+
+def test_what_ros2_does_not_take_is_one_line(rclpy_with):
+    rclpy_with(given={"map_sigma_m": 3, "start": 48, "hfov_deg": "wide", "map": True, "threads": 1.5})
+    from scenematch.bridges import ros2
+
+    node = ros2.Node("scenematch")
+    assert repr(
+        [node.parameter("map_sigma_m", 0.0), node.parameter("start", ""), node.parameter("mount", "")]
+    ) == ("[3.0, '48', '']")
+    for name, default, stated in (
+        ("hfov_deg", 0.0, "hfov_deg: expected a number, got 'wide'"),
+        ("map", "", "map: expected text, got True"),
+        ("threads", 1, "threads: expected a whole number, got 1.5"),
+    ):
+        with pytest.raises(OptionError, match=f"^{stated}$"):
+            node.parameter(name, default)
+    with pytest.raises(OptionError, match=r"^topic: expected a name that ROS 2 permits, got 'a b'$"):
+        node.wait_for("a b", "sensor_msgs/msg/CameraInfo", 0.01)
+    with pytest.raises(OptionError, match=r"^ros_arguments: .* got Failed to parse global arguments$"):
+        ros2.Node("scenematch", ["wrong"])
+
+
+@pytest.mark.parametrize(
+    ("given", "becomes"),
+    [
+        ({}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}),
+        ({"ROS_LOCALHOST_ONLY": "0"}, {"ROS_LOCALHOST_ONLY": "0"}),
+    ],
+)
+def test_discovery_stays_here_unless_it_is_set(rclpy_with, monkeypatch, given, becomes):
+    rclpy_with()
+    from scenematch.bridges import ros2
+
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    ros2.Node("scenematch")
+    names = ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE")
+    assert {name: ros2.os.environ[name] for name in names if name in ros2.os.environ} == becomes
+
+
+@pytest.mark.parametrize("ends", [ShutdownError, KeyboardInterrupt])
+def test_a_run_that_is_ended_has_its_counts(rclpy_with, monkeypatch, tmp_path, ends):
+    """By Ctrl-C, by SIGTERM, which is made the same, or by a context that was shut down."""
+    from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
+    from scenematch.runs.simulation import write_flight
+    from scenematch.simulator import plan_flight
+
+    rclpy_with(ends=ends)
+    monkeypatch.setattr("engine.matching.matcher.SceneMatcher.warmup", lambda self, report: None)
+    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        settings = RosSettings(map=tmp_path / "map.tif", camera=tmp_path / "camera.yaml", version=2)
+        assert run_ros_bridge(settings).line() == "0 pictures; published 0; not published: nothing"
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class Rospy(ModuleType):

@@ -10,10 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine.kernels import eager, reference
 from engine.kernels import ncc as kernels
+from engine.kernels import reference, tensors
 
-KERNELS = {"dispatch": kernels.ncc_surface, "eager": eager.ncc_surface}
+KERNELS = {"dispatch": kernels.ncc_surface, "tensors": tensors.ncc_surface}
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}
 
 
@@ -131,4 +131,4 @@ def test_fast_length_is_the_next_number_without_prime_factors_above_five():
         return n == 1
 
     for n in range(1, 1200):
-        assert eager.fast_length(n) == next(m for m in range(n, 2 * n + 1) if smooth(m))
+        assert tensors.fast_length(n) == next(m for m in range(n, 2 * n + 1) if smooth(m))

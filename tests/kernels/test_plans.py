@@ -6,12 +6,12 @@ import math
 
 import torch
 
-from engine.kernels import eager
+from engine.kernels import tensors
 from engine.window import place_window, window_size_px
 
 
 def test_window_sides_from_64_to_1024_px_share_61_lengths():
-    lengths = {side: eager.fast_length(side) for side in range(64, 1025)}
+    lengths = {side: tensors.fast_length(side) for side in range(64, 1025)}
     assert len(set(lengths.values())) == 61
     assert max(length / side for side, length in lengths.items()) < 1.11  # what sharing costs
 
@@ -39,6 +39,6 @@ def test_a_flight_of_many_window_sizes_plans_few_transforms(monkeypatch):
     assert len(sizes) > 50
     template = torch.rand(1, 48, 40, generator=torch.Generator().manual_seed(0))
     for height, width in sizes:
-        products = eager.products(torch.zeros(height, width), template)
+        products = tensors.products(torch.zeros(height, width), template)
         assert products.shape == (1, height - 47, width - 39)
     assert len(plans) <= 24

@@ -159,9 +159,9 @@ def write_map(path, ground, gray):
     return path
 
 
-def prepared(path, upright=True):
+def prepared(path, upright=True, backend="auto"):
     site = OrthoMap.open(path)
-    marks = LandmarkMap(site, CPU)
+    marks = LandmarkMap(site, CPU, backend)
     marks.prepare([0])
     return table(marks.find(whole(site), 0, upright=upright))
 
@@ -235,6 +235,16 @@ def test_another_map_or_another_detector_has_another_file(stored, monkeypatch):
     monkeypatch.setattr(landmarks, "DETECTOR_VERSION", 999)
     prepared(stored[0])
     assert len({path.name for path in stored[1].iterdir()}) == len(more) + 2
+
+
+def test_a_file_says_by_which_backend_it_was_made(stored):
+    first = prepared(stored[0])
+    names = {path.name for path in stored[1].iterdir()}
+    other = prepared(stored[0], backend="kornia")
+    assert len({path.name for path in stored[1].iterdir()}) == 2 * len(names)
+    assert other.shape != first.shape or not np.array_equal(other, first)
+    np.testing.assert_array_equal(prepared(stored[0], backend="compiled"), first)  # which is auto's on a CPU
+    assert len({path.name for path in stored[1].iterdir()}) == 2 * len(names)
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(stored, tmp_path, monkeypatch):

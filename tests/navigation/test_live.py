@@ -58,6 +58,19 @@ class Sink:
             return list(self.answers)
 
 
+class Clock:
+    """Stands still until a test turns it."""
+
+    def __init__(self):
+        self.now_ns = 0
+
+    def __call__(self):
+        return self.now_ns
+
+    def advance(self, ms):
+        self.now_ns += round(ms * 1e6)
+
+
 def reasons(answers):
     return [a.result.reason if isinstance(a.result, NoFix) else "fix" for a in answers]
 
@@ -145,34 +158,38 @@ def test_the_navigator_is_given_what_is_left():
     assert answers[0].age_ms >= 3000
 
 
-@pytest.mark.slow
 def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
-    gate, sink, starts = threading.Event(), Sink(), []
+    clock, gate, begun, sink, starts = Clock(), threading.Event(), threading.Event(), Sink(), []
+
+    def hang():
+        begun.set()
+        gate.wait()
 
     def make(start):
         starts.append(start)
-        return Slow(0, {1: gate.wait} if len(starts) == 1 else {})
+        return Slow(0, {1: hang} if len(starts) == 1 else {})
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=1000, patience_ms=1000)) as live:
+    options = LiveOptions(deadline_ms=1000, patience_ms=500)
+    with Live(make, sink, options=options, clock_ns=clock, machine_ns=clock) as live:
         live.submit(frame(0))
         sink.wait_for(1)
         live.submit(frame(1))
+        assert begun.wait(60.0)
+        clock.advance(1000)
         sink.wait_for(2)
-        while live.counts.workers_replaced == 0:
-            time.sleep(0.005)
-        number = 2
-        while reasons(sink.answers)[-1] != "fix":  # until the new worker has begun
-            live.submit(frame(number))
-            sink.wait_for(number + 1)
-            number += 1
+        clock.advance(500)
+        wait_until(lambda: live.counts.workers_replaced)
+        live.submit(frame(2))
+        sink.wait_for(3)
         gate.set()  # the one that hung comes back, and is not heard
-        time.sleep(0.05)
-    assert reasons(sink.answers)[:2] == ["fix", Reason.LATE]
+        live.submit(frame(3))
+        sink.wait_for(4)
+    assert reasons(sink.answers) == ["fix", Reason.LATE, "fix", "fix"]
+    assert [a.age_ms for a in sink.answers] == [0.0, 1000.0, 0.0, 0.0]
     assert live.counts.workers_replaced == 1
     assert starts[0] is None
-    assert starts[1].east_m == 0.0
-    assert starts[1].sigma_m > 1.0
-    assert [a.frame.timestamp_ns for a in sink.answers] == list(range(number))
+    assert (starts[1].east_m, starts[1].sigma_m) == (0.0, 1.0 + 15.0 * 1.5)
+    assert [a.frame.timestamp_ns for a in sink.answers] == [0, 1, 2, 3]
 
 
 def test_a_worker_that_dies_is_replaced_and_its_frame_answered():
@@ -330,54 +347,63 @@ def test_nothing_is_waited_for_longer_than_a_minute(name):
         LiveOptions(**{name: 1e13})
 
 
-@pytest.mark.slow
 def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
     monkeypatch.setattr("engine.navigation.live._JOIN_S", 0.05)
-    gate, sink, starts = threading.Event(), Sink(), []
+    clock, gate, begun, sink, starts = Clock(), threading.Event(), threading.Event(), Sink(), []
+
+    def hang():
+        begun.set()
+        gate.wait()
 
     def make(start):
         starts.append(start)
-        return Slow(0, {0: gate.wait})
+        return Slow(0, {0: hang})
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=500, patience_ms=2000)) as live:
+    options = LiveOptions(deadline_ms=500, patience_ms=100)
+    with Live(make, sink, options=options, clock_ns=clock, machine_ns=clock) as live:
         live.submit(frame(0))
+        assert begun.wait(60.0)
+        clock.advance(500)
         assert reasons(sink.wait_for(1)) == [Reason.LATE]
-    time.sleep(2.5)
+    clock.advance(100)
+    wait_until(lambda: "scenematch-_watch" not in [thread.name for thread in threading.enumerate()])
     assert len(starts) == 1
     assert live.counts.workers_replaced == 0
     gate.set()
     wait_until(no_threads)
 
 
-@pytest.mark.slow
 def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
-    gate, sink, calls = threading.Event(), Sink(), []
+    clock, gate, sink, calls = Clock(), threading.Event(), Sink(), []
 
     def die():
         raise ZeroDivisionError
 
     def make(start):
-        calls.append(time.monotonic())
+        calls.append(clock() * 1e-6)
         if 1 < len(calls) < 4:
             gate.wait()
         return Slow(0, {0: die} if len(calls) == 1 else {})
 
-    with Live(make, sink, options=LiveOptions(deadline_ms=100, patience_ms=10)) as live:
+    options = LiveOptions(deadline_ms=100, patience_ms=10)
+    with Live(make, sink, options=options, clock_ns=clock, machine_ns=clock) as live:
         live.submit(frame(0))
-        answers, number = sink.wait_for(1), 1
-        while reasons(answers)[-1] != "fix":
-            assert number < 200, "it is waited for without end"
-            live.submit(frame(number))
-            answers, number = sink.wait_for(number + 1), number + 1
+        sink.wait_for(1)
+        wait_until(lambda: len(calls) == 2)
+        live.submit(frame(1))
+        clock.advance(100)
+        assert reasons(sink.wait_for(2))[-1] is Reason.LATE  # nothing waits for longer than its deadline
+        for made in (3, 4):
+            wait_until(lambda made=made: clock.advance(1) or len(calls) == made)
+        live.submit(frame(2))
+        sink.wait_for(3)
         gate.set()  # those that hung come back, and are not heard
-        live.submit(frame(number))
-        assert reasons(sink.wait_for(number + 1))[-1] == "fix"
-    assert set(reasons(answers)[1:-1]) == {Reason.LATE}  # nothing waits for longer than its deadline
-    assert len(calls) == 4
+        live.submit(frame(3))
+        assert reasons(sink.wait_for(4))[2:] == ["fix", "fix"]
     assert live.counts.workers_replaced == 3
     # A maker that is only slow comes through in the end: each is waited for twice as long as the one before.
-    assert calls[2] - calls[1] > 0.08
-    assert calls[3] - calls[2] > 0.18
+    assert calls[2] - calls[1] >= 110.0
+    assert calls[3] - calls[2] >= 220.0
 
 
 def test_options_are_checked():

@@ -15,10 +15,10 @@ SPEED_MPS = 7.0
 STEP_S = 0.1
 
 
-def fix(east_m, north_m=0.0):
+def fix(east_m, north_m=0.0, sigma_m=0.3):
     return Fix(
         timestamp_ns=1, lat_deg=0.0, lon_deg=0.0, east_m=east_m, north_m=north_m, up_m=None,
-        covariance_m2=np.diag([0.09, 0.09, 1e6]), attitude=None, score=0.9, method="ncc",
+        covariance_m2=np.diag([sigma_m**2, sigma_m**2, 1e6]), attitude=None, score=0.9, method="ncc",
         window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0),
     )  # fmt: skip
 
@@ -33,19 +33,19 @@ class Flight:
     def __init__(self, guard=None):
         self.guard, self.time_s, self.east_m = guard or TrackGuard(), 0.0, 0.0
 
-    def step(self, result, *, velocity=True):
-        """The next frame; a number is a fix so far from the truth."""
+    def step(self, result, *, velocity=True, off_mps=0.0):
+        """The next frame; its velocity is off to the west."""
         self.time_s += STEP_S
         self.east_m += SPEED_MPS * STEP_S
-        east_mps, north_mps = (SPEED_MPS, 0.0) if velocity else (None, None)
+        east_mps, north_mps = (SPEED_MPS - off_mps, 0.0) if velocity else (None, None)
         frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, east_mps, north_mps)
         self.guard.advance(frame, round(self.time_s * 1e9))
         trusted = self.guard.trusts(result(self.east_m))
         self.guard.has_fix |= trusted
         return trusted
 
-    def fly(self, seconds, result, *, velocity=True):
-        return [self.step(result, velocity=velocity) for _ in range(round(seconds / STEP_S))]
+    def fly(self, seconds, result, *, velocity=True, off_mps=0.0):
+        return [self.step(result, velocity=velocity, off_mps=off_mps) for _ in range(round(seconds / STEP_S))]
 
 
 def true(east_m):
@@ -54,6 +54,11 @@ def true(east_m):
 
 def shifted(east_m):
     return fix(east_m, 40.0)
+
+
+def noisy(east_m, flight, noise_m, sigma_m):
+    east, north = noise_m[round(flight.time_s / STEP_S) % len(noise_m)]
+    return fix(east_m + east, north, sigma_m)
 
 
 def covered(_):
@@ -124,22 +129,73 @@ def test_the_first_fix_must_agree_with_the_start_or_the_receiver():
     assert flight.step(true)
 
 
-def test_single_wrong_matches_are_no_dispute():
+@pytest.mark.parametrize("velocity", [True, False])
+def test_single_wrong_matches_are_held_back_and_no_dispute(velocity):
     flight = Flight()
-    flight.fly(5.0, true)
+    flight.fly(5.0, true, velocity=velocity)
     for _ in range(10):
-        assert not flight.step(shifted)
-        assert flight.step(true)
+        assert not flight.step(shifted, velocity=velocity)
+        assert flight.step(true, velocity=velocity)
 
 
-def test_one_wrong_fix_is_no_track():
-    """It agrees with a vague track, and what contradicts it afterwards is the truth."""
+@pytest.mark.parametrize("cover_s", [0.0, 10.0])
+def test_one_wrong_fix_is_no_track(cover_s):
+    """It agrees with a track that is vague or none, and what contradicts it afterwards is the truth."""
+    flight = Flight()
+    if cover_s:
+        flight.fly(5.0, true)
+        flight.fly(cover_s, covered, velocity=False)
+    assert flight.step(shifted)
+    answers = flight.fly(5.0, true)
+    assert answers[:2] == [False, False]
+    assert all(answers[2:])
+
+
+@pytest.mark.parametrize("good_s", [0.0, 3.0])
+@pytest.mark.parametrize("off_mps", [2.0, 3.0, 4.3, 8.0])
+def test_right_fixes_outweigh_a_stated_velocity_that_is_wrong(good_s, off_mps):
+    flight = Flight()
+    flight.fly(good_s, true)
+    assert sum(flight.fly(6.0, true, off_mps=off_mps)) >= 55
+
+
+@pytest.mark.parametrize("sigma_m", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("off_mps", [2.5, 4.3, 8.0])
+def test_an_outage_with_a_wrong_velocity_is_recovered_from(off_mps, sigma_m):
+    """By the fixes' own way it is wrong, and that explains how far off they are: 43 m by 4.3 m/s in 10 s."""
+    noise_m = np.random.default_rng(1).normal(0.0, sigma_m, (200, 2))
+    flight = Flight()
+    flight.fly(3.0, true)
+    flight.fly(10.0, covered, off_mps=off_mps)
+    answers = flight.fly(10.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m), off_mps=off_mps)
+    assert all(answers[30:])
+    assert all(flight.fly(5.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m)))  # it is right again
+
+
+@pytest.mark.parametrize("cover_s", [0.0, 5.0, 10.0])
+@pytest.mark.parametrize("sigma_m", [0.05, 1.0])
+def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_right(cover_s, sigma_m):
+    noise_m = np.random.default_rng(2).normal((0.0, 40.0), sigma_m, (400, 2))
     flight = Flight()
     flight.fly(5.0, true)
-    flight.guard._track.append(
-        replace(flight.guard._track[-1], estimate=PositionEstimate(np.array([0.0, 99.0]), 0.3))
-    )
-    assert all(flight.fly(5.0, true))
+    flight.fly(cover_s, covered, off_mps=0.5)
+    assert not any(flight.fly(20.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m), off_mps=0.5))
+
+
+def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_known_to_be_wrong():
+    flight = Flight()
+    assert all(flight.fly(5.0, true, off_mps=4.3))
+    assert not any(flight.fly(20.0, shifted, off_mps=4.3))
+    assert not any(flight.fly(20.0, shifted, off_mps=8.0))
+
+
+def test_a_jump_of_three_frames_is_not_sent_and_forgotten():
+    flight = Flight()
+    flight.fly(5.0, true)
+    assert not any(flight.fly(0.3, lambda east_m: fix(east_m + 30.0)))
+    answers = flight.fly(1.0, true)
+    assert not any(answers[:2])
+    assert all(answers[2:])
 
 
 @pytest.mark.parametrize(("sigma_mps", "contradicts"), [(None, True), (0.1, True), (5.0, False)])

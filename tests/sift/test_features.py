@@ -7,13 +7,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kornia import feature as kornia_feature
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.features import Features, match, plans_created, prepare_plans, sift
+from engine.features import Features, chosen_backend, match, plans_created, prepare_plans, sift
 from engine.sift import loops
-from engine.sift.descriptors import _orient, normalise
 
 LEVEL_RATIO = 2 ** (1 / 3)
+
+
+@pytest.fixture(params=["compiled", "kornia"])
+def backend(request):
+    return request.param
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -72,8 +77,10 @@ def valid(features: Features, name: str, element: int = 0) -> np.ndarray:
 @pytest.mark.parametrize(("upsample", "tolerance_px"), [(1.0, 0.35), (2.0, 0.05)])
 @pytest.mark.parametrize("sigma", [2.3, 3.1, 4.6])
 @pytest.mark.parametrize("centre", [(31.0, 31.0), (30.25, 33.5), (32.7, 29.1), (31.5, 31.75)])
-def test_a_blob_lies_at_its_centre_and_has_its_scale(upsample, tolerance_px, sigma, centre):
-    found = sift(blob(*centre, sigma), upsample=upsample)
+def test_a_blob_lies_at_its_centre_and_has_its_scale(upsample, tolerance_px, sigma, centre, backend):
+    if backend == "kornia":  # it asks for a strict maximum, and a blob midway between two samples has two alike
+        centre = (centre[0] + 0.2, centre[1] - 0.2)
+    found = sift(blob(*centre, sigma), upsample=upsample, backend=backend)
     best = 0  # slots are ordered by contrast
     assert found.valid[0, best]
     error = found.xy_px[0, best].numpy() - centre
@@ -82,38 +89,40 @@ def test_a_blob_lies_at_its_centre_and_has_its_scale(upsample, tolerance_px, sig
     assert found.scale_px[0, best] == pytest.approx(scene / math.sqrt(LEVEL_RATIO), rel=0.05)
 
 
-def test_positions_have_no_bias():
+def test_positions_have_no_bias(backend):
     rng = np.random.default_rng(5)
     centres = rng.uniform(28, 36, (60, 2))
     images = torch.cat([blob(x, y, 3.0) for x, y in centres])
-    errors = sift(images, max_keypoints=1).xy_px[:, 0].numpy() - centres
+    errors = sift(images, max_keypoints=1, backend=backend).xy_px[:, 0].numpy() - centres
     assert np.abs(errors.mean(0)).max() < 0.004  # OpenCV's is 0.25
 
 
-def test_a_quarter_turn_of_the_image_turns_the_features():
+def test_a_quarter_turn_of_the_image_turns_the_features(backend):
     size = 129
     image = tensor(texture(size, size, 3))
-    plain = sift(image, spread=1)
-    turned = sift(torch.rot90(image, 1, (2, 3)), spread=1)  # (x, y) goes to (y, size - 1 - x)
+    plain = sift(image, spread=1, backend=backend)
+    turned = sift(torch.rot90(image, 1, (2, 3)), spread=1, backend=backend)  # (x, y) goes to (y, size - 1 - x)
     assert plain.valid.sum() > 60
     xy = plain.xy_px[0]
     expected = torch.stack([xy[:, 1], size - 1 - xy[:, 0]], 1)[plain.valid[0]]
     distance, nearest = torch.cdist(expected, turned.xy_px[0]).min(1)
     same = distance < 0.05
-    assert same.float().mean() > 0.97
+    assert same.float().mean() > {"compiled": 0.97, "kornia": 0.95}[backend]  # whose octaves end at even sizes
     turn = turned.angle_deg[0, nearest] - plain.angle_deg[0, plain.valid[0]] + 90
     assert ((turn + 180).remainder(360) - 180)[same].abs().quantile(0.9) < 2
     cosine = (turned.descriptors[0, nearest] * plain.descriptors[0, plain.valid[0]]).sum(1)
     assert cosine[same].median() > 0.999
 
 
-def test_the_angle_turns_from_x_towards_y():
+def test_the_angle_turns_from_x_towards_y(backend):
     v, u = np.mgrid[:64, :64]
     direction = math.radians(40)
     ramp = 0.02 * ((u - 32) * math.cos(direction) + (v - 32) * math.sin(direction))
-    found = sift(blob(32, 32, 3) * 0.3 + torch.from_numpy(ramp), max_keypoints=1)
+    found = sift(blob(32, 32, 3) * 0.3 + torch.from_numpy(ramp), max_keypoints=1, backend=backend)
     assert found.angle_deg[0, 0] == pytest.approx(40, abs=5)
-    assert sift(blob(32, 32, 3), upright=True).angle_deg.abs().max() == 0
+    assert sift(blob(32, 32, 3), upright=True, backend=backend).angle_deg.abs().max() == 0
+    turned = sift(blob(32, 32, 3), upright=True, up_deg=-30.0, max_keypoints=1, backend=backend)
+    assert turned.angle_deg[0, 0] == pytest.approx(330.0, abs=1e-3)
 
 
 def opencv_sift(image: np.ndarray, max_keypoints: int = 300) -> Features:
@@ -121,21 +130,22 @@ def opencv_sift(image: np.ndarray, max_keypoints: int = 300) -> Features:
     detector = cv2.SIFT_create(nfeatures=max_keypoints, contrastThreshold=0.02)
     keypoints, described = detector.detectAndCompute(image, None)
     slots = torch.tensor([(*k.pt, k.size / 2, k.angle % 360) for k in keypoints])[None, :max_keypoints]
-    descriptors = normalise(torch.from_numpy(described)[None, :max_keypoints], root=False)
+    descriptors = torch.nn.functional.normalize(torch.from_numpy(described)[None, :max_keypoints], dim=2)
     valid = torch.ones(slots.shape[:2], dtype=torch.bool)
     return Features(slots[..., :2], slots[..., 2], slots[..., 3], descriptors, valid)
 
 
-def test_position_scale_and_angle_agree_with_opencv():
+def test_position_scale_and_angle_agree_with_opencv(backend):
     image = texture(200, 240, 1)
     ours, theirs = (
-        sift(tensor(image), max_keypoints=600),
+        sift(tensor(image), max_keypoints=600, backend=backend),
         opencv_sift(image, max_keypoints=600),
     )
     distance = torch.cdist(ours.xy_px[0], theirs.xy_px[0] - 0.25)
     scales = (ours.scale_px[0, :, None] / theirs.scale_px[0].clamp_min(1e-3)).log2().abs()
     near = (distance < 0.5) & (scales < 0.2) & ours.valid[0][:, None] & theirs.valid[0]
-    assert near.any(1).sum() > 0.75 * ours.valid.sum()
+    # kornia leaves out what has not settled within half a voxel, and ranks weaker ones before the rest.
+    assert near.any(1).sum() > {"compiled": 0.75, "kornia": 0.7}[backend] * ours.valid.sum()
     turn = (ours.angle_deg[0, :, None] - theirs.angle_deg[0] + 180).remainder(360) - 180
     turn = turn.abs().masked_fill(~near, torch.inf).amin(1)[near.any(1)]
     assert turn.median() < 3
@@ -148,13 +158,13 @@ def test_position_scale_and_angle_agree_with_opencv():
 @pytest.mark.parametrize("shape", [(1, 1), (5, 40), (16, 16), (17, 23), (63, 500)])
 @pytest.mark.parametrize("content", ["flat", "texture", "nan", "infinite"])
 @pytest.mark.parametrize("upright", [False, True])
-def test_any_image_gives_finite_features(shape, content, upright):
+def test_any_image_gives_finite_features(shape, content, upright, backend):
     image = torch.full((2, 1, *shape), 0.5)
     if content != "flat":
         image[0] = tensor(texture(*shape))
     if content in ("nan", "infinite"):
         image[:, :, ::7, ::5] = float("nan" if content == "nan" else "inf")
-    found = sift(image, max_keypoints=20, upright=upright)
+    found = sift(image, max_keypoints=20, upright=upright, backend=backend)
     for name in ("xy_px", "scale_px", "angle_deg", "descriptors"):
         assert torch.isfinite(getattr(found, name)).all()
     assert found.descriptors.shape == (2, 20, 128)
@@ -162,8 +172,8 @@ def test_any_image_gives_finite_features(shape, content, upright):
         assert not found.valid.any()
 
 
-def test_invalid_slots_are_zero_and_valid_ones_of_unit_norm():
-    found = sift(tensor(texture(60, 60)), max_keypoints=500)
+def test_invalid_slots_are_zero_and_valid_ones_of_unit_norm(backend):
+    found = sift(tensor(texture(60, 60)), max_keypoints=500, backend=backend)
     assert 0 < found.valid.sum() < 500
     empty = ~found.valid
     assert found.xy_px[empty].abs().max() == found.descriptors[empty].abs().max() == 0
@@ -172,39 +182,42 @@ def test_invalid_slots_are_zero_and_valid_ones_of_unit_norm():
     assert (found.angle_deg < 360).all()
 
 
-def test_a_batch_is_its_images():
+def test_a_batch_is_its_images(backend):
     images = tensor(texture(90, 110, 1), texture(90, 110, 2), np.full((90, 110), 9, np.uint8))
-    together = sift(images, max_keypoints=50)
+    together = sift(images, max_keypoints=50, backend=backend)
     for i in range(3):
-        alone = sift(images[i : i + 1], max_keypoints=50)
+        alone = sift(images[i : i + 1], max_keypoints=50, backend=backend)
         assert torch.equal(alone.valid[0], together.valid[i])
         torch.testing.assert_close(alone.xy_px[0], together.xy_px[i], atol=1e-3, rtol=0)
         torch.testing.assert_close(alone.descriptors[0], together.descriptors[i], atol=1e-3, rtol=0)
 
 
-def test_repeats_are_equal():
+def test_repeats_are_equal(backend):
     image = tensor(texture(90, 110))
-    first, second = sift(image), sift(image)
+    first, second = sift(image, backend=backend), sift(image, backend=backend)
     assert torch.equal(first.descriptors, second.descriptors)
     assert torch.equal(first.xy_px, second.xy_px)
 
 
-def test_the_mask_holds_keypoints_back():
+def test_the_mask_holds_keypoints_back(backend):
     image = tensor(texture(120, 120))
     mask = torch.zeros_like(image, dtype=torch.bool)
     mask[..., 30:70, 50:100] = True
-    found = sift(image, mask=mask)
+    found = sift(image, mask=mask, backend=backend)
     xy = valid(found, "xy_px")
-    assert 5 < len(xy) < sift(image).valid.sum()
+    assert 5 < len(xy) < sift(image, backend=backend).valid.sum()
     assert (np.abs(xy - (74.5, 49.5)) <= (25, 20)).all()
 
 
-def test_spread_reaches_weak_texture():
+def test_spread_reaches_weak_texture(backend):
     strong, weak = texture(120, 60, 1), texture(120, 180, 2)
     image = np.hstack([strong, (weak.astype(np.float32) * 0.15 + 109).astype(np.uint8)])
     shares = [
         (
-            valid(sift(tensor(image), max_keypoints=60, spread=s, contrast_threshold=0.005), "xy_px")[:, 0] > 60
+            valid(
+                sift(tensor(image), max_keypoints=60, spread=s, contrast_threshold=0.005, backend=backend), "xy_px"
+            )[:, 0]
+            > 60
         ).mean()
         for s in (1, 6)
     ]
@@ -214,19 +227,10 @@ def test_spread_reaches_weak_texture():
 # What is described.
 
 
-def test_splitting_a_gradient_loses_nothing():
-    gx, gy = torch.randn(2, 1000, dtype=torch.float64)
-    weights = _orient(gx, gy) * math.sqrt(2)
-    angles = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
-    assert (weights >= 0).all()
-    assert ((weights > 1e-12).sum(0) <= 2).all()
-    torch.testing.assert_close(angles.cos() @ weights, gx)
-    torch.testing.assert_close(angles.sin() @ weights, gy)
-
-
-def test_light_does_not_change_descriptors():
+def test_light_does_not_change_descriptors(backend):
     image = tensor(texture(120, 120))
-    plain, dim = sift(image), sift(0.6 * image + 0.3, contrast_threshold=0.6 * 0.02)
+    plain = sift(image, backend=backend)
+    dim = sift(0.6 * image + 0.3, contrast_threshold=0.6 * 0.02, backend=backend)
     pairs = match(plain, dim).pairs()
     assert len(pairs) > 0.9 * plain.valid.sum()
     gap = (plain.xy_px[0, pairs[:, 0]] - dim.xy_px[0, pairs[:, 1]]).norm(dim=1)
@@ -250,13 +254,13 @@ def quality(
 
 
 @pytest.mark.slow
-def test_quality_is_opencvs():
+def test_quality_is_opencvs(backend):
     warps = [(0, 1.0, (3.3, -2.6)), (35, 1.0, (0, 0)), (-80, 1.25, (4, 1)), (160, 0.8, (0, 3)), (10, 0.7, (1, 1))]
     ours, theirs = [], []
     for seed in range(4):
         image = texture(180, 180, seed)
         for angle, scale, shift in warps:
-            ours.append(quality(lambda i: sift(tensor(i)), image, angle, scale, shift))
+            ours.append(quality(lambda i: sift(tensor(i), backend=backend), image, angle, scale, shift))
             theirs.append(quality(opencv_sift, image, angle, scale, shift))
     ratio = np.mean(ours, 0) / np.mean(theirs, 0)
     assert ratio[0] > 0.95  # repeatability
@@ -264,8 +268,47 @@ def test_quality_is_opencvs():
     assert ratio[2] > 0.85  # inliers; OpenCV gives a place several orientations
 
 
+def test_the_backends_find_and_describe_the_same():
+    """Orientations and cells are in one order: a descriptor of one matches its own of the other."""
+    image = tensor(texture(200, 240, 1))
+    for upright in (False, True):
+        one, other = (
+            sift(image, upright=upright, up_deg=20.0, max_keypoints=600, backend=name)
+            for name in ("compiled", "kornia")
+        )
+        distance = torch.cdist(one.xy_px[0], other.xy_px[0])
+        scales = (one.scale_px[0, :, None] / other.scale_px[0].clamp_min(1e-3)).log2().abs()
+        near = (distance < 0.3) & (scales < 0.1) & one.valid[0][:, None] & other.valid[0]
+        assert near.any(1).sum() > 0.8 * one.valid.sum()
+        first, second = near.nonzero().unbind(1)
+        turn = (one.angle_deg[0, first] - other.angle_deg[0, second] + 180).remainder(360) - 180
+        assert (turn.abs() < 5).float().mean() > 0.9
+        cosine = (one.descriptors[0, first] * other.descriptors[0, second]).sum(1)
+        assert cosine[turn.abs() < 5].median() > 0.98
+
+
+def test_edges_and_low_contrast_are_no_keypoints(backend):
+    """A straight edge under noise has extrema along it; the ratio of its curvatures tells them from blobs."""
+    step = np.where(np.arange(120) < 60, 60, 190)[None].repeat(120, 0).astype(np.float32)
+    noisy = step + np.random.default_rng(0).normal(0, 2, step.shape)
+    edge = cv2.GaussianBlur(np.clip(noisy, 0, 255).astype(np.float32), (0, 0), 1.5).astype(np.uint8)
+    assert sift(tensor(edge), backend=backend).valid.sum() == 0
+    weak = 0.5 + 0.01 * blob(32, 32, 3)  # a difference of Gaussians of about a sixth of its height
+    assert not sift(weak, contrast_threshold=0.02, backend=backend).valid.any()
+    assert sift(weak, contrast_threshold=0.001, backend=backend).valid.any()
+
+
+def test_auto_is_compiled_on_the_cpu_and_kornia_elsewhere():
+    image = tensor(texture(60, 60))
+    assert torch.equal(sift(image).descriptors, sift(image, backend="compiled").descriptors)
+    assert not torch.equal(sift(image).descriptors, sift(image, backend="kornia").descriptors)
+    cuda = torch.device("cuda")
+    assert chosen_backend("auto", cuda) == chosen_backend("kornia", cuda) == "kornia"
+    with pytest.raises(OptionError, match="backend: expected auto or kornia for images on cuda, got 'compiled'"):
+        chosen_backend("compiled", cuda)
+
+
 def test_lafs_are_kornias():
-    kornia_feature = pytest.importorskip("kornia.feature")
     found = sift(tensor(texture(90, 90)), max_keypoints=30)
     lafs, keep = found.lafs(), found.valid[0]
     torch.testing.assert_close(kornia_feature.get_laf_center(lafs), found.xy_px)
@@ -300,7 +343,6 @@ def pair() -> tuple[Features, Features]:
 
 @pytest.mark.parametrize("ratio", [0.8, 0.95])
 def test_matches_are_kornias(pair, ratio):
-    kornia_feature = pytest.importorskip("kornia.feature")
     query, train = pair
     ours = match(query, train, ratio=ratio, mutual=False)
     for b in range(2):
@@ -382,6 +424,12 @@ def test_known_rotation_and_scale_leave_out_contradictions():
         ),
         (torch.zeros(1, 1, 9, 9), {"max_keypoints": 0}, OptionError, "max_keypoints: expected at least 1, got 0"),
         (torch.zeros(1, 1, 9, 9), {"upsample": 3}, OptionError, "upsample: expected 1 or 2, got 3"),
+        (
+            torch.zeros(1, 1, 9, 9),
+            {"backend": "opencv"},
+            OptionError,
+            "backend: expected one of auto, compiled, kornia, got 'opencv'",
+        ),
         (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected 1 to 1000, got 0"),
         (torch.zeros(1, 1, 9, 9), {"contrast_threshold": -1}, OptionError, "contrast_threshold"),
         (
@@ -404,23 +452,23 @@ def test_a_wrong_ratio_is_named(pair):
         match(*pair, ratio=1.5)
 
 
-def test_a_picture_that_requires_a_gradient_has_the_same_features():
+def test_a_picture_that_requires_a_gradient_has_the_same_features(backend):
     image = torch.rand(1, 1, 60, 70, generator=torch.Generator().manual_seed(4))
-    expected, found = sift(image), sift(image.clone().requires_grad_())
+    expected, found = (sift(i, backend=backend) for i in (image, image.clone().requires_grad_()))
     assert torch.equal(found.descriptors, expected.descriptors)
 
 
 @pytest.mark.parametrize("value", [3e38, -3e38, torch.inf, -torch.inf, torch.nan])
-def test_pixels_of_absurd_values_spoil_nothing_else(value):
+def test_pixels_of_absurd_values_spoil_nothing_else(value, backend):
     image = torch.rand(1, 1, 90, 90, generator=torch.Generator().manual_seed(5))
     image[0, 0, 40, 40] = value
-    found = sift(image)
+    found = sift(image, backend=backend)
     assert all(values.isfinite().all() for values in (found.xy_px, found.angle_deg, found.descriptors))
 
 
 def test_after_preparation_no_rectangle_lacks_a_filter():
     """Of a camera of 1280 px: the sides of an orthophoto reach three times as far."""
-    prepare_plans(range(16, 3 * 1280 + 1, 16), torch.device("cpu"))
+    prepare_plans(range(16, 3 * 1280 + 1, 16))
     before = plans_created()
     for height, width in np.random.default_rng(6).integers(1, 241, (300, 2)) * 16:
         for upsample in (1, 2):

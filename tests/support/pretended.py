@@ -166,5 +166,16 @@ def pretended_device() -> Iterator[Crossings]:
     """The block in which tensors of :data:`DEVICE` can be made and used, and its record."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch, "inference_mode", torch.no_grad)  # which wrappers cannot follow; the values are equal
+        made = torch.tensor
+
+        def tensor(data: Any, *, device: Any = None, **kind: Any) -> Tensor:
+            there = made(data, **kind)  # torch itself would make one without values
+            return there if device is None else there.to(device)
+
+        def new_tensor(like: Tensor, data: Any, **kind: Any) -> Tensor:
+            return tensor(data, device=like.device, **({"dtype": like.dtype} | kind))
+
+        patch.setattr(torch, "tensor", tensor)
+        patch.setattr(Tensor, "new_tensor", new_tensor)
         with Crossings() as crossings:
             yield crossings

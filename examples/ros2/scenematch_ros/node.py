@@ -3,7 +3,7 @@
 import sys
 
 from engine import EngineError, OptionError, set_threads
-from scenematch import BridgeSettings, RosSettings, run_ros_bridge
+from scenematch import BridgeSettings, Progress, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import RosTopics
 from scenematch.bridges.ros2 import Node
 
@@ -11,6 +11,14 @@ FILES = ("map", "surface", "camera", "start", "origin", "mount")
 """Parameters of text; an empty one is not given."""
 TOPICS = RosTopics()
 TOPIC_NAMES = [name for name in RosTopics.__slots__ if name != "odometry_type"]
+
+
+class Printed(Progress):
+    """What the node does, a line each; ros2 launch shows them."""
+
+    def message(self, text):
+        """Print it at once, whatever standard output is."""
+        print(text, flush=True)
 
 
 def settings_of(node):
@@ -43,12 +51,14 @@ def settings_of(node):
 
 
 def main():
-    """Run until ROS ends it."""
+    """Run until ROS, Ctrl-C or SIGTERM ends it."""
     try:
         node = Node("scenematch", sys.argv)
         set_threads(node.parameter("threads", 1))
         ros, matching = settings_of(node)
-        print(run_ros_bridge(ros, matching, node=node))
+        print(run_ros_bridge(ros, matching, node=node, progress=Printed()).line(), flush=True)
+    except KeyboardInterrupt:  # while it was loading
+        print("ended before it began", flush=True)
     except EngineError as error:
         sys.exit(f"scenematch: {error}")
 

@@ -6,9 +6,11 @@ ArduPilot does it.
 
 import math
 import sys
+from contextlib import suppress
 
 import rclpy
 from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Float64
 
@@ -39,7 +41,8 @@ def main():
         height.publish(Float64(data=at.z))
 
     node.create_subscription(Odometry, "/truth/odometry", heard, 50)
-    rclpy.spin(node)
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
 
 
 if __name__ == "__main__":

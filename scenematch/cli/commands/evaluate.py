@@ -21,7 +21,7 @@ def evaluate(
 ) -> None:
     """Score a finished track against truth.
 
-    Prints the errors and rewrites the folder's summary.json and figures.
+    Prints the errors and rewrites the folder's summary.json and report.
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
     from scenematch.runs.evaluation import recorded_files

@@ -1,4 +1,4 @@
-"""NCC by OpenCV's transforms: every way through it against the reference in float64."""
+"""NCC in blocks on the CPU: every way through it against the reference in float64."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine.kernels import by_opencv, eager, reference
+from engine.kernels import blocks, reference, tensors
 from engine.ncc_fft import Search, ncc, prepare, surface
 from engine.runtime import threads as chosen
 
@@ -69,8 +69,8 @@ def test_blocks_are_the_window(seed, size, model, count, threads):
     search = rng.normal(0.0, 30.0, (1, *size)).astype(np.float32)
     templates = rng.normal(0.0, 30.0, (1, count, *model)).astype(np.float32)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(by_opencv, "_CACHED_SIDE", 32)
-        patch.setattr(by_opencv, "_division", by_opencv._division.__wrapped__)
+        patch.setattr(blocks, "_CACHED_SIDE", 32)
+        patch.setattr(blocks, "_division", blocks._division.__wrapped__)
         before = chosen.count()
         chosen.set_threads(threads)
         try:
@@ -85,8 +85,8 @@ def test_blocks_are_the_window(seed, size, model, count, threads):
 def test_weak_patches_beside_strong_ones(divided, count, monkeypatch):
     """A thousand times the contrast in one corner: float32 transforms would lose the rest."""
     if divided:
-        monkeypatch.setattr(by_opencv, "_CACHED_SIDE", 32)
-        monkeypatch.setattr(by_opencv, "_division", by_opencv._division.__wrapped__)
+        monkeypatch.setattr(blocks, "_CACHED_SIDE", 32)
+        monkeypatch.setattr(blocks, "_division", blocks._division.__wrapped__)
     rng = np.random.default_rng(7)
     search = rng.normal(0.0, 1.0, (1, 80, 90)).astype(np.float32)
     search[0, :20, :20] *= 1000.0
@@ -112,14 +112,14 @@ def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
     rng = np.random.default_rng(seed)
     image = torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))
     part, on_device = (
-        whole.crop(7, 3, 41, 37) for whole in (prepare(image), Search(image, sums=eager.integrals(image)))
+        whole.crop(7, 3, 41, 37) for whole in (prepare(image), Search(image, sums=tensors.integrals(image)))
     )
     assert part.sums is None  # they take four times the picture's memory
     templates = torch.from_numpy(rng.normal(0.0, 1.0, (2, *model)).astype(np.float32))
     centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    norms = eager.inverse_norm(on_device.sums, *model)
+    norms = tensors.inverse_norm(on_device.sums, *model)
     for count in (1, 2):
-        expected = eager.prepared_surface(on_device.image, norms, centred[:count])
+        expected = tensors.prepared_surface(on_device.image, norms, centred[:count])
         torch.testing.assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
 
 
@@ -141,6 +141,6 @@ def test_gradients_of_templates_come_from_the_tensor_ops():
 
 def test_large_windows_are_divided_into_blocks_that_cover_them():
     for count, model in [(33, 64), (1921, 128), (1537, 512), (9000, 200), (1, 1), (5, 3000)]:
-        blocks, side = by_opencv._division(count, model)
-        assert blocks * (side - model + 1) >= count > (blocks - 1) * (side - model + 1)
+        number, side = blocks._division(count, model)
+        assert number * (side - model + 1) >= count > (number - 1) * (side - model + 1)
         assert side % 2 == 0

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels import eager, ncc
+from engine.kernels import tensors
 from engine.runtime.tensors import Tensor, torch
 
 Array = NDArray[np.float64]
@@ -30,8 +30,8 @@ def summits(products: Tensor, inverse_norms: Tensor, *, exclusion_px: float) -> 
         (T, 28) float64: flat index, score, the rival's score, and the 5 x 5 scores about it, those on the border
         repeated beyond it.
     """
-    best, position = ncc.peak(products, inverse_norms)
-    second = ncc.rival(products, inverse_norms, position, math.floor(exclusion_px * exclusion_px))
+    best, position = tensors.peak(products, inverse_norms)
+    second = tensors.rival(products, inverse_norms, position, math.floor(exclusion_px * exclusion_px))
     count, height, width = products.shape
     near = torch.arange(-_REACH_PX, _REACH_PX + 1, device=position.device)
     rows = ((position // width)[:, None] + near).clamp_(0, height - 1)[:, :, None]
@@ -90,6 +90,6 @@ def match(images: Tensor, sums: Tensor, templates: Tensor, exclusion_px: float) 
     Returns:
         (B, 28) of :func:`summits`.
     """
-    inverse_norms = eager.inverse_norm(sums, *templates.shape[1:])
+    inverse_norms = tensors.inverse_norm(sums, *templates.shape[1:])
     centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    return summits(eager.products(images, centred), inverse_norms, exclusion_px=exclusion_px)
+    return summits(tensors.products(images, centred), inverse_norms, exclusion_px=exclusion_px)

@@ -10,15 +10,9 @@ import math
 
 from engine.errors import OptionError
 from engine.kernels import sums
-from engine.kernels.transform_sizes import FLOAT32_NORM_RATIO, fast_length
+from engine.kernels.transform_sizes import FLAT_SHARE, FLOAT32_NORM_RATIO, fast_length
 from engine.runtime.tensors import Tensor, torch
 
-# A patch is flat where its sum of squares is below this share of the window's, which is rounding.
-_FLAT_SHARE = 1e-12
-# Windows of more pixels than this are processed in blocks where the templates are much smaller.
-_MIN_BLOCKED_PX = 1 << 21
-# Least side of these blocks.
-_MIN_BLOCK_PX = 256
 # Lower bound on a template's norm; a template of zeros scores 0.
 _TINY = 1e-12
 # Upper bound on the numbers in the product spectra of a group of templates, which bounds the memory.
@@ -64,7 +58,7 @@ def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
     sums = integrals(search)
     energy = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w)
     window_energy = sums[1, -1, -1]
-    energy.masked_fill_(energy <= _FLAT_SHARE * window_energy, torch.inf)
+    energy.masked_fill_(energy <= FLAT_SHARE * window_energy, torch.inf)
     work = torch.float32 if _suits_float32(search, window_energy, energy) else torch.float64
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
     normal = (templates / norm.clamp_min(_TINY)).to(work)  # a flat template is all zeros, and scores 0 everywhere
@@ -157,15 +151,12 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
         (..., H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
     energy, squares = box_energy(sums, h, w), sums[..., 1, :, :]
-    floor = _FLAT_SHARE * (squares[..., -1:, -1:] - squares[..., :1, :1])  # no less than the window's own energy
+    floor = FLAT_SHARE * (squares[..., -1:, -1:] - squares[..., :1, :1])  # no less than the window's own energy
     return energy.masked_fill_(energy <= floor, torch.inf).float().rsqrt_()
 
 
 def correlate(search: Tensor, templates: Tensor) -> Tensor:
     """Cross-correlation by the correlation theorem.
-
-    A window much larger than the templates is processed in overlapping blocks (overlap-save), whose transforms fit
-    into the cache.
 
     Args:
         search: (H, W) floating point, or (T, H, W) where every template has its own.
@@ -175,11 +166,6 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
         (T, H-h+1, W-w+1) sums of products.
     """
     (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
-    block = fast_length(max(_MIN_BLOCK_PX, 3 * max(h, w)))
-    if max(_MIN_BLOCKED_PX, 2 * block * block) < H * W:
-        if search.ndim == 3:
-            return torch.cat([correlate(*pair) for pair in zip(search, templates.split(1), strict=True)])
-        return _correlate_blocks(search, templates, min(block, fast_length(H)), min(block, fast_length(W)))
     rows, columns = fast_length(H), fast_length(W)
     size = (rows, columns)
     count = max(1, _CHUNK_NUMBERS // (2 * rows * (columns // 2 + 1)))
@@ -193,27 +179,6 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
         for spectrum, group in zip(spectra, groups, strict=True)
     ]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
-
-
-def _correlate_blocks(search: Tensor, templates: Tensor, rows: int, columns: int) -> Tensor:
-    """The same by blocks of rows x columns, each of which gives rows-h+1 x columns-w+1 sums."""
-    (H, W), (T, h, w) = search.shape, templates.shape
-    step_y, step_x = rows - h + 1, columns - w + 1
-    ny, nx = -(-(H - h + 1) // step_y), -(-(W - w + 1) // step_x)
-    padded = search.new_zeros((ny - 1) * step_y + rows, (nx - 1) * step_x + columns)
-    padded[:H, :W] = search
-    blocks = padded.unfold(0, rows, step_y).unfold(1, columns, step_x)  # (ny, nx, rows, columns), no copy
-    out = search.new_empty(T, ny * step_y, nx * step_x)
-    count = max(1, _CHUNK_NUMBERS // (2 * nx * rows * columns))
-    models = torch.fft.rfft2(templates, s=(rows, columns)).conj()
-    for j in range(ny):
-        spectra = torch.fft.rfft2(blocks[j])
-        for first in range(0, T, count):
-            product = spectra * models[first : first + count, None]
-            sums = _inverse(product, step_y, step_x, columns)  # (t, nx, step_y, step_x)
-            line = sums.permute(0, 2, 1, 3).reshape(sums.shape[0], step_y, nx * step_x)
-            out[first : first + count, j * step_y : (j + 1) * step_y] = line
-    return out[:, : H - h + 1, : W - w + 1]
 
 
 def _inverse(spectrum: Tensor, height: int, width: int, columns: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The compiled loops of SIFT do what the tensor ops do."""
+"""The compiled loops of SIFT do what the paper says, written out in float64."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from engine.features import sift
 from engine.kernels import sift_descriptors
 from engine.runtime import jit
 from engine.runtime.threads import count, set_threads
-from engine.sift import descriptors, keypoints, loops, scale_space
-
-CPU = torch.device("cpu")
+from engine.sift import loops
+from tests.support import sift_reference as reference
 
 
 def picture(height: int, width: int, seed: int = 0) -> torch.Tensor:
@@ -38,74 +37,67 @@ def shape(request):
 
 @pytest.fixture(params=[1, 2], ids=["as it is", "doubled"])
 def plan(shape, request):
-    return scale_space.make_plan(*shape, 1, request.param, CPU)
+    return loops.plan_loops(*shape, request.param)
+
+
+def octaves(plan):
+    return tuple(octave for octave, _, _ in plan.octaves)
+
+
+def shaped(buffer, plan):
+    """The levels (L, H, W) of each octave in the flat buffer."""
+    return [buffer[o.offset : o.end].reshape(-1, o.height, o.width) for o in octaves(plan)]
 
 
 def both(plan, contrast_threshold=0.02):
-    """The picture's levels and keypoints by the tensor ops, and by the loops with their plan."""
-    image = picture(*plan.octaves[0].source)
-    gaussians = scale_space.gaussian_levels(image, plan)
-    points = keypoints.find_points(gaussians, plan, contrast_threshold)
-    by_loops = loops.plan_loops(*image.shape[1:], plan.upsample)
-    levels, rows = loops.detect(image[0].numpy(), by_loops, contrast_threshold)
-    return (gaussians, points.take(points.valid.nonzero()[:, 0])), (levels.copy(), rows, by_loops)
+    """The picture's levels and keypoints by the reference, and by the loops."""
+    image = picture(*octaves(plan)[0].source)[0].numpy()
+    levels = reference.levels_of(image, octaves(plan))
+    buffer, rows = loops.detect(image, plan, contrast_threshold)
+    return levels, reference.keypoints_of(levels, contrast_threshold), buffer.copy(), rows
 
 
-def as_rows(points: keypoints.Points) -> np.ndarray:
-    """Keypoints (K, 6) as the loops have them."""
-    columns = (points.x, points.y, points.growth, points.contrast, points.level, points.octave)
-    return torch.stack([column.float() for column in columns], dim=1).numpy()
+def test_levels_are_those_of_the_equation(plan):
+    expected, _, buffer, _ = both(plan)
+    for wanted, got in zip(expected, shaped(buffer, plan), strict=True):
+        np.testing.assert_allclose(got, wanted, atol=2e-6)
 
 
-def test_levels_are_those_of_the_banded_matrices(plan):
-    (expected, _), (got, _, _) = both(plan)
-    for octave in plan.octaves:
-        inner = np.s_[:, : octave.height, :, : octave.width]
-        levels = octave.levels(torch.from_numpy(got))
-        torch.testing.assert_close(levels[inner], octave.levels(expected)[inner], atol=2e-6, rtol=0)
-
-
-def test_keypoints_are_those_of_the_tensor_ops(plan):
+def test_keypoints_are_those_of_the_reference(plan):
     """All but those that rounding moves across a threshold, of which there is at most one in a hundred."""
-    (_, points), (_, got, _) = both(plan)
-    expected = as_rows(points)
+    _, expected, _, got = both(plan)
     near = [np.abs(got - row).max(axis=1).min(initial=np.inf) < 0.02 for row in expected]
     assert len(expected) - sum(near) <= 0.01 * len(expected)
     assert abs(len(expected) - len(got)) <= 0.01 * len(expected)
-    if min(plan.octaves[0].source) > 60:
+    if min(octaves(plan)[0].source) > 60:
         assert len(expected) > 20
 
 
 @pytest.mark.parametrize("spread", [1, 3, 6])
 @pytest.mark.parametrize("most", [7, 60, 5000])
-def test_the_strongest_are_those_of_the_tensor_ops(plan, spread, most):
-    (_, points), (_, _, by_loops) = both(plan)
-    height, width = plan.octaves[0].source
-    mask = np.random.default_rng(3).random((height, width)) > 0.3
-    allowed = points.within(torch.from_numpy(mask)[None, None])
-    index, filled = keypoints.strongest(allowed, plan, 1, most, spread)
-    expected = as_rows(points.take(index[filled]))
-    got = loops.strongest(as_rows(points), by_loops, mask, most, spread)
-    np.testing.assert_array_equal(got, expected)
+def test_the_strongest_are_those_of_the_reference(plan, spread, most):
+    rows = both(plan)[3]
+    mask = np.random.default_rng(3).random(octaves(plan)[0].source) > 0.3
+    kept = reference.strongest(rows, mask, plan.upsample, most, spread)
+    np.testing.assert_array_equal(loops.strongest(rows, plan, mask, most, spread), rows[kept])
 
 
 @pytest.mark.parametrize("root", [True, False])
 @pytest.mark.parametrize("turn_rad", [None, 0.0], ids=["turned", "upright"])
-def test_angles_and_descriptors_are_those_of_the_tensor_ops(plan, turn_rad, root):
-    (gaussians, points), (_, _, by_loops) = both(plan)
-    levels, rows = gaussians.numpy(), as_rows(points)
-    expected = descriptors.dominant_angle(gaussians, points, plan)
-    apart = (
-        (torch.from_numpy(loops.dominant_angle(levels, rows, by_loops)) - expected + math.pi) % math.tau
-    ).abs()
-    assert ((apart - math.pi).abs() > 0.01).sum() <= 0.01 * len(apart)  # two peaks of one height
-    angle = expected if turn_rad is None else torch.full_like(expected, turn_rad)
-    torch.testing.assert_close(
-        torch.from_numpy(loops.describe(levels, rows, angle.numpy(), by_loops, root=root)),
-        descriptors.describe(gaussians, points, angle, plan, root=root),
-        atol=2e-4,
-        rtol=0,
-    )
+def test_angles_and_descriptors_are_those_of_the_reference(plan, turn_rad, root):
+    _, _, buffer, rows = both(plan)
+    rows, levels, sigma = rows[:40], shaped(buffer.astype(np.float64), plan), float(plan.first_sigma)
+    pictures = [levels[int(row[5])][int(row[4])] for row in rows]
+    expected = np.array([reference.angle_of(p, row, sigma) for p, row in zip(pictures, rows, strict=True)])
+    apart = np.abs((loops.dominant_angle(buffer, rows, plan) - expected + math.pi) % math.tau - math.pi)
+    assert (apart > 0.01).sum() <= 0.05 * len(apart)  # two peaks of one height
+    turns = np.full(len(rows), turn_rad) if turn_rad is not None else expected
+    described = [
+        reference.descriptor_of(p, row, sigma, turn, root=root)
+        for p, row, turn in zip(pictures, rows, turns, strict=True)
+    ]
+    got = loops.describe(buffer, rows, turns.astype(np.float32), plan, root=root)
+    np.testing.assert_allclose(got, np.array(described).reshape(-1, 128), atol=3e-4)
 
 
 def test_a_filter_at_the_edge_has_the_weight_of_one_inside():
@@ -114,9 +106,8 @@ def test_a_filter_at_the_edge_has_the_weight_of_one_inside():
         for upsample in (1, 2):
             plan = loops.plan_loops(inputs, 60, upsample)
             levels, _ = loops.detect(np.full((inputs, 60), 0.7, np.float32), plan, 0.02)
-            for octave, _, _ in plan.octaves:
-                inner = octave.levels(torch.from_numpy(levels))[:, : octave.height, :, : octave.width]
-                torch.testing.assert_close(inner, torch.full_like(inner, 0.7), atol=2e-6, rtol=0)
+            for level in shaped(levels, plan):
+                np.testing.assert_allclose(level, 0.7, atol=2e-6)
 
 
 def test_directions_are_the_arc_tangents():

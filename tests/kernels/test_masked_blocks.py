@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from engine.kernels import masked, masked_whole
+from engine.kernels import masked_blocks, masked_tensors
 from engine.ncc_fft import ncc
 
 KINDS = ("border", "slanted", "holes", "speckles", "half", "nearly nothing")
@@ -47,14 +47,14 @@ def drawn(kind, size, model, count=2, mean=0.0):
 def reference(window, valid, templates, min_overlap):
     tensors = torch.from_numpy(window)[None], torch.from_numpy(valid)[None], torch.from_numpy(templates)[None]
     shown = torch.ones_like(tensors[2]).bool()
-    return masked.ncc_surface(*tensors, shown, min_overlap=min_overlap)[0].numpy()
+    return masked_tensors.ncc_surface(*tensors, shown, min_overlap=min_overlap)[0].numpy()
 
 
 @pytest.mark.parametrize(("small_px", "min_overlap"), [(0, 0.3001), (1 << 17, 0.8999)])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("size", "model"), [((230, 317), (48, 61)), ((400, 260), (21, 20)), ((97, 90), (90, 90))])
 def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, small_px, monkeypatch):
-    monkeypatch.setattr(masked_whole, "_SMALL_PX", small_px)
+    monkeypatch.setattr(masked_blocks, "_SMALL_PX", small_px)
     window, valid, templates = drawn(kind, size, model)
     for dtype, tolerance in ((np.float64, 1e-9), (np.float32, 1e-6)):
         picture, patches = window.astype(dtype), templates.astype(dtype)
@@ -69,10 +69,10 @@ def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, mod
 def test_the_division_changes_no_score(kind, monkeypatch):
     window, valid, templates = drawn(kind, (230, 317), (48, 61), mean=40.0)
     found = []
-    monkeypatch.setattr(masked_whole, "_SMALL_PX", 0)
+    monkeypatch.setattr(masked_blocks, "_SMALL_PX", 0)
     for divisions in ((1,), (3,), (16,)):
-        monkeypatch.setattr(masked_whole, "_DIVISIONS", divisions)
-        found.append(masked_whole.surfaces(window, valid, templates, 0.5))
+        monkeypatch.setattr(masked_blocks, "_DIVISIONS", divisions)
+        found.append(masked_blocks.ncc_surface(window[None], valid[None], templates[None], min_overlap=0.5)[0])
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], rtol=0, atol=1e-10)
 
@@ -95,9 +95,10 @@ def test_flat_templates_and_flat_ground_score_zero_also_across_an_edge(level):
     window, valid, templates = drawn("border", (120, 130), (30, 31))
     for dtype in (np.float32, np.float64):
         flat = np.full((1, 30, 31), level, dtype)
-        scores = masked_whole.surfaces(window.astype(dtype), valid, flat, 0.5)
+        scores = masked_blocks.ncc_surface(window.astype(dtype)[None], valid[None], flat[None], min_overlap=0.5)[0]
         assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6
         half = window.astype(dtype)
         half[:, :80] = level
-        scores = masked_whole.surfaces(half, valid, templates.astype(dtype), 0.5)[:, :, : 80 - 31]
+        scores = masked_blocks.ncc_surface(half[None], valid[None], templates.astype(dtype)[None], min_overlap=0.5)
+        scores = scores[0, :, :, : 80 - 31]
         assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6

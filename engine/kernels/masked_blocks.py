@@ -1,7 +1,7 @@
 """Masked NCC on the CPU of templates that are whole: what lies wholly on valid pixels is scored without a mask.
 
-Only where a template reaches over the mask's edge are the sums of :mod:`engine.kernels.masked` needed. Of their
-six correlations a template without a mask leaves three; the others are sums over boxes.
+Only where a template reaches over the mask's edge are the sums of :mod:`engine.kernels.masked_tensors` needed. Of
+their six correlations a template without a mask leaves three; the others are sums over boxes.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels import by_opencv, surface_loops
-from engine.kernels.by_opencv import fast_side, transform
+from engine.kernels import blocks, surface_loops
+from engine.kernels.blocks import fast_side, transform
 from engine.kernels.sums import counts, counts_inside, integrals
 from engine.kernels.transform_sizes import FLAT_SHARE
 
@@ -34,8 +34,26 @@ class _Model(NamedTuple):
     squares: Array
 
 
-def surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_overlap: float) -> NDArray[Any]:
-    """Zero-mean NCC over the valid pixels.
+def ncc_surface(
+    search: NDArray[Any], search_valid: Mask, templates: NDArray[Any], *, min_overlap: float
+) -> NDArray[Any]:
+    """Zero-mean NCC over the valid pixels of windows.
+
+    Args:
+        search: (B, H, W).
+        search_valid: (B, H, W) bool.
+        templates: (B, T, h, w).
+        min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
+
+    Returns:
+        (B, T, H-h+1, W-w+1) in [-1, 1]: float32 where both pictures are, else float64.
+    """
+    windows = zip(search, search_valid, templates, strict=True)
+    return np.stack([_surfaces(*window, min_overlap) for window in windows])
+
+
+def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_overlap: float) -> NDArray[Any]:
+    """The same of one window.
 
     Args:
         window: (H, W).
@@ -73,7 +91,7 @@ def _score_whole(
     models = [surface_loops.unit(template, True)[0] for template in templates]
     inverse_norms = surface_loops.inverse_norms(centred, *moments, *templates.shape[1:], True)
     inverse_norms[~whole] = 0.0
-    by_opencv.correlate(out, centred, moments, inverse_norms, models)
+    blocks.correlate(out, centred, moments, inverse_norms, models)
 
 
 def _score_partial(
