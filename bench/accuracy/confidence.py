@@ -4,8 +4,8 @@
 
 On towns that no other benchmark reports on, and as many matches of one year on the map of another: over the
 cities' half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of
-the telemetry and how coarsely SIFT looks changes from match to match. SIFT has no weights: how often evidence is met
-for wrong places is printed, beside how often it may be.
+the telemetry and how coarsely SIFT looks changes from match to match. SIFT has no weights: how often evidence is
+met for wrong places is printed, beside how often it may be.
 """
 
 from __future__ import annotations
