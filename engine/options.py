@@ -251,10 +251,7 @@ class SiftOptions:
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
         use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
             features alone hardly separate a tilt from a displacement.
-        min_confidence: probability of :func:`engine.matching.confidence.probability` below which a pose is not
-            accepted.
-        null_test_below: confidence below which the pose must also beat the null hypothesis, its frame mirrored, or
-            be confirmed by the refinement with a high correlation.
+        risk: probability of a wrong fix that is allowed, see :mod:`engine.matching.evidence`.
         refine: refine the pose densely after PnP, where height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
         errors: what is assumed of the telemetry and the map.
@@ -283,8 +280,7 @@ class SiftOptions:
     min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
     use_attitude: bool = True
-    min_confidence: float = 0.995
-    null_test_below: float = 0.9999
+    risk: float = 1e-4
     refine: bool = True
     pose: PoseOptions = field(default_factory=PoseOptions)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
@@ -298,10 +294,8 @@ class SiftOptions:
                 raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         if not self.min_deviation >= 0.0:
             raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
-        if not 0.0 <= self.min_confidence < 1.0:
-            raise OptionError(f"min_confidence: expected 0 or more and below 1, got {self.min_confidence}")
-        if not 0.0 <= self.null_test_below <= 1.0:
-            raise OptionError(f"null_test_below: expected a probability, got {self.null_test_below}")
+        if not 0.0 < self.risk < 1.0:
+            raise OptionError(f"risk: expected a probability above 0 and below 1, got {self.risk}")
         for name in ("scale", "ratio", "vote_ratio", "vote_share"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")

@@ -333,6 +333,26 @@ class Fix:
         """Horizontal standard deviation, the larger of the two axes of the ellipse."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2[:2, :2])[-1]))
 
+    def protection_level_m(self, risk: float = 1e-4) -> float:
+        """The horizontal radius about the fix beyond which the vehicle is with no more than this probability.
+
+        It counts that the place may be a wrong one, by :attr:`confidence`, and else the ellipse of the covariance,
+        taken for a circle of its larger axis.
+
+        Args:
+            risk: probability that is allowed, above 0 and below 1.
+
+        Returns:
+            float: infinite where the place alone is wrong more often than that, or how often is not known.
+
+        Raises:
+            OptionError: the risk is no such probability.
+        """
+        if not 0.0 < risk < 1.0:
+            raise OptionError(f"risk: expected a probability above 0 and below 1, got {risk}")
+        left = risk - (1.0 - (self.confidence or 0.0))
+        return self.sigma_m * math.sqrt(-2.0 * math.log(left)) if left > 0.0 else math.inf
+
     def refused(self, reason: Reason, detail: str) -> NoFix:
         """The refusal of this fix, with what was measured of it."""
         return NoFix(

@@ -1,10 +1,11 @@
 """Fit the probability that a fix is right: prints the constants of ``engine.matching.confidence``.
 
-    python -m bench.accuracy.confidence [--matches N] [--method NCC|SIFT|...]
+    python -m bench.accuracy.confidence [--matches N] [--method "NCC, first look"|"NCC, second look"|SIFT]
 
 On towns that no other benchmark reports on, and as many matches of one year on the map of another: over the
 cities' half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of
-the telemetry and how coarsely SIFT looks changes from match to match.
+the telemetry and how coarsely SIFT looks changes from match to match. SIFT has no weights: how often evidence is
+met for wrong places is printed, beside how often it may be.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from numpy.typing import NDArray
 from bench.accuracy.judged import FIRST_LOOK, SECOND_LOOK, Bench, Row
 from bench.accuracy.trials import Trial, ground
 from bench.accuracy.year_pairs import matched as year_matched
-from engine.matching.confidence import PeakModel, PoseModel
+from engine.matching.confidence import PeakModel
 from engine.options import SiftOptions
 from engine.runtime.threads import set_threads
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
-MODELS = {FIRST_LOOK: PeakModel, SECOND_LOOK: PeakModel, "SIFT": PoseModel}
+METHODS = (FIRST_LOOK, SECOND_LOOK, "SIFT")
 UNTOLD = 0.25  # how often something is left out
 SCALES = (0.5, 0.35, 0.25)  # of the frame, as a budget asks for
 
@@ -45,6 +46,21 @@ def fitted(x: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, ...
         if np.abs(step).max() < 1e-8:
             break
     return tuple(float(round(w, 3)) for w in weights)
+
+
+def alarms(nats: NDArray[np.float64], right: NDArray[np.bool_]) -> str:
+    """How many wrong places have more evidence than a few nats, beside how many may have.
+
+    Args:
+        nats: (N,) evidence of each place.
+        right: (N,) whether it was right.
+    """
+    wrong = nats[~right]
+    shown = (
+        f"{(wrong > e).sum()} of wrong places above {e} nats, {wrong.size * np.exp(-e):.1f} may be"
+        for e in (2, 4, 6, 8)
+    )
+    return "\n".join(shown)
 
 
 def matched(job: tuple[int, int, int, str]) -> list[Row]:
@@ -81,10 +97,10 @@ def main() -> None:
     """Fit, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--matches", type=int, default=12_000, help="by each method")
-    parser.add_argument("--method", choices=MODELS)
+    parser.add_argument("--method", choices=METHODS)
     options = parser.parse_args()
     each = options.matches // len(FIT_SEEDS)
-    for method, model in MODELS.items():
+    for method in METHODS:
         if options.method not in (None, method):
             continue
         jobs = [(a, b, each, method) for a, b in zip(FIT_SEEDS, FIT_SEEDS[1:] + FIT_SEEDS[:1], strict=True)]
@@ -93,11 +109,10 @@ def main() -> None:
             parts = [*pool.map(matched, jobs), years.result()]
         found = [row for part in parts for row in part if row.regressors]
         right = np.array([row.right for row in found])
-        weights = model(*fitted(np.array([row.regressors for row in found]), right))
+        values = np.array([row.regressors for row in found])
+        fit = alarms(values[:, 0], right) if method == "SIFT" else PeakModel(*fitted(values, right))
         wrong = int((~right).sum())
-        print(
-            f"{weights}\n{sum(map(len, parts))} matches, {len(found)} found something, {wrong} wrong", flush=True
-        )
+        print(f"{fit}\n{sum(map(len, parts))} matches, {len(found)} found something, {wrong} wrong", flush=True)
 
 
 if __name__ == "__main__":

@@ -145,11 +145,11 @@ class Bench:
         found = sift.find(query, options)
         fixed = isinstance(found, PoseCandidate) and isinstance(sift.judge(query, found), Fix)
         if isinstance(found, NoFix):
-            found = sift.find(query, replace(options, pose=LOOSE, min_confidence=0.0))
+            found = sift.find(query, replace(options, pose=LOOSE, risk=1.0 - 1e-9))
         if isinstance(found, NoFix):
             return self.row(made, "SIFT", None, False, [], [])
-        scores = [found.confidence, -found.features.log10_nfa, found.fix.score]
-        return self.row(made, "SIFT", found.fix, fixed, scores, regressors(found.features).tolist())
+        scores = [found.fix.confidence or 0.0, -found.evidence.log10_nfa, found.fix.score]
+        return self.row(made, "SIFT", found.fix, fixed, scores, [found.evidence.nats])
 
     def row(
         self, made: Trial, method: str, fix: Fix | None, fixed: bool, scores: list[float], values: list[float]

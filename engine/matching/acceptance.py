@@ -5,14 +5,15 @@ The rules are documented in ``docs/integrity.md``; their thresholds were fitted 
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import chi_square
-from engine.matching.confidence import PeakFeatures, PoseFeatures
+from engine.matching.confidence import PeakFeatures
 from engine.matching.covariance import score_sigma
+from engine.matching.evidence import PoseEvidence, needed_nats, probability
 from engine.options import PeakRule
 from engine.values import Fix, Peak, Reason
 
@@ -84,36 +85,27 @@ def judge_second_look(peak: Peak, features: PeakFeatures, confidence: float, rul
 
 def _improbable_peak(features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal:
     figures = f"NCC {features.sigmas:.1f} sigmas, rival at {features.ratio:.0%}"
-    chi_square_text = f"{features.agreement.prior_chi_square:.1f}"
-    return Reason.AMBIGUOUS, _improbable(confidence, rule.min_confidence, figures, chi_square_text)
+    figures += f", chi-square {features.agreement.prior_chi_square:.1f} from the prior"
+    asked = f"{rule.min_confidence:g} is asked for ({figures})"
+    return Reason.AMBIGUOUS, f"right with a probability of {confidence:.3f}, {asked}"
 
 
-def judge_pose(
-    features: PoseFeatures, confidence: float, min_confidence: float, null_log10_nfa: float = math.inf
-) -> Refusal | None:
+def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
     """The reason to refuse a pose by matched features, or None where it is accepted.
 
     Args:
-        features: of the confidence model.
-        confidence: that the model gives them.
-        min_confidence: that is asked for.
-        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches, infinite where it was not asked.
+        evidence: of the pose.
+        risk: probability of a wrong fix that is allowed.
     """
-    if confidence >= min_confidence:
-        if null_log10_nfa > features.log10_nfa:
-            return None
-        figures = f"log10 of false alarms {null_log10_nfa:.1f} against {features.log10_nfa:.1f}"
-        return Reason.AMBIGUOUS, f"the mirrored frame fits the map as well ({figures})"
-    figures = f"log10 of false alarms {features.log10_nfa:.1f}"
-    off = features.prior_chi_square
-    return Reason.BAD_POSE, _improbable(
-        confidence, min_confidence, figures, "unknown" if off is None else f"{off:.1f}"
-    )
-
-
-def _improbable(confidence: float, min_confidence: float, figures: str, prior_chi_square: str) -> str:
-    asked = f"{min_confidence:g} is asked for ({figures}, chi-square {prior_chi_square} from the prior)"
-    return f"right with a probability of {confidence:.3f}, {asked}"
+    if evidence.nats >= needed_nats(risk):
+        return None
+    off, alarms = evidence.prior_chi_square, f"log10 of false alarms {evidence.log10_nfa:.1f}"
+    known = f"chi-square {'unknown' if off is None else f'{off:.1f}'} from the prior"
+    wrong = f"wrong with a probability of {1.0 - probability(evidence.nats):.1g}, {risk:g} is allowed"
+    if replace(evidence, null_log10_nfa=0.0).nats >= needed_nats(risk):
+        figures = f"{alarms} against {evidence.null_log10_nfa:.1f}"
+        return Reason.AMBIGUOUS, f"the mirrored frame fits the map as well ({figures}): {wrong}"
+    return Reason.BAD_POSE, f"{wrong} ({alarms}, rival at {evidence.rival_share:.0%}, {known})"
 
 
 def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:

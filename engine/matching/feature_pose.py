@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
 from engine.matching.acceptance import judge_pose
-from engine.matching.confidence import PoseFeatures, prior_agreement, probability
+from engine.matching.confidence import prior_agreement
 from engine.matching.covariance import tilt_covariance
+from engine.matching.evidence import PoseEvidence, needed_nats, probability
 from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
 from engine.matching.point_finding import PointFinder
 from engine.matching.pose import PoseStats, solve_pose
@@ -39,20 +40,11 @@ class PoseCandidate:
 
     Attributes:
         fix: what it means, with its confidence.
-        features: of the confidence model.
-        null_log10_nfa: log10 of the false alarms of the null hypothesis, the same frame mirrored, which shows no
-            place on Earth; infinite where that gave no pose or was not asked.
+        evidence: for it.
     """
 
     fix: Fix
-    features: PoseFeatures
-    null_log10_nfa: float = math.inf
-
-    @property
-    def confidence(self) -> float:
-        """Probability that the place is right."""
-        assert self.fix.confidence is not None  # each pose has one
-        return self.fix.confidence
+    evidence: PoseEvidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,19 +92,21 @@ class FeatureMatcher:
 
     def judge(self, found: PoseCandidate) -> Fix | NoFix:
         """The fix where its pose is accepted, else a refusal."""
-        fix, least = found.fix, self.options.min_confidence
-        refusal = judge_pose(found.features, found.confidence, least, found.null_log10_nfa)
+        fix, refusal = found.fix, judge_pose(found.evidence, self.options.risk)
         if refusal is None:
             return fix
         return self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
-        """The candidate, unless nearly certain with what its frame reaches mirrored, by the same telemetry."""
-        if found.confidence >= self.options.null_test_below:
+        """The candidate, unless beyond doubt with what its frame reaches mirrored, by the same telemetry."""
+        if is_beyond_doubt(found.evidence.nats, self.options.risk):
             return found
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
         null = replace(self, query=mirrored)._find_with(hypothesis)
-        return found if isinstance(null, NoFix) else replace(found, null_log10_nfa=null.features.log10_nfa)
+        if isinstance(null, NoFix):
+            return found
+        evidence = replace(found.evidence, null_log10_nfa=min(null.evidence.log10_nfa, 0.0))
+        return PoseCandidate(replace(found.fix, confidence=probability(evidence.nats)), evidence)
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
         """What is tried in turn: the telemetry, the same at the frame's full resolution, and doubts of it."""
@@ -129,8 +123,8 @@ class FeatureMatcher:
             yield self, wide
 
     def is_doubtful(self, found: PoseCandidate) -> bool:
-        """Whether a pose is not probable enough."""
-        return found.confidence < self.options.min_confidence
+        """Whether too little speaks for a pose."""
+        return found.evidence.nats < needed_nats(self.options.risk)
 
     def matches_in(self, window: Window) -> tuple[Array, Array, PoseStats | None]:
         """What is matched in a window at the frame's own height and heading, and the pose of it: for reports.
@@ -250,11 +244,16 @@ class FeatureMatcher:
         if query.prior is not None and query.prior_px is not None:
             prior_m = query.site.enu_from_pixel(query.prior_px)
             prior_chi_square = prior_agreement(fix, prior_m, query.prior.sigma_m).prior_chi_square
-        log10_nfa, rival_share = stats.log10_nfa, None
+        log10_nfa, rival_share = stats.log10_nfa, 0.0
         if vote is not None:
             log10_nfa, rival_share = vote.log10_nfa, vote.rival / vote.votes
-        features = PoseFeatures(log10_nfa, prior_chi_square, height_chi_square, rival_share)
-        return PoseCandidate(replace(fix, confidence=probability(features)), features)
+        evidence = PoseEvidence(log10_nfa, prior_chi_square, height_chi_square, rival_share)
+        return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
+
+
+def is_beyond_doubt(nats: float, risk: float) -> bool:
+    """Whether a place has evidence for the square of the risk: no null hypothesis is asked."""
+    return nats >= 2.0 * needed_nats(risk)
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:

@@ -11,8 +11,9 @@ from engine.maps.landmarks import LandmarkMap
 from engine.maps.prepared import enhanced_part
 from engine.maps.samples import SampleMap
 from engine.matching.align import SIDE_STEP_PX
+from engine.matching.evidence import nats_of, needed_nats
 from engine.matching.explanation import Explanation, explain_features
-from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
+from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate, is_beyond_doubt
 from engine.matching.method import Method
 from engine.matching.query import Query
 from engine.matching.refinement import MIN_CORRELATION_AT_ONCE, Refinement, improved, with_unconfirmed_tilt
@@ -136,7 +137,9 @@ class Sift(Method):
             return None
         with query.scheduler.costed(_FEW, self._work_px(query)[1.0]):
             found = FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
-        return None if isinstance(found, NoFix) or found.confidence < self.options.min_confidence else found.fix
+        if isinstance(found, NoFix) or found.evidence.nats < needed_nats(self.options.risk):
+            return None
+        return found.fix
 
     def _few_scale(self, query: Query) -> float | None:
         """The scale of the frame at which few features are sought; None where it is not asked or the map ends."""
@@ -159,7 +162,7 @@ class Sift(Method):
     def _is_certain(self, fix: Fix) -> bool:
         """Whether a pose is so probable that no null hypothesis is asked."""
         assert fix.confidence is not None  # each pose has one
-        return fix.confidence >= self.options.null_test_below
+        return is_beyond_doubt(nats_of(fix.confidence), self.options.risk)
 
     def _by_all_after(self, query: Query, few: Fix) -> Result:
         """A fix by all features, or that of few where there is no time: its covariance for a tilt that is wrong.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from engine.matching.evidence import RELIABILITY
 from engine.navigation.motion import PositionEstimate
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Prior
@@ -19,8 +20,6 @@ MAX_PROBABILITY = 0.9999
 """Of a match or of a track: the confidence models were tested on some ten thousand matches, not on more."""
 UNSTATED_PROBABILITY = 0.98
 """Of a match that states none: what the matchers ask for where they do; a search of more has stricter rules."""
-RELIABILITY = 0.99
-"""Probability that a position of another source, or a guess at the motion, holds within its standard deviation."""
 _SAME_GROUND = 0.5  # what a match of ground that was matched before counts
 _HEIGHT_M = 100.0  # assumed where it is unknown
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from engine.matching.evidence import RELIABILITY
 from engine.navigation.evidence import (
-    RELIABILITY,
     Sources,
     agreement_log_odds,
     log_odds,

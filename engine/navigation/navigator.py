@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
+from engine.matching.evidence import RELIABILITY
 from engine.navigation.anchors import Anchor, RecentAnchors
 from engine.navigation.attitude_bias import Bias
 from engine.navigation.evidence import (
     MAX_PROBABILITY,
-    RELIABILITY,
     Sources,
     log_odds,
     match_log_odds,

@@ -30,6 +30,8 @@ class FrameNote:
         roll_sigma_deg: standard deviation of the roll, where it is known, as of the next two.
         pitch_sigma_deg: of the pitch.
         heading_sigma_deg: of the heading.
+        protection_level_m: radius beyond which the vehicle is with a probability of 1e-4 at most; None where none
+            holds.
     """
 
     frame: str
@@ -46,6 +48,7 @@ class FrameNote:
     roll_sigma_deg: float | None = None
     pitch_sigma_deg: float | None = None
     heading_sigma_deg: float | None = None
+    protection_level_m: float | None = None
 
 
 COLUMNS = tuple(f.name for f in fields(FrameNote))
@@ -66,6 +69,7 @@ def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
         return FrameNote(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
     # Where no height was measured, roll and pitch are the telemetry's, or none.
     tilt = None if result.up_m is None else result.attitude
+    level_m = result.protection_level_m()
     roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)
     return FrameNote(
         frame=name,
@@ -81,6 +85,7 @@ def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
         heading_sigma_deg=heading_sigma_deg,
         stage=result.stage,
         confidence=None if result.confidence is None else float(result.confidence),
+        protection_level_m=level_m if math.isfinite(level_m) else None,
     )
 
 

@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine import Fix, Reason
-from engine.matching.acceptance import judge_peak, judge_pose
+from engine.matching.acceptance import judge_peak
 from engine.matching.confidence import (
     PeakFeatures,
-    PoseFeatures,
     PriorAgreement,
     peak_features,
     prior_agreement,
@@ -89,17 +88,6 @@ def test_a_place_is_held_against_the_errors_of_both():
     assert found.spread_m == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize(("better", "worse"), [(-30.0, -3.0), (-7.0, 0.0)])
-def test_fewer_false_alarms_make_a_pose_more_probable(better, worse):
-    likely, unlikely = (probability(PoseFeatures(nfa, 1.0, 1.0)) for nfa in (better, worse))
-    assert likely > unlikely
-
-
-@given(st.floats(-1e6, 1e6), st.one_of(st.none(), st.floats(0, 1e9)), st.one_of(st.none(), st.floats(0, 1e9)))
-def test_every_pose_has_a_probability(log10_nfa, prior_chi_square, height_chi_square):
-    assert 0.0 < probability(PoseFeatures(log10_nfa, prior_chi_square, height_chi_square)) < 1.0
-
-
 def test_a_refusal_tells_its_figures():
     clear, rule = peak(0.9, 0.1), PeakRule()
     verdict = judge_peak(clear, 2500, replace(MIDDLING, ratio=0.9), 0.979, rule)
@@ -108,16 +96,6 @@ def test_a_refusal_tells_its_figures():
     for figure in ("0.979", "0.99", "10.0 sigmas", "90%", "4.0"):
         assert figure in verdict[1]
     assert judge_peak(clear, 2500, MIDDLING, 0.99, rule) is None
-
-
-def test_a_refusal_of_a_pose_tells_its_figures():
-    verdict = judge_pose(PoseFeatures(-1.5, None, None), 0.991, 0.995)
-    assert verdict is not None
-    assert verdict[0] is Reason.BAD_POSE
-    for figure in ("0.991", "0.995", "-1.5", "chi-square unknown"):
-        assert figure in verdict[1]
-    assert "chi-square 3.2" in judge_pose(PoseFeatures(-1.5, 3.2, None), 0.991, 0.995)[1]
-    assert judge_pose(PoseFeatures(-40.0, 1.0, 1.0), 0.97, 0.97) is None
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(1e-3, 1), st.floats(0, 1e9))

@@ -602,8 +602,8 @@ def test_options_are_refused_by_name(ground, camera):
 @pytest.mark.parametrize(
     ("options", "name", "value", "text"),
     [
-        (SiftOptions, "min_confidence", 97, "0 or more and below 1"),
-        (SiftOptions, "min_confidence", float("nan"), "0 or more and below 1"),
+        (SiftOptions, "risk", 97, "a probability above 0 and below 1"),
+        (SiftOptions, "risk", float("nan"), "a probability above 0 and below 1"),
         (SiftOptions, "max_tilt_deg", -1, "above 0"),
         (SiftOptions, "min_deviation", float("nan"), "0 or more"),
         (SiftOptions, "max_height_m", float("inf"), "a finite number"),
