@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scenematch.files.datasets.sequence import ImportOptions
     from scenematch.runs.bag_conversion import convert_to_bag
     from scenematch.runs.bridge_files import BridgeFiles
+    from scenematch.runs.cameras import CameraInput
     from scenematch.runs.campaign import run_campaign
     from scenematch.runs.checking import diagnose_flight
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.map_audit import AuditFiles, MapAudit, audit_map
     from scenematch.runs.map_fetch import FetchSettings, fetch_map
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import (
         BridgeSettings,
         MavlinkSettings,
@@ -50,6 +52,7 @@ __all__ = [
     "AuditFiles",
     "BridgeFiles",
     "BridgeSettings",
+    "CameraInput",
     "ClosedLoopSettings",
     "Corrections",
     "FetchSettings",
@@ -57,6 +60,7 @@ __all__ = [
     "ImportOptions",
     "LiveViewTarget",
     "MapAudit",
+    "MapInput",
     "MavlinkSettings",
     "PhotographOptions",
     "Progress",
@@ -92,6 +96,7 @@ _NAMES = {
     "scenematch.files.datasets.sequence": "ImportOptions",
     "scenematch.runs.bag_conversion": "convert_to_bag",
     "scenematch.runs.campaign": "run_campaign",
+    "scenematch.runs.cameras": "CameraInput",
     "scenematch.runs.checking": "diagnose_flight",
     "scenematch.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
     "scenematch.runs.comparison": "compare parse_runs",
@@ -102,6 +107,7 @@ _NAMES = {
     "scenematch.runs.live_viewing": "LiveViewTarget",
     "scenematch.runs.map_audit": "AuditFiles MapAudit audit_map",
     "scenematch.runs.map_fetch": "FetchSettings fetch_map",
+    "scenematch.runs.map_input": "MapInput",
     "scenematch.runs.bridge_files": "BridgeFiles",
     "scenematch.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
     "scenematch.runs.mavlink_parameters": "write_parameter_file",

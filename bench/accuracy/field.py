@@ -107,7 +107,7 @@ def inputs_of(name: str, step: int) -> tuple[FlightFiles, FlightInputs]:
 
 def _with_video(folder: Path) -> FlightFiles:
     names = {"map": "map.tif", "camera": "camera.yaml", "frames": VIDEO, "telemetry": "telemetry.csv"}
-    return FlightFiles(**{what: folder / name for what, name in names.items()})
+    return FlightFiles.from_flat(**{what: folder / name for what, name in names.items()})
 
 
 def fly(name: str, method: str, step: int, weights: Sequence[Path]) -> Figures:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -201,7 +200,7 @@ def flight_options(files: FlightFiles, *, settings: Path | None = None, start: s
     """The files of a flight with all that was given of them, as options of `check` and `track` are typed."""
     from scenematch.files.corrections import Corrections
 
-    values: dict[str, object] = {field.name: getattr(files, field.name) for field in fields(files)}
+    values: dict[str, object] = files.flat()
     given, nothing = files.corrections, Corrections()
     is_scaled = values.pop("scale_calibration")
     values |= {"corrections": None, "settings": settings, "start": start}

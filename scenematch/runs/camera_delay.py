@@ -16,7 +16,7 @@ from engine.navigation.lag import Lag, camera_lag, turn_between
 from engine.values import Frame, NoFix, Reason
 from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage, capture
-from scenematch.runs.cameras import CameraFiles
+from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
 from scenematch.runs.progress import SILENT, Progress
 
@@ -36,12 +36,10 @@ class _Idle:
 
 def measure_camera_delay(
     connect: str,
-    camera: StrPath | None,
+    camera: CameraInput,
     camera_source: str,
     *,
-    hfov_deg: float | None = None,
     seconds: float = 20.0,
-    mount: str | None = None,
     firmware: str = "ardupilot",
     system_id: int = 1,
     key: StrPath | None = None,
@@ -52,11 +50,9 @@ def measure_camera_delay(
 
     Args:
         connect: the autopilot, as of the bridge.
-        camera: calibration; None is by ``hfov_deg``.
+        camera: a calibration, or a field of view.
         camera_source: as of the bridge.
-        hfov_deg: horizontal field of view, in place of a calibration.
         seconds: how long pictures are taken.
-        mount: how the camera is mounted, by name; None is the calibration's.
         firmware: of the autopilot, "ardupilot" or "px4".
         system_id: of the vehicle; others are not heard.
         key: secret of MAVLink's signing; with it unsigned packets are ignored.
@@ -72,11 +68,9 @@ def measure_camera_delay(
     from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions
     from scenematch.bridges.packets import read_key
 
-    if camera is None and hfov_deg is None:
+    if camera.camera is None and camera.hfov_deg is None:
         raise OptionError("camera: expected a calibration, or `hfov_deg`")
-    calibration = None if camera is None else Path(camera)
-    described = CameraFiles(calibration=calibration, hfov_deg=hfov_deg, mount=mount)
-    model = described.load_live(camera_source, progress=progress)
+    model = camera.load_live(camera_source, progress=progress)
     options, secret = MavlinkOptions(firmware=firmware), None if key is None else read_key(Path(key))
     connection = parse_connection(connect, listen_anywhere=listen_anywhere)
     try:

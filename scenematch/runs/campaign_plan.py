@@ -107,7 +107,7 @@ class RecordedFlight:
             return needed(what)
 
         try:
-            return FlightFiles(
+            return FlightFiles.from_flat(
                 map=needed("map"),
                 surface=optional("surface"),
                 camera=optional("camera"),
@@ -238,7 +238,7 @@ def _plan(campaign: Campaign, base: Path, out: Path) -> CampaignPlan:
 def _files_to_come(job: Job) -> FlightFiles:
     """All the files of a flight folder, which the job is going to write."""
     paths: dict[str, Any] = {name: job.folder / file for name, file in FOLDER_LAYOUT.items()}
-    return FlightFiles(**paths)
+    return FlightFiles.from_flat(**paths)
 
 
 def _dataset(folder: Path) -> str | None:
@@ -289,12 +289,13 @@ def _settings_hash(settings: TrackSettings) -> dict[str, str]:
 
 def _input_hashes(files: FlightFiles) -> dict[str, str]:
     """A hash of the content of each input; no stamp of a file has to be trusted."""
-    paths = {name: getattr(files, name) for name in (*FOLDER_LAYOUT, "frame_stamps")}
+    given = files.flat()
+    paths = {name: given[name] for name in (*FOLDER_LAYOUT, "frame_stamps")}
     hashes = {name: _content_hash(path) for name, path in paths.items() if path is not None}
-    values = {name: getattr(files, name) for name in _VALUES}
+    values = {name: given[name] for name in _VALUES}
     values |= {
         "log_offset_s": files.log_offset_s or None,
-        "scale_calibration": files.scale_calibration or None,
+        "scale_calibration": given["scale_calibration"] or None,
         "every": files.every if files.every > 1 else None,
     }
     return hashes | {name: repr(value) for name, value in values.items() if value is not None}

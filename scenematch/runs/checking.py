@@ -63,7 +63,7 @@ def diagnose_flight(
         )
     # A bag holds its calibration, which cannot be written to.
     cures = [
-        _that_can_be_set(one, flight.has_gimbal, files.camera not in (None, files.frames))
+        _that_can_be_set(one, flight.has_gimbal, files.camera.camera not in (None, files.frames))
         for one in found.findings
     ]
     return replace(found, findings=cures)

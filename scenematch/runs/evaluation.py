@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from scenematch.files.track import TrackRow, read_track
 from scenematch.report.metrics import Ground
 from scenematch.report.page_frames import shows_frames
 from scenematch.runs.folders import StrPath
-from scenematch.runs.inputs import FlightFiles, open_map, open_run_truth
+from scenematch.runs.inputs import FlightFiles, open_run_truth
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import RunRecord, read_record
 from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, write_results
@@ -83,10 +84,7 @@ def redraw(
 
 def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:
     """The map of a finished run."""
-    return open_map(
-        record.map, record.surface, record.map_sigma_m, bounds=record.map_bounds, crs=record.map_crs,
-        progress=progress,
-    )  # fmt: skip
+    return MapInput(**{each.name: getattr(record, each.name) for each in fields(MapInput)}).open(progress)
 
 
 def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> ReportFrames:
@@ -115,7 +113,7 @@ def recorded_files(record: RunRecord) -> FlightFiles:
     """
     if record.frames is None:
         raise TelemetryError("the record of the run lacks its frames")
-    return FlightFiles(
+    return FlightFiles.from_flat(
         map=record.map,
         surface=record.surface,
         camera=record.camera,

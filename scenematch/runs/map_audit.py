@@ -20,7 +20,7 @@ from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
 from scenematch.runs.arguments import parse_circle
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
-from scenematch.runs.inputs import open_map
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.renaming import renamed_in_errors
 
@@ -35,28 +35,22 @@ class AuditFiles:
     """The files of an audit, the height, and what part of the map it is of; None where not given.
 
     Attributes:
-        map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        surface: surface model, a GeoTIFF of heights.
+        map: the map with its surface.
         camera: calibration; None is the paper's camera.
         route: GeoJSON LineString, or a QGroundControl .plan.
         other: the same ground at another date.
         height_agl_m: above the ground; None is the paper's height.
         around: only what lies within "LAT,LON,RADIUS_M".
         corridor_m: only what lies so near to the route.
-        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
-        map_crs: of a map that names none.
     """
 
-    map: StrPath
-    surface: StrPath | None = None
+    map: MapInput
     camera: StrPath | None = None
     route: StrPath | None = None
     other: StrPath | None = None
     height_agl_m: float | None = None
     around: str | None = None
     corridor_m: float | None = None
-    map_bounds: str | None = None
-    map_crs: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +97,7 @@ def audit_map(
     prepare_folder(out, force, OWNED)
     audit = gather(plan, progress.track(measure_self_match(plan), len(plan), "auditing"))
     route = None if waypoints is None else predict_route(audit, *waypoints.T)
-    _write(out, audit, route, Path(files.map).name)
+    _write(out, audit, route, Path(files.map.map).name)
     facts = _summary(audit, route, files)
     (out / "summary.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     return MapAudit(audit, route, facts)
@@ -116,8 +110,8 @@ def _plan(
     around = parse_circle("around", files.around)
     if files.corridor_m is not None and files.route is None:
         raise OptionError("corridor_m: expected a `route` with it, got none")
-    site = open_map(files.map, files.surface, bounds=files.map_bounds, crs=files.map_crs, progress=progress)
-    other = None if files.other is None else _same_ground(open_map(files.other, progress=progress), site)
+    site = files.map.open(progress)
+    other = None if files.other is None else _same_ground(MapInput(files.other).open(progress), site)
     camera = Camera.from_fov(*PAPER_CAMERA) if files.camera is None else Camera.load(files.camera)
     waypoints = None if files.route is None else read_route(files.route)
     if waypoints is not None:
@@ -215,8 +209,8 @@ def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -
     known = np.isfinite(audit.availability)
     scale = 2.0**plan.level * plan.site.gsd_m_per_px
     return {
-        "map": str(files.map),
-        "surface": None if files.surface is None else str(files.surface),
+        "map": str(files.map.map),
+        "surface": None if files.map.surface is None else str(files.map.surface),
         "camera": None if files.camera is None else str(files.camera),
         "other": None if files.other is None else str(files.other),
         "height_agl_m": plan.height_agl_m,

@@ -27,7 +27,6 @@ from scenematch.runs.arguments import check_choice, check_device, check_unused, 
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.checks import check_position
 from scenematch.runs.folders import StrPath
-from scenematch.runs.inputs import open_map
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.progress import SILENT, Progress
@@ -204,9 +203,7 @@ def run_mavlink_bridge(
     outgoing = link.outgoing()
     start = parse_position("start", settings.start)
     key = None if link.key is None else read_key(Path(link.key))
-    site = open_map(
-        files.map, files.surface, files.map_sigma_m, bounds=files.map_bounds, crs=files.map_crs, progress=progress
-    )
+    site = files.map.open(progress)
     camera = files.load_camera(progress)
     check_position("start", start, site, OptionError)
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
@@ -215,7 +212,7 @@ def run_mavlink_bridge(
     # A camera's bridge may start in the air; a flight that is played begins where it began.
     resumes = files.camera_source is not None
     last_fix = LastFix(
-        last_fix_file(link.connect, link.system_id, Path(files.map).absolute()) if resumes else None
+        last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
     if supervise:
         check_supervision(matcher.device)

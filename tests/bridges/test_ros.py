@@ -923,6 +923,8 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
 
 def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp_path, monkeypatch):
     """Of its field of view; nothing but the picture's topic is waited for."""
+    from scenematch.runs.cameras import CameraInput
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
     from scenematch.runs.simulation import write_flight
     from scenematch.simulator import plan_flight
@@ -945,7 +947,9 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp
 
     monkeypatch.setattr("scenematch.runs.ros_bridge.SceneMatcher", matcher)
     write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
-    settings = RosSettings(map=tmp_path / "map.tif", hfov_deg=90.0, topics=RosTopics(image="/down"))
+    settings = RosSettings(
+        map=MapInput(tmp_path / "map.tif"), camera=CameraInput(hfov_deg=90.0), topics=RosTopics(image="/down")
+    )
     node = Spun(maker)
     with pytest.raises(LoadedError) as ended:
         run_ros_bridge(settings, node=node)
@@ -956,7 +960,7 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp
     with pytest.raises(BackendError, match=r"image_topic: expected a picture on /down within 30 s, got none"):
         run_ros_bridge(settings, node=node)
     with pytest.raises(OptionError, match="hfov_deg: expected without `camera`"):
-        RosSettings(map="m.tif", hfov_deg=90.0, camera="c.yaml")
+        RosSettings(map=MapInput("m.tif"), camera=CameraInput("c.yaml", hfov_deg=90.0))
 
 
 def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):

@@ -47,7 +47,7 @@ def said(capsys, arguments, code=2):
             for value in ("x", "-1", "99999")
         ),
         *((command, "--every", value) for command in (TRACK, CHECK, PLAYED) for value in ("0", "-3")),
-        (LOCATE, "--near", "48,16,1e200"),
+        (LOCATE, "--start", "48,16,1e200"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         *((command, "--device", "gpu") for command in COMMANDS.values()),

@@ -633,7 +633,7 @@ def singles_followed(out, count):
     assert len(found) == count
     for flight in found:
         files = RecordedFlight().files(flight.name, flight)
-        assert files.surface is not None
+        assert files.map.surface is not None
         for method in ("ncc", "sift"):
             tracks = out / "tracks" / flight.name / method
             summary = track(files, tracks, TrackSettings(method=method), report=False)

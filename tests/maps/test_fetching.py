@@ -22,6 +22,7 @@ from scenematch.fetch.client import shown
 from scenematch.fetch.heights import files_for
 from scenematch.fetch.xyz import tile_url
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.simulation import write_flight
 from scenematch.runs.single_image import locate_image
 from scenematch.simulator import plan_flight
@@ -260,8 +261,8 @@ def test_a_frame_is_located_over_a_fetched_map_as_over_the_map_itself(tmp_path, 
     site, fixes = OrthoMap.open(tmp_path / "map.tif"), {}
     for name in ("map", "wms", "tiles"):
         fix = locate_image(
-            tmp_path / "frames" / row["frame"], tmp_path / f"{name}.tif", tmp_path / "camera.yaml",
-            surface=tmp_path / "dsm.tif", method="ncc", near=f"{around},20",
+            tmp_path / "frames" / row["frame"], MapInput(tmp_path / f"{name}.tif", surface=tmp_path / "dsm.tif"),
+            tmp_path / "camera.yaml", method="ncc", start=f"{around},20",
             height_agl_m=float(row["height_agl_m"]), heading_deg=float(row["heading_deg"]),
         )  # fmt: skip
         assert isinstance(fix, Fix), (name, fix)

@@ -15,8 +15,10 @@ from engine.features import sift
 from scenematch import (
     BridgeFiles,
     BridgeSettings,
+    CameraInput,
     FlightFiles,
     LiveViewTarget,
+    MapInput,
     MavlinkSettings,
     Progress,
     TrackSettings,
@@ -81,7 +83,7 @@ def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_p
 def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     progress, names = Recorded(), ["000000.jpg", "000002.jpg"]
     paths = {name: flight / file for name, file in FOLDER_LAYOUT.items()}
-    files = FlightFiles(**paths, every=2)
+    files = FlightFiles.from_flat(**paths, every=2)
     track(files, tmp_path / "out", progress=progress)
     assert [row.frame for row in read_track(tmp_path / "out" / "track.csv")] == names
     assert progress.messages == ["one frame in 2 is used, 2 of all"]
@@ -113,7 +115,7 @@ def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(fligh
 
 def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     progress = Recorded()
-    files = FlightFiles(
+    files = FlightFiles.from_flat(
         map=flight / "map.tif",
         camera=flight / "camera.yaml",
         frames=flight / "frames",
@@ -139,10 +141,10 @@ def test_a_task_that_is_interrupted_is_finished():
 
 def test_a_folder_gives_what_it_has(flight, tmp_path):
     files = FlightFiles.in_folder(flight)
-    assert (files.surface, files.truth) == (flight / "dsm.tif", flight / "truth.csv")
+    assert (files.map.surface, files.truth) == (flight / "dsm.tif", flight / "truth.csv")
     bare = FlightFiles.in_folder(tmp_path)
-    assert (bare.surface, bare.telemetry, bare.truth) == (None, None, None)
-    assert bare.map == tmp_path / "map.tif"
+    assert (bare.map.surface, bare.telemetry, bare.truth) == (None, None, None)
+    assert bare.map.map == tmp_path / "map.tif"
 
 
 def refused(call, *arguments, **named):
@@ -213,7 +215,7 @@ def serial_link():
 
 
 def bridge():
-    files = BridgeFiles(map="m.tif", camera="c.yaml", frames="f")
+    files = BridgeFiles(map=MapInput("m.tif"), camera=CameraInput("c.yaml"), frames="f")
     run_mavlink_bridge(files, MavlinkSettings(connect="udpout:127.0.0.1:1"), BridgeSettings())
 
 
@@ -275,7 +277,7 @@ def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, 
     found = Diagnosis(findings, 16, 16, ("attitude",), (Contradiction("heading", 6 * is_wrong, 16),))
     monkeypatch.setattr("scenematch.runs.tracking.diagnose_flight", lambda *_, **__: found)
     given = {name: flight / file for name, file in FOLDER_LAYOUT.items() if name != "telemetry"}
-    files = FlightFiles(**given, telemetry=telemetry)
+    files = FlightFiles.from_flat(**given, telemetry=telemetry)
     summary = track(files, tmp_path / "out", TrackSettings(method="ncc"), report=False)
     assert summary["fixes"] == FRAMES - 1
     said = summary["settings"]["diagnosis"]

@@ -141,15 +141,19 @@ def mavlink(
     """
     from scenematch.runs.arguments import parse_realtime
     from scenematch.runs.bridge_files import BridgeFiles
+    from scenematch.runs.cameras import CameraInput
     from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
 
     use_threads(threads)
     files = BridgeFiles(
-        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, frames=frames, telemetry=telemetry,
-        camera_source=camera_source, rate_hz=rate_hz, every=every, exposure_to_grab_ms=exposure_to_grab_ms,
-        map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs, mount=mount,
-        camera_pitch_deg=camera_pitch_deg, gimbal=gimbal,
+        map=MapInput(
+            map_path, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs
+        ),
+        camera=CameraInput(camera, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg),
+        frames=frames, telemetry=telemetry, camera_source=camera_source, rate_hz=rate_hz, every=every, exposure_to_grab_ms=exposure_to_grab_ms,
+        gimbal=gimbal,
     )  # fmt: skip
     link = MavlinkSettings(
         connect=connect, listen_anywhere=listen_anywhere, system_id=system_id, component_id=component_id,
@@ -199,9 +203,10 @@ def camera_delay(
     to and fro by hand. The result is for --exposure-to-grab-ms.
     """
     from scenematch.runs.camera_delay import measure_camera_delay
+    from scenematch.runs.cameras import CameraInput
 
     found = measure_camera_delay(
-        connect, camera, camera_source, hfov_deg=hfov_deg, seconds=seconds, mount=mount,
+        connect, CameraInput(camera, hfov_deg=hfov_deg, mount=mount), camera_source, seconds=seconds,
         firmware=firmware, system_id=system_id, key=key, listen_anywhere=listen_anywhere,
         progress=console.PROGRESS,
     )  # fmt: skip
@@ -343,7 +348,9 @@ def ros(
     """
     from scenematch.bridges.ros import RosTopics
     from scenematch.runs.arguments import parse_realtime
+    from scenematch.runs.cameras import CameraInput
     from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import BridgeSettings
     from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 
@@ -357,9 +364,11 @@ def ros(
         seconds=seconds, odometry=odometry, realtime=parse_realtime(realtime, nice, cores),
     )  # fmt: skip
     ros_settings = RosSettings(
-        map=map_path, surface=surface, camera=camera, hfov_deg=hfov_deg, topics=topics,
-        map_sigma_m=map_sigma_m, version=version, firmware=firmware, origin=origin, map_bounds=map_bounds,
-        map_crs=map_crs, mount=mount, camera_pitch_deg=camera_pitch_deg, arguments=tuple(ros_arguments or ()),
+        map=MapInput(
+            map_path, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs
+        ),
+        camera=CameraInput(camera, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg),
+        topics=topics, version=version, firmware=firmware, origin=origin, arguments=tuple(ros_arguments or ()),
     )  # fmt: skip
     live_view = LiveViewTarget(recording, viewer)
     status = run_ros_bridge(ros_settings, settings, live_view=live_view, progress=console.PROGRESS)

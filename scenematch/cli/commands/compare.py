@@ -86,7 +86,7 @@ def compare(
 
     use_threads(threads)
     settings = parse_runs(runs or [], weights=weights or (), start=start, device=device, budget_ms=budget_ms)
-    files = FlightFiles(
+    files = FlightFiles.from_flat(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic,
         odometry_topic=odometry_topic, every=every, map_sigma_m=map_sigma_m, map_bounds=map_bounds,

@@ -54,9 +54,9 @@ def locate(
         float | None, typer.Option("--roll", metavar="DEG", help="Degrees, right side down.")
     ] = None,
     pitch_deg: Annotated[float | None, typer.Option("--pitch", metavar="DEG", help="Degrees, nose up.")] = None,
-    near: Annotated[
+    start: Annotated[
         str | None,
-        typer.Option("--near", metavar="LAT,LON[,SIGMA_M]", help="Search here; without it the whole map."),
+        typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Search here; without it the whole map."),
     ] = None,
     method: MethodOption = "auto",
     weights: WeightsOption = None,
@@ -69,14 +69,17 @@ def locate(
     Prints a fix and exits with 0, or prints why there is none and exits with 1.
     """
     from engine.values import Fix
+    from scenematch.runs.cameras import CameraInput
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.single_image import locate_image
 
     use_threads(threads)
     result = locate_image(
-        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
-        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
-        scale_calibration=scale_calibration, height_agl_m=height_agl_m,
-        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
+        image, MapInput(
+            map_path, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs
+        ), CameraInput(camera, hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg, scale_calibration=scale_calibration),
+        height_agl_m=height_agl_m,
+        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, start=start, method=method,
         weights=weights or (), device=device, progress=console.PROGRESS,
     )  # fmt: skip
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)

@@ -29,9 +29,9 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Size, ground sample distance, CRS, bounds."""
-    from scenematch.runs.inputs import open_map
+    from scenematch.runs.map_input import MapInput
 
-    site = open_map(map_path, surface, bounds=map_bounds, crs=map_crs, progress=console.PROGRESS)
+    site = MapInput(map_path, surface=surface, map_bounds=map_bounds, map_crs=map_crs).open(console.PROGRESS)
     console.facts(site.info(), as_json, title=str(map_path))
     place = f"{console.quoted(map_path)} --camera CAMERA --height-agl METRES"
     console.next_step(f"map audit {place} --out audit", as_json=as_json)
@@ -80,11 +80,12 @@ def audit(
     place, along the route, or both.
     """
     from scenematch.runs.map_audit import AuditFiles, audit_map
+    from scenematch.runs.map_input import MapInput
 
     use_threads(threads)
     files = AuditFiles(
-        map=map_path, surface=surface, camera=camera, route=route, other=other, height_agl_m=height_agl_m,
-        around=around, corridor_m=corridor_m, map_bounds=map_bounds, map_crs=map_crs,
+        map=MapInput(map_path, surface=surface, map_bounds=map_bounds, map_crs=map_crs), camera=camera, route=route, other=other, height_agl_m=height_agl_m,
+        around=around, corridor_m=corridor_m,
     )  # fmt: skip
     result = audit_map(files, out, prior_sigma_m=prior_sigma_m, force=force, progress=console.PROGRESS)
     if as_json:

@@ -118,7 +118,7 @@ def track(
     from scenematch.runs.tracking import track as track_flight
 
     use_threads(threads)
-    files = FlightFiles(
+    files = FlightFiles.from_flat(
         map=map_path, surface=surface, camera=camera, frames=frames, telemetry=telemetry, truth=truth,
         frame_stamps=frame_stamps, log_offset_s=log_offset_s, image_topic=image_topic,
         odometry_topic=odometry_topic, every=every, map_sigma_m=map_sigma_m, map_bounds=map_bounds,
