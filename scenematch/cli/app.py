@@ -30,9 +30,7 @@ from scenematch.cli.commands import (
     doctor,
     evaluate,
     export,
-    init,
     locate,
-    report,
     simulate,
     track,
 )
@@ -55,11 +53,9 @@ app.command(cls=Command)(check.check)
 app.command(cls=Command)(track.track)
 app.command(cls=Command)(compare.compare)
 app.command(cls=Command)(campaign.campaign)
-app.command(cls=Command)(init.init)
 app.command(cls=Command)(locate.locate)
 app.command(cls=Command)(simulate.simulate)
 app.command(cls=Command)(evaluate.evaluate)
-app.command(cls=Command)(report.report)
 app.command(cls=Command)(export.export)
 app.command(cls=Command)(bag.bag)
 app.command(cls=Command)(doctor.doctor)
@@ -69,8 +65,6 @@ map_app.command("fetch", cls=Command)(map_commands.fetch)
 dataset_app.command("import", cls=Command)(dataset.import_dataset)
 dataset_app.command("check", cls=Command)(dataset.check)
 bridge_app.command("mavlink", cls=Command)(bridge.mavlink)
-bridge_app.command("mavlink-params", cls=Command)(bridge.mavlink_params)
-bridge_app.command("camera-delay", cls=Command)(bridge.camera_delay)
 bridge_app.command("ros", cls=Command)(bridge.ros)
 app.add_typer(map_app, name="map")
 app.add_typer(dataset_app, name="dataset")

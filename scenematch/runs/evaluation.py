@@ -23,25 +23,25 @@ from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, write_re
 from scenematch.runs.settings import TrackSettings
 
 
-def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progress = SILENT) -> dict[str, Any]:
-    """Score a finished track again, and rewrite its summary, figures and page.
+def evaluate(
+    folder: StrPath, truth: StrPath | None = None, *, force: bool = False, progress: Progress = SILENT
+) -> dict[str, Any]:
+    """Score a finished track again, if there is truth, and rewrite its summary, figures and page.
 
     Args:
         folder: of a finished run.
         truth: truth.csv, a log or a folder of photographs; None is the one that the run had.
+        force: without another truth, whether the page may lose frames that are not there any more.
         progress: is shown what the run does.
 
     Returns:
         The summary.
 
     Raises:
-        TelemetryError: the folder holds no finished track, or no truth is known.
+        TelemetryError: the folder holds no finished track.
+        OptionError: the page would lose its frames.
     """
-    folder = Path(folder)
-    read_track(folder / TRACK)  # what is wrong with it is said first
-    if truth is None and read_record(folder / SUMMARY).truth is None:
-        raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
-    return redraw(folder, truth, progress=progress)
+    return redraw(Path(folder), truth, keep_frames=truth is None and not force, progress=progress)
 
 
 def redraw(

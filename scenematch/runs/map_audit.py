@@ -71,8 +71,8 @@ class MapAudit:
 def audit_map(
     files: AuditFiles,
     out: StrPath,
+    options: AuditOptions | None = None,
     *,
-    prior_sigma_m: float = 10.0,
     force: bool = False,
     progress: Progress = SILENT,
 ) -> MapAudit:
@@ -81,7 +81,7 @@ def audit_map(
     Args:
         files: the map, and what it is audited for.
         out: the folder.
-        prior_sigma_m: of the position before a match.
+        options: what is assumed; None is the defaults.
         force: whether the folder may be there already.
         progress: is shown what the audit does.
 
@@ -93,7 +93,7 @@ def audit_map(
     require("matplotlib", "desk")
     out = Path(out)
     check_folder(out, force)
-    plan, waypoints = _plan(files, prior_sigma_m, progress)
+    plan, waypoints = _plan(files, options or AuditOptions(), progress)
     prepare_folder(out, force, OWNED)
     audit = gather(plan, progress.track(measure_self_match(plan), len(plan), "auditing"))
     route = None if waypoints is None else predict_route(audit, *waypoints.T)
@@ -104,7 +104,7 @@ def audit_map(
 
 
 def _plan(
-    files: AuditFiles, prior_sigma_m: float, progress: Progress
+    files: AuditFiles, options: AuditOptions, progress: Progress
 ) -> tuple[AuditPlan, NDArray[np.float64] | None]:
     """What is audited, and the (N, 2) waypoints of the route in degrees."""
     around = parse_circle("around", files.around)
@@ -119,7 +119,7 @@ def _plan(
     height_m = PAPER_HEIGHT_M if files.height_agl_m is None else files.height_agl_m
     with renamed_in_errors(part="route"):
         part = _part(around, waypoints, files.corridor_m, site)
-        plan = plan_audit(site, camera, height_m, AuditOptions(prior_sigma_m=prior_sigma_m), other, part)
+        plan = plan_audit(site, camera, height_m, options, other, part)
     _check_size(plan, part)
     return plan, waypoints
 

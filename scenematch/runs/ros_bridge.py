@@ -102,16 +102,17 @@ def run_ros_bridge(
     camera = None if ros.camera.camera is None else ros.camera.load(None)
     node = node or _node(ros.version, ros.arguments)
     camera = camera or _heard_camera(node, ros, progress)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
 
-    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:
-            if settings.realtime is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
+            scheduling = settings.scheduling()
+            if scheduling is not None:  # this thread, too, may hold Python's lock
+                set_realtime(replace(scheduling, cores=()))  # of which a camera's command would inherit
             report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat:
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from engine.errors import OptionError, TelemetryError
@@ -18,7 +18,6 @@ from scenematch.runs.checks import check_position
 from scenematch.runs.folders import StrPath
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
-from scenematch.runs.settings import with_weights
 
 
 def locate_image(
@@ -32,8 +31,8 @@ def locate_image(
     pitch_deg: float | None = None,
     start: str | None = None,
     method: str = "auto",
-    weights: Sequence[StrPath] = (),
     device: str = "auto",
+    options: MatcherOptions | None = None,
     progress: Progress = SILENT,
 ) -> Fix | NoFix:
     """Match one image. Height, attitude and position are the arguments', not those of a photograph's EXIF.
@@ -48,8 +47,8 @@ def locate_image(
         pitch_deg: nose up.
         start: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
         method: "ncc", "sift", "auto" or "learned".
-        weights: files of the learned method.
         device: where tensors live.
+        options: settings of the methods; None is the defaults.
         progress: is shown the copying of the map.
 
     Raises:
@@ -61,7 +60,6 @@ def locate_image(
     }  # fmt: skip
     _check_numbers(known)
     check_choice("method", method, METHODS)
-    options = MatcherOptions(learned=with_weights(method, weights))
     check_device(device)
     prior = parse_position("start", start)
     site = MapInput.of(map).open(progress)

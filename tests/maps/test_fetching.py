@@ -515,7 +515,7 @@ def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
     out = tmp_path / "map.tif"
     given = [
         "map", "fetch", f"--around={middle}", "--radius-m=50", f"--source={server.url}/wms", f"--out={out}",
-        "--pause-ms=0", "--json",
+        "--settings=fetch.pause_ms=0", "--json",
     ]  # fmt: skip
     assert run([*given, "--dry-run"]) == 0
     planned = json.loads(capsys.readouterr().out)
@@ -529,8 +529,8 @@ def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
     assert run(given) == 2
     found = json.loads(capsys.readouterr().out)
     assert (found["argument"], "exists" in found["error"]) == ("--out", True)
-    assert run([*given, "--force", "--max-tiles=1", "--radius-m=150"]) == 2
-    assert "--max-tiles: expected at most 1 tiles" in capsys.readouterr().err
+    assert run([*given, "--force", "--settings=fetch.max_tiles=1", "--radius-m=150"]) == 2
+    assert "--settings fetch.max_tiles: expected at most 1 tiles" in capsys.readouterr().err
 
 
 def test_around_photographs_the_map_holds_what_they_saw_as_fine_as_their_height_needs(server, tmp_path):

@@ -160,7 +160,7 @@ def test_the_method_without_weights_says_which_it_takes(ground, camera):
 
 
 def test_weights_belong_to_the_learned_method(tmp_path):
-    with pytest.raises(OptionError, match="weights: expected them with method learned, got method 'ncc'"):
+    with pytest.raises(OptionError, match="weights: expected them with method learned, got method 'auto'"):
         load_settings(None, weights=["w.pth"])
     with pytest.raises(OptionError, match="weights: expected them with a run by learned, got ncc"):
         parse_runs(["ncc"], weights=["w.pth"])
@@ -171,7 +171,7 @@ def test_weights_belong_to_the_learned_method(tmp_path):
         TrackSettings(method="learned", profile="paper")
     path = tmp_path / "s.toml"
     path.write_text('method = "learned"\n[learned]\nweights = ["a.pth", "b.pth"]\n')
-    assert load_settings(path).learned.weights == ("a.pth", "b.pth")
+    assert load_settings(path).learned.weights == tuple(str(Path(name).resolve()) for name in ("a.pth", "b.pth"))
 
 
 def test_settings_of_the_learned_method_are_checked():

@@ -334,4 +334,4 @@ def test_it_is_asked_for_by_a_setting_and_not_with_the_papers_recipe():
     assert not TrackSettings().navigator.odometry
     assert load_settings(None, odometry=True).navigator.odometry
     with pytest.raises(OptionError, match=r"^odometry: expected with `profile` engine"):
-        load_settings(None, odometry=True, profile="paper")
+        load_settings(None, odometry=True, profile="paper", method="ncc")

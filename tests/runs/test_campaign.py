@@ -279,7 +279,7 @@ def test_an_input_that_changed_on_disk_changes_its_print(place, tmp_path):
         ('run = ["ncc"]', "run: not a setting; did you mean runs?"),
         ("runs = ['ncc']\n[flights.a]\nfodler = 'x'", "flights.a.fodler: not a setting; did you mean folder?"),
         ("runs = ['ncc']\n[simulated]\nseed = [1]", "simulated.seed: not a setting; did you mean seeds?"),
-        ("runs = 'ncc'", "runs: expected a list, got 'ncc'"),
+        ("[runs]\nncc = 1", "runs: expected a list, got {'ncc': 1}"),
         ("flights = ['a']", "flights: expected tables [flights.NAME], got ['a']"),
         ("[simulated]\nseeds = [1.5]", "simulated.seeds: expected a whole number, got 1.5"),
         ("[simulated]\nseeds = [-1]", "simulated.seeds: expected 0 or more, got -1"),

@@ -218,7 +218,7 @@ def test_a_live_camera_that_gives_no_picture_is_not_waited_for_without_end(monke
 
 def test_the_delay_of_a_camera_needs_to_know_its_lens(capsys):
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
-    command = ["bridge", "camera-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
+    command = ["bridge", "mavlink", "--measure-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
     assert run(command) == 2
     assert "--camera: expected a calibration, or --hfov-deg" in capsys.readouterr().err
 
@@ -331,7 +331,7 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
     write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
     arguments = ["locate", str(photos / "0.jpg"), "--map", str(path), "--camera", str(calibration)]
     assert run(arguments) == 1
-    assert "made smaller or larger as a whole, add --scale-calibration" in capsys.readouterr().err
+    assert "made smaller or larger as a whole, add --settings input.scale_calibration" in capsys.readouterr().err
 
 
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):

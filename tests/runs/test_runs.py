@@ -125,9 +125,9 @@ def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     track(files, tmp_path / "out", report=False, progress=progress)
     (flight / "frames" / "spare.jpg").unlink()
     counted = [(done, FRAMES) for done in range(FRAMES + 1)]
-    assert progress.updates["ncc, engine profile"] == counted
+    assert progress.updates["auto, engine profile"] == counted
     assert progress.updates["checking pictures"] == counted
-    assert progress.finished[-1] == "ncc, engine profile"
+    assert progress.finished[-1] == "auto, engine profile"
     assert progress.messages == ["frames without a row in the telemetry, left out: 1"]
 
 
@@ -273,7 +273,7 @@ def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, 
     last[names.index("heading_deg")] = ""
     telemetry = tmp_path / "telemetry.csv"
     telemetry.write_text("\n".join([*lines[:-1], ",".join(last)]), encoding="utf-8")
-    findings = [Finding("radians", "the heading is in radians", "--angles radians")] if is_wrong else []
+    findings = [Finding("radians", "the heading is in radians", "--correct angles=radians")] if is_wrong else []
     found = Diagnosis(findings, 16, 16, ("attitude",), (Contradiction("heading", 6 * is_wrong, 16),))
     monkeypatch.setattr("scenematch.runs.tracking.diagnose_flight", lambda *_, **__: found)
     given = {name: flight / file for name, file in FOLDER_LAYOUT.items() if name != "telemetry"}
@@ -283,5 +283,5 @@ def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, 
     said = summary["settings"]["diagnosis"]
     assert (said is not None) == is_wrong
     if said:
-        assert said["radians"] == "the heading is in radians; try --angles radians"
+        assert said["radians"] == "the heading is in radians; try --correct angles=radians"
         assert said["pictures"].endswith("; 6 of 16 (38%) contradict the heading")

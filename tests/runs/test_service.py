@@ -224,7 +224,7 @@ def test_the_unit_grants_what_real_time_asks_for(unit):
     for cure in (_FIFO_CURE, _MEMORY_CURE):
         name, value = re.search(r"(Limit\w+)=(\w+)", cure).groups()
         assert unit[name] == value
-    assert "--realtime" in unit["ExecStart"]
+    assert "bridge.realtime=true" in unit["ExecStart"]
 
 
 def test_the_unit_hears_the_worker_of_a_supervisor_and_has_a_watchdog(unit):
@@ -248,7 +248,9 @@ def test_the_units_command_is_one_of_the_command_line(unit):
     program, *words = unit["ExecStart"].split()
     assert program.endswith("/scenematch")
     assert run([*words, "--help"]) == 0
-    asked = [word.replace("/srv/scenematch", "/nowhere") for word in words if word != "--realtime"]
+    asked = [
+        word.replace("/srv/scenematch", "/nowhere").replace("realtime=true", "realtime=false") for word in words
+    ]
     assert run(asked) == 1  # every option is known: what is wrong is the map, which is not there
 
 

@@ -11,12 +11,13 @@ import typer
 from engine.errors import OptionError
 from scenematch.cli import console
 from scenematch.cli.options import (
+    MAP,
+    OUTPUT,
     ForceOption,
     JsonOption,
-    RerunConnectOption,
     RerunOption,
     SurfaceOption,
-    ThreadsOption,
+    live_view,
     use_threads,
 )
 
@@ -31,7 +32,10 @@ _FLIGHT = {
 
 
 def simulate(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Flight folder, created by this run.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="DIR", help="Flight folder, created by this run.", rich_help_panel=OUTPUT),
+    ],
     seed: Annotated[
         int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
     ] = 1,
@@ -46,7 +50,10 @@ def simulate(
     ] = None,
     relief_m: Annotated[float, typer.Option("--relief-m", metavar="H", help="Height of a town's hills.")] = 0.0,
     map_path: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Your own map as the world, in place of a town.")
+        Path | None,
+        typer.Option(
+            "--map", metavar="FILE", help="Your own map as the world, in place of a town.", rich_help_panel=MAP
+        ),
     ] = None,
     surface: SurfaceOption = None,
     camera_pitch_deg: Annotated[
@@ -69,13 +76,7 @@ def simulate(
         str | None,
         typer.Option("--fault", metavar="none|killed|shifted|frozen", help="With --closed-loop: what goes wrong."),
     ] = None,
-    recording: RerunOption = None,
-    viewer: RerunConnectOption = None,
-    device: Annotated[
-        str | None,
-        typer.Option("--device", metavar="auto|cpu|cuda", help="With --closed-loop: where tensors live."),
-    ] = None,
-    threads: ThreadsOption = 1,
+    rerun: RerunOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -85,11 +86,10 @@ def simulate(
     folder holds its track, estimate, figures and summary too.
     """
     from scenematch.runs.arguments import check_unused
-    from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.simulation import WorldSettings
     from scenematch.runs.simulation import simulate as simulate_flight
 
-    use_threads(threads)
+    use_threads()
     world = WorldSettings(
         seed=seed,
         condition=condition,
@@ -98,14 +98,14 @@ def simulate(
         surface=surface,
         camera_pitch_deg=camera_pitch_deg,
     )
-    loop = {"minutes": minutes, "method": method, "fault": fault, "device": device}
+    loop = {"minutes": minutes, "method": method, "fault": fault}
     if not closed_loop:
-        check_unused(loop | {"recording": recording, "viewer": viewer}, "closed_loop")
+        check_unused(loop | {"rerun": rerun}, "closed_loop")
         facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
     elif frames is not None:
         raise OptionError("frames: expected without `closed_loop`, which has `minutes`")
     else:
-        facts = _fly_closed_loop(out, world, loop, LiveViewTarget(recording, viewer), force)
+        facts = _fly_closed_loop(out, world, loop, live_view(rerun), force)
     console.facts(facts, as_json, title=f"simulated flight {seed}")
     flight = {name: out / file for name, file in _FLIGHT.items()}
     if not closed_loop:
@@ -117,10 +117,10 @@ def simulate(
 
 
 def _fly_closed_loop(
-    out: Path, world: WorldSettings, loop: Mapping[str, Any], live_view: LiveViewTarget, force: bool
+    out: Path, world: WorldSettings, loop: Mapping[str, Any], shown: LiveViewTarget, force: bool
 ) -> dict[str, Any]:
     """The figures of a flight by the engine's fixes; what is None of the loop's settings is its default."""
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
 
     settings = ClosedLoopSettings(**{name: value for name, value in loop.items() if value is not None})
-    return fly_closed_loop(out, world, settings, force=force, live_view=live_view, progress=console.PROGRESS)
+    return fly_closed_loop(out, world, settings, force=force, live_view=shown, progress=console.PROGRESS)
