@@ -135,11 +135,11 @@ JsonOption = Annotated[
     bool, typer.Option("--json", help="Results as JSON on standard output.", rich_help_panel=OUTPUT)
 ]
 RerunOption = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--rerun",
         metavar="FILE.rrd|HOST:PORT",
-        help="Record the live view, or show it in a viewer of rerun that listens.",
+        help="Record the live view, or show it in a viewer of rerun that listens; both if repeated.",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -203,7 +203,9 @@ class FlightOptions(CameraOptions, MapOptions):
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """A command whose parameters of the types above are replaced by their fields, one option each."""
     hints = get_type_hints(command, include_extras=True)
-    groups: dict[str, type[Any]] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    groups: dict[str, type[Any]] = {
+        name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)
+    }
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
         kind, keyword = groups.get(name), inspect.Parameter.KEYWORD_ONLY
@@ -257,12 +259,22 @@ def table(settings: Settings, name: str, **given: Any) -> Any:
     return settings.table(name, **given)
 
 
-def live_view(rerun: str | None) -> LiveViewTarget:
-    """Where the live view goes: into a file, or to a viewer."""
+def live_view(rerun: Sequence[str] | None) -> LiveViewTarget:
+    """Where the live view goes: into a file, to a viewer, or both.
+
+    Raises:
+        OptionError: there are two files, or two viewers.
+    """
+    from engine.errors import OptionError
     from scenematch.runs.live_viewing import LiveViewTarget
 
-    is_viewer = rerun is not None and ":" in rerun and not rerun.endswith(".rrd")
-    return LiveViewTarget(viewer=rerun) if is_viewer else LiveViewTarget(recording=rerun)
+    given: dict[str, str] = {}
+    for text in rerun or ():
+        kind = "viewer" if ":" in text and not text.endswith(".rrd") else "recording"
+        if kind in given:
+            raise OptionError(f"{kind}: expected one file and one viewer at most, got {given[kind]} and {text}")
+        given[kind] = text
+    return LiveViewTarget(**given)
 
 
 def flight_options(files: FlightFiles, *, settings: Sequence[str] | None = None, start: str | None = None) -> str:

@@ -1,4 +1,4 @@
-"""The node: what `scenematch bridge ros --ros 2` takes as options, this takes as ROS parameters."""
+"""The node: what `scenematch bridge ros` takes as options, this takes as ROS parameters."""
 
 import sys
 
