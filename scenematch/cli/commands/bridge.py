@@ -32,6 +32,8 @@ from scenematch.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings
     from scenematch.runs.settings import Settings
 
@@ -121,18 +123,55 @@ class MatchingOptions:
         return made
 
 
+@dataclass(frozen=True, kw_only=True)
+class OptionalMapOptions:
+    """The map, which only fixes need."""
+
+    map: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.", rich_help_panel=MAP
+        ),
+    ] = None
+    surface: SurfaceOption = None
+
+    def map_input(self, settings: Settings) -> MapInput:
+        """The map with what the settings say of it."""
+        if self.map is None:
+            raise OptionError("map: expected a file, got none")
+        return MapOptions(map=self.map, surface=self.surface).map_input(settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OtherWork:
+    """What is done in place of fixes."""
+
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--write-params",
+            metavar="FILE",
+            help="Write the autopilot's parameters for these fixes, and end.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None
+    measure_delay: Annotated[
+        bool,
+        typer.Option(
+            "--measure-delay",
+            help="Measure how late the camera's pictures arrive, and end.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False
+
+
 @with_options
 def mavlink(
     autopilot: LinkOptions,
     pictures: PictureOptions,
     matching: MatchingOptions,
-    map_path: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.", rich_help_panel=MAP
-        ),
-    ] = None,
-    surface: SurfaceOption = None,
+    site: OptionalMapOptions,
+    other: OtherWork,
     supervise: Annotated[
         bool,
         typer.Option(
@@ -143,23 +182,6 @@ def mavlink(
     ] = False,
     settings: SettingsOption = None,
     rerun: RerunOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--write-params",
-            metavar="FILE",
-            help="Write the autopilot's parameters for these fixes, and end.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    measure_delay: Annotated[
-        bool,
-        typer.Option(
-            "--measure-delay",
-            help="Measure how late the camera's pictures arrive, and end.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -170,18 +192,30 @@ def mavlink(
     PX4 to fly by these fixes. With --measure-delay it compares the turns that the pictures show with those of the
     autopilot's attitude, while the vehicle is tilted to and fro by hand.
     """
-    given = read_settings(settings)
-    if out is not None:
-        _write_parameters(autopilot, given, out, force, as_json)
-        return
-    if autopilot.connect is None:
+    given, hint = read_settings(settings), ""
+    if other.out is not None:
+        following = _write_parameters(autopilot, given, other.out, force, as_json)
+        hint = f"load {other.out} into the autopilot"
+    elif autopilot.connect is None:
         raise OptionError("connect: expected a link to the autopilot, got none")
-    if measure_delay:
-        _measure_delay(autopilot, pictures, given, as_json)
-        return
-    if map_path is None:
-        raise OptionError("map: expected a file, got none")
-    site = MapOptions(map=map_path, surface=surface)
+    elif other.measure_delay:
+        following = _measure_delay(autopilot, pictures, given, as_json)
+    else:
+        following = _bridge(autopilot, pictures, matching, site, given, supervise, live_view(rerun), as_json)
+    console.next_step(following, as_json=as_json, hint=hint)
+
+
+def _bridge(
+    autopilot: LinkOptions,
+    pictures: PictureOptions,
+    matching: MatchingOptions,
+    site: OptionalMapOptions,
+    given: Settings,
+    supervise: bool,
+    shown: LiveViewTarget,
+    as_json: bool,
+) -> str:
+    """Bridge until the end; what comes after it."""
     from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.mavlink_bridge import run_mavlink_bridge
 
@@ -194,19 +228,18 @@ def mavlink(
         **table(given, "input").of(BridgeFiles),
     )
     link, how = autopilot.link(given), matching.bridge_settings(given)
-    status = run_mavlink_bridge(
-        files, link, how, supervise=supervise, live_view=live_view(rerun), progress=console.PROGRESS
-    )
+    status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {link.connect}")
     flown = console.options(
-        map=map_path, surface=surface, camera=pictures.camera, hfov_deg=pictures.hfov_deg, frames=pictures.frames,
-        telemetry=pictures.telemetry,
+        map=site.map, surface=site.surface, camera=pictures.camera, hfov_deg=pictures.hfov_deg,
+        frames=pictures.frames, telemetry=pictures.telemetry,
     )  # fmt: skip
     recorded = "" if pictures.frames else " --frames VIDEO --telemetry LOG"
-    console.next_step(f"track {flown}{recorded} --out out", as_json=as_json)
+    return f"track {flown}{recorded} --out out"
 
 
-def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> None:
+def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> str:
+    """Measure and print; what comes after it."""
     from scenematch.runs.camera_delay import measure_camera_delay
 
     source = pictures.camera_source
@@ -223,10 +256,11 @@ def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: S
         connect=link.connect, camera=pictures.camera, hfov_deg=pictures.hfov_deg, camera_source=source,
         settings=f"input.exposure_to_grab_ms={delay_ms}",
     )  # fmt: skip
-    console.next_step(f"bridge mavlink --map MAP {same}", as_json=as_json)
+    return f"bridge mavlink --map MAP {same}"
 
 
-def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> None:
+def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> str:
+    """Write and say so; what comes after it."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
     written = write_parameter_file(file, autopilot.link(settings), table(settings, "parameters"), force=force)
@@ -234,11 +268,7 @@ def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, fo
         console.print_json({"parameters": str(file)} | asdict(written))
     else:
         console.say(f"written to {file}, for a delay of {written.delay_ms} ms ({written.delay_source})")
-    console.next_step(
-        "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE",
-        as_json=as_json,
-        hint=f"load {file} into the autopilot",
-    )
+    return "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
 
 
 @with_options

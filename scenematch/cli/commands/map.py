@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from scenematch.cli.options import (
     SurfaceOption,
     read_settings,
     table,
+    with_options,
 )
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")]
@@ -114,38 +116,46 @@ def audit(
     console.next_step(f"track {files_given} --frames FRAMES --out out", as_json=as_json)
 
 
-def fetch(
+@dataclass(frozen=True, kw_only=True)
+class WantedMap:
+    """What is fetched."""
+
     around: Annotated[
         str, typer.Option("--around", metavar="LAT,LON|DIR", help="The middle; or photographs with positions.")
-    ],
+    ]
     source: Annotated[
         str,
         typer.Option(
             "--source", metavar="URL", help="Tiles as https://host/{z}/{x}/{y}.png, or a WMS or WMTS: your choice."
         ),
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.", rich_help_panel=OUTPUT)
-    ],
+    ]
     radius_m: Annotated[
         float | None,
         typer.Option("--radius-m", metavar="M", help="To each edge, at least; else what the photographs saw."),
-    ] = None,
+    ] = None
     gsd_m_per_px: Annotated[
         float | None,
         typer.Option(
             "--gsd-m-per-px", metavar="M", help="Tiles are so fine or finer; 0.5, or as photographs need."
         ),
-    ] = None,
+    ] = None
     layer: Annotated[
         str | None, typer.Option("--layer", metavar="NAME", help="Of a WMS or WMTS that has several.")
-    ] = None,
+    ] = None
     surface: Annotated[
         str | None,
         typer.Option(
             "--surface", metavar="FILE|URL", help="Heights to cut out as well; {lat} and {lon} as N48 and E016."
         ),
-    ] = None,
+    ] = None
+
+
+@with_options
+def fetch(
+    what: WantedMap,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.", rich_help_panel=OUTPUT)
+    ],
     settings: SettingsOption = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say what would be fetched.", rich_help_panel=EXPERT)
@@ -160,24 +170,14 @@ def fetch(
     """
     from scenematch.runs.map_fetch import fetch_map
 
-    wanted = table(
-        read_settings(settings),
-        "fetch",
-        around=around,
-        source=source,
-        radius_m=radius_m,
-        gsd_m_per_px=gsd_m_per_px,
-        layer=layer,
-        surface=surface,
-        dry_run=dry_run,
-        force=force,
-    )
+    given = asdict(what) | {"dry_run": dry_run, "force": force}
+    wanted = table(read_settings(settings), "fetch", **given)
     facts = fetch_map(wanted, out, console.PROGRESS)
-    console.facts(facts, as_json, title=f"map around {around}")
+    console.facts(facts, as_json, title=f"map around {what.around}")
     if dry_run:
-        given = console.options(around=around, radius_m=radius_m)
+        place = console.options(around=what.around, radius_m=what.radius_m)
         console.next_step(
-            f"map fetch {given} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
+            f"map fetch {place} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
         )
     else:
         console.next_step(f"map info {console.quoted(out)}", as_json=as_json)
