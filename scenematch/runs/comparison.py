@@ -30,7 +30,6 @@ def parse_runs(
     texts: Sequence[str] = (),
     *,
     settings: Sequence[StrPath] = (),
-    weights: Sequence[StrPath] = (),
     **overrides: Any,
 ) -> dict[str, TrackSettings]:
     """Settings by the name of their run, from METHOD, METHOD/PROFILE or a settings file each.
@@ -38,7 +37,6 @@ def parse_runs(
     Args:
         texts: one a run; none of them is :data:`DEFAULT_RUNS`.
         settings: of all runs, files or NAME=VALUE; a run's own file counts more.
-        weights: files of the runs by the learned method.
         overrides: settings that hold for all of them, where not None.
 
     Raises:
@@ -47,23 +45,18 @@ def parse_runs(
     texts = texts or DEFAULT_RUNS
     runs: dict[str, TrackSettings] = {}
     for text in texts:
-        name, parsed = _parse_run(text, settings, weights, overrides)
+        name, parsed = _parse_run(text, settings, overrides)
         if name in runs:
             raise OptionError(f"runs: expected runs of different names, got {name!r} twice")
         runs[name] = parsed
-    if weights and not any(each.method == "learned" for each in runs.values()):
-        raise OptionError(f"weights: expected them with a run by learned, got {', '.join(runs)}")
     return runs
 
 
-def _parse_run(
-    text: str, settings: Sequence[StrPath], weights: Sequence[StrPath], overrides: Mapping[str, Any]
-) -> tuple[str, TrackSettings]:
+def _parse_run(text: str, settings: Sequence[StrPath], overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
     method, slash, profile = text.partition("/")
-    weights = weights if method == "learned" else ()
     if method in METHODS and not Path(text).is_file():
         chosen: dict[str, Any] = {"method": method, "profile": profile} if slash else {"method": method}
-        return text.replace("/", "-"), load_settings(*settings, weights=weights, **overrides, **chosen)
+        return text.replace("/", "-"), load_settings(*settings, **overrides, **chosen)
     if not Path(text).is_file():
         raise OptionError(
             f"runs: expected {', '.join(METHODS)}, one of them with /paper, or a settings file, got {text!r}"

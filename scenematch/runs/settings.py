@@ -191,7 +191,8 @@ class Settings:
         """
         values = {name: value for name, value in self._values().items() if name not in (*TABLES, "threads")}
         found: TrackSettings = self._built(TrackSettings, values, "", given)
-        return replace(found, learned=with_weights("learned", found.learned.weights, found.learned))
+        weights = tuple(str(Path(path).resolve()) for path in found.learned.weights)  # as a record keeps them
+        return replace(found, learned=replace(found.learned, weights=weights))
 
     def table(self, name: str, **given: Any) -> Any:
         """A table of :data:`TABLES`.
@@ -244,36 +245,15 @@ def documented_settings() -> str:
     return "\n".join(texts)
 
 
-def load_settings(
-    *texts: StrPath | None, weights: Sequence[StrPath] = (), odometry: bool = False, **overrides: Any
-) -> TrackSettings:
-    """The settings of a file, or the defaults, with what overrides them.
+def load_settings(*texts: StrPath | None, **overrides: Any) -> TrackSettings:
+    """The settings of files, or the defaults, with what overrides them.
 
     Args:
         texts: TOML files as ``scenematch doctor --settings`` prints one, or NAME=VALUE, the later counting more;
             None is the defaults.
-        weights: files of the learned method, in place of those of the settings file.
-        odometry: whether pictures are followed where there is no velocity, whatever the file says.
-        overrides: settings by name that count more than the file; None is none.
+        overrides: settings by name that count more; None is none.
 
     Raises:
-        OptionError, OSError: see :meth:`Settings.track`.
+        OptionError, OSError: see :meth:`Settings.read` and :meth:`Settings.track`.
     """
-    settings = Settings.read([text for text in texts if text is not None]).track(**overrides)
-    if odometry:
-        settings = replace(settings, navigator=replace(settings.navigator, odometry=True))
-    if not weights:
-        return settings
-    return replace(settings, learned=with_weights(settings.method, weights, settings.learned))
-
-
-def with_weights(method: str, weights: Sequence[StrPath], options: LearnedOptions | None = None) -> LearnedOptions:
-    """The settings of the learned method with these files, by their whole paths.
-
-    Raises:
-        OptionError: there are files, and the method is another.
-    """
-    options = options or LearnedOptions()
-    if weights and method != "learned":
-        raise OptionError(f"weights: expected them with method learned, got method {method!r}")
-    return replace(options, weights=tuple(str(Path(path).resolve()) for path in weights))
+    return Settings.read([text for text in texts if text is not None]).track(**overrides)
