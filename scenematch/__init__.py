@@ -1,4 +1,4 @@
-"""The product around the engine: track a flight, compare methods, campaigns, simulation, bridges, as a library.
+"""The product around the engine: track a flight, compare methods, simulation, bridges, as a library.
 
 ::
 
@@ -17,15 +17,11 @@ from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from scenematch.files.corrections import Corrections
-    from scenematch.files.datasets.sequence import ImportOptions
-    from scenematch.runs.bag_conversion import convert_to_bag
     from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.cameras import CameraInput
-    from scenematch.runs.campaign import run_campaign
     from scenematch.runs.checking import diagnose_flight
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
     from scenematch.runs.comparison import compare, parse_runs
-    from scenematch.runs.dataset_import import PhotographOptions, check_flight, import_dataset, import_photographs
     from scenematch.runs.demo import run_demo
     from scenematch.runs.evaluation import evaluate
     from scenematch.runs.inputs import FlightFiles
@@ -57,32 +53,25 @@ __all__ = [
     "Corrections",
     "FetchSettings",
     "FlightFiles",
-    "ImportOptions",
     "LiveViewTarget",
     "MapAudit",
     "MapInput",
     "MavlinkSettings",
-    "PhotographOptions",
     "Progress",
     "RosSettings",
     "TrackSettings",
     "WorldSettings",
     "audit_map",
-    "check_flight",
     "compare",
-    "convert_to_bag",
     "diagnose_flight",
     "evaluate",
     "export_track",
     "fetch_map",
     "fly_closed_loop",
-    "import_dataset",
-    "import_photographs",
     "load_settings",
     "locate_image",
     "parse_runs",
     "report",
-    "run_campaign",
     "run_demo",
     "run_mavlink_bridge",
     "run_ros_bridge",
@@ -93,14 +82,10 @@ __all__ = [
 
 _NAMES = {
     "scenematch.files.corrections": "Corrections",
-    "scenematch.files.datasets.sequence": "ImportOptions",
-    "scenematch.runs.bag_conversion": "convert_to_bag",
-    "scenematch.runs.campaign": "run_campaign",
     "scenematch.runs.cameras": "CameraInput",
     "scenematch.runs.checking": "diagnose_flight",
     "scenematch.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
     "scenematch.runs.comparison": "compare parse_runs",
-    "scenematch.runs.dataset_import": "PhotographOptions check_flight import_dataset import_photographs",
     "scenematch.runs.demo": "run_demo",
     "scenematch.runs.evaluation": "evaluate",
     "scenematch.runs.inputs": "FlightFiles",

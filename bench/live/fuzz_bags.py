@@ -48,9 +48,9 @@ def damaged(source: Path, target: Path, rng: np.random.Generator) -> None:
 
 
 def small_bag(path: Path, kind: str) -> None:
+    from bench.inputs.bags import write_bag
     from engine.camera import Camera
     from engine.values import Frame, Prior
-    from scenematch.files.ros.bag_writer import write_bag
 
     rng = np.random.default_rng(1)
     frames = [
@@ -92,7 +92,7 @@ def _worker(tasks: multiprocessing.Queue, answers: multiprocessing.Queue) -> Non
 
 def fuzz(count: int, seed: int) -> tuple[Counter[str], float, list[float]]:
     """So many damaged bags, read in a process that is ended where it hangs; outcomes, and processor times."""
-    from scenematch.files.ros.bag_writer import BAG_KINDS
+    from bench.inputs.bags import BAG_KINDS
 
     context = multiprocessing.get_context("spawn")
     rng, outcomes, times = np.random.default_rng(seed), Counter[str](), []

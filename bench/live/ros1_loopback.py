@@ -85,9 +85,9 @@ def play(plan, frames, rate_hz):
     import genpy
     import rospy
 
+    from bench.inputs.bags import BagMessages
     from scenematch.bridges.ros import find_class
     from scenematch.files.ros import bags
-    from scenematch.files.ros.messages import MessageFactory
 
     rospy.init_node("player", disable_signals=True)
     listener = Listener(rospy)
@@ -96,7 +96,7 @@ def play(plan, frames, rate_hz):
              bags.HEIGHT: "std_msgs/msg/Float64", bags.VELOCITY: "geometry_msgs/msg/TwistStamped"}  # fmt: skip
     out = {name: rospy.Publisher(name, find_class(kind), queue_size=10, tcp_nodelay=True)
            for name, kind in kinds.items()}  # fmt: skip
-    maker = MessageFactory(find_class, True, genpy.Time, octets=lambda values: values.tobytes())
+    maker = BagMessages(find_class, True, genpy.Time, octets=lambda values: values.tobytes())
     end = time.monotonic() + 120.0
     while not out[bags.IMAGE].get_num_connections():  # the node first asks for the calibration
         if time.monotonic() > end:

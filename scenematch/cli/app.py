@@ -20,12 +20,9 @@ from scenematch.cli.argument_names import (
     urls_as_typed,
 )
 from scenematch.cli.commands import (
-    bag,
     bridge,
-    campaign,
     check,
     compare,
-    dataset,
     demo,
     doctor,
     evaluate,
@@ -44,7 +41,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},  # commands inherit it
 )
 map_app = typer.Typer(help="A map: facts, audit, fetching.")
-dataset_app = typer.Typer(help="Published data sets.")
 bridge_app = typer.Typer(help="Live, beside an autopilot.")
 
 # In the order of the help.
@@ -52,22 +48,17 @@ app.command(cls=Command)(demo.demo)
 app.command(cls=Command)(check.check)
 app.command(cls=Command)(track.track)
 app.command(cls=Command)(compare.compare)
-app.command(cls=Command)(campaign.campaign)
 app.command(cls=Command)(locate.locate)
 app.command(cls=Command)(simulate.simulate)
 app.command(cls=Command)(evaluate.evaluate)
 app.command(cls=Command)(export.export)
-app.command(cls=Command)(bag.bag)
 app.command(cls=Command)(doctor.doctor)
 map_app.command("info", cls=Command)(map_commands.info)
 map_app.command("audit", cls=Command)(map_commands.audit)
 map_app.command("fetch", cls=Command)(map_commands.fetch)
-dataset_app.command("import", cls=Command)(dataset.import_dataset)
-dataset_app.command("check", cls=Command)(dataset.check)
 bridge_app.command("mavlink", cls=Command)(bridge.mavlink)
 bridge_app.command("ros", cls=Command)(bridge.ros)
 app.add_typer(map_app, name="map")
-app.add_typer(dataset_app, name="dataset")
 app.add_typer(bridge_app, name="bridge")
 
 # typer brings its own copy of click, or depends on click: what it raises is found by descent, not by import.

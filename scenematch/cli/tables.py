@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scenematch.cli import console
 
 if TYPE_CHECKING:
-    from scenematch.files.truth_checks import TruthFinding
     from scenematch.runs.map_audit import MapAudit
 
 COLUMNS = ("RMS m", "p50 ms", "p95 ms", "fixed", "false", "NEES", "up m")
@@ -120,9 +119,3 @@ def print_audit(result: MapAudit, title: str) -> None:
             )
             pairs.append((f"poor: {one.flag}", f"{ends}, {one.length_m:,.0f} m, {one.availability:.0%}"))
     console.print_pairs(f"audit of {title}", pairs)
-
-
-def print_findings(findings: Sequence[TruthFinding], title: str) -> None:
-    """A line a finding."""
-    pairs = [(finding.kind, finding.text) for finding in findings] or [("nothing found", "")]
-    console.print_pairs(title, pairs)

@@ -1,1 +1,1 @@
-"""Maps fetched from servers that the user names: tiles by XYZ and WMTS, pictures by WMS, heights by files."""
+"""Maps fetched from servers that the user names, by GDAL: tiles, WMS and WMTS, and heights by files."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -22,8 +21,9 @@ from numpy.typing import NDArray
 from engine.errors import MapError, OptionError
 from engine.maps.rasters import open_source, vertical_datum
 from engine.maps.xyz_tiles import TileCache
-from scenematch.fetch.client import Client, check_url, shown, user_agent
-from scenematch.fetch.mosaic import Bounds
+from scenematch.fetch.grid import reason_of
+from scenematch.fetch.place import Bounds
+from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -35,7 +35,6 @@ GLO30_SLOPE_SIGMA_DEG = 0.5
 """Two heights of GLO-30 differ by less than 2 m from the truth in 90 % (its specification): 1.2 m over 150 m."""
 _MARGIN_PX = 2
 _MARGIN_DEG = 0.001  # GLO-30's files begin and end half a pixel off whole degrees
-_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +67,8 @@ def files_for(template: str, bounds_deg: Bounds) -> list[str]:
     Raises:
         OptionError: a placeholder is unknown or missing, or the URL is none.
     """
-    names = set(_PLACEHOLDER.findall(template))
-    stray = set("{}") & set(_PLACEHOLDER.sub("", template))
+    names = set(PLACEHOLDER.findall(template))
+    stray = set("{}") & set(PLACEHOLDER.sub("", template))
     if stray or names not in (set(), {"lat", "lon"}):
         raise OptionError(
             f"surface: expected {{lat}} and {{lon}} as placeholders, or none, in {shown(template)!r}"
@@ -89,7 +88,7 @@ def files_for(template: str, bounds_deg: Bounds) -> list[str]:
 
 
 def read_part(
-    files: Sequence[str], map_bounds: Bounds, map_crs: CRS, datum: str | None, client: Client
+    files: Sequence[str], map_bounds: Bounds, map_crs: CRS, datum: str | None, timeout_s: float
 ) -> Heights:
     """Heights under a map.
 
@@ -98,7 +97,7 @@ def read_part(
         map_bounds: of the map, in its CRS.
         map_crs: its CRS.
         datum: code of the vertical datum; None is the files' own, else EGM2008 for those named as GLO-30's.
-        client: that asks whether an address has something.
+        timeout_s: of a server, without a byte.
 
     Raises:
         OptionError: the datum is no vertical one in metres, or contradicts that of the files.
@@ -110,13 +109,13 @@ def read_part(
         "GDAL_HTTP_USERAGENT": user_agent(),
         "GDAL_HTTP_MAX_RETRY": 3,
         "GDAL_HTTP_RETRY_DELAY": 2,
-        "GDAL_HTTP_CONNECTTIMEOUT": math.ceil(client.timeout_s),
-        "GDAL_HTTP_LOW_SPEED_TIME": math.ceil(client.timeout_s),  # without a byte; the whole may take longer
+        "GDAL_HTTP_CONNECTTIMEOUT": math.ceil(timeout_s),
+        "GDAL_HTTP_LOW_SPEED_TIME": math.ceil(timeout_s),  # without a byte; the whole may take longer
         "GDAL_HTTP_LOW_SPEED_LIMIT": 1,
         "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # no requests for side files
     }
     with rasterio.Env(**settings), ExitStack() as opened:
-        found = {shown(file): _opened(file, client) for file in files}
+        found = {shown(file): _opened(file) for file in files}
         datasets = {name: dataset for name, dataset in found.items() if dataset is not None}
         for dataset in datasets.values():
             opened.callback(dataset.close)
@@ -125,7 +124,7 @@ def read_part(
         return _joined(datasets, map_bounds, map_crs, datum)
 
 
-def _opened(file: str, client: Client) -> Any:
+def _opened(file: str) -> Any:
     """The dataset of a file of heights; None where it is not there."""
     import rasterio
     from rasterio.errors import RasterioError
@@ -137,13 +136,13 @@ def _opened(file: str, client: Client) -> Any:
         if isinstance(dataset, TileCache):
             raise MapError(f"surface: expected heights, got a folder of pictures, {file}")
         return dataset
-    if client.get(file, first_bytes=4) is None:
-        return None
     try:
         return rasterio.open(f"/vsicurl/{file}", driver="GTiff")
     except RasterioError as error:
-        reason = str(error.__cause__ or error).splitlines()[0]
-        raise MapError(f"{shown(file)}: cannot be read as a GeoTIFF by ranges of bytes: {shown(reason)}") from None
+        reason = reason_of(error)
+    if reason.endswith(("HTTP response code: 404", "HTTP response code: 410")):
+        return None
+    raise MapError(f"{shown(file)}: cannot be read as a GeoTIFF by ranges of bytes: {shown(reason)}")
 
 
 def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum: str | None) -> Heights:

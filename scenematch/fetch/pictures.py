@@ -1,12 +1,11 @@
-"""Pieces of a mosaic: fetched into a folder, where an interrupted fetch finds them again, and made one GeoTIFF."""
+"""Pictures of a server into one GeoTIFF, one request at a time; what was fetched is kept until it is complete."""
 
 from __future__ import annotations
 
-import hashlib
-import io
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,190 +13,151 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
-from scenematch.fetch.client import Answer, Client, shown
-from scenematch.fetch.mosaic import Mosaic, Piece
-from scenematch.fetch.services import snippet
+from scenematch.fetch.grid import Grid, reason_of
+from scenematch.fetch.urls import shown
 
-Pixels = NDArray[np.uint8]
-
-_FORMATS = ("PNG", "JPEG", "WEBP")
-_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # Pillow's, of eight bits or fewer
+ATTEMPTS = 5
+"""How often a picture is asked for before the fetch ends."""
+FIRST_WAIT_S = 2.0
+"""Before the second attempt; doubled for each further one."""
 _OPAQUE = 128
 """Alpha from which a pixel is valid, as where maps are read."""
 _BLOCK_PX = 256
+_CACHED = re.compile(r"[0-9a-f]{32}")  # names that GDAL gives to what it keeps
+_STATUS = re.compile(r"HTTP status code: (\d+), error: (.*?)\.?(?: Add the HTTP|$)")
+_BUSY = re.compile(r"HTTP status code: (429|5\d\d)|timed? ?out|reset by peer|Empty reply", re.IGNORECASE)
 
 
-def piece_file(folder: Path, piece: Piece) -> Path:
-    """Where a piece is kept: by its address, so that another fetch into the same folder finds what it shares."""
-    return folder / f"{hashlib.sha256(piece.url.encode()).hexdigest()[:32]}.piece"
-
-
-def fetch_pieces(mosaic: Mosaic, client: Client, folder: Path) -> Iterator[bool]:
-    """Fetch what is missing in a folder.
-
-    Args:
-        mosaic: what is wanted.
-        client: that asks for it.
-        folder: of the pieces; a piece that the server does not have is an empty file.
-
-    Yields:
-        For each piece, in order: whether it had to be fetched.
-
-    Raises:
-        MapError: the server refuses, or sends something else. What has been fetched stays.
-    """
-    for piece in mosaic.pieces:
-        file = piece_file(folder, piece)
-        if file.is_file():
-            yield False
-            continue
-        answer = client.get(piece.url)
-        content = b"" if answer is None else answer.content
-        if answer is not None and content:
-            _check_picture(answer, mosaic, piece)
-        elif not mosaic.gaps:
-            raise MapError(f"{shown(piece.url)}: expected a picture, but the server has nothing there (404)")
-        part = file.with_suffix(".part")
-        part.write_bytes(content)
-        os.replace(part, file)
-        yield True
-
-
-def _check_picture(answer: Answer, mosaic: Mosaic, piece: Piece) -> None:
-    """Refuse what is no picture of the size that is expected.
-
-    Raises:
-        MapError: it is none.
-    """
-    try:
-        pixels = _decoded(answer.content)
-    except ValueError:
-        what = answer.kind or "no type"
-        raise MapError(
-            f"{shown(piece.url)}: expected a picture, got {what} that says {snippet(answer.content)}"
-            if what.startswith("text/") or "xml" in what or "json" in what
-            else f"{shown(piece.url)}: expected a picture of {', '.join(_FORMATS)} with 8 bits, got {what} that "
-            "cannot be read as one"
-        ) from None
-    (width, height), got = mosaic.piece_px, (pixels.shape[1], pixels.shape[0])
-    if got != (width, height):
-        hint = f"; give `tile_px` {got[0]}" if mosaic.kind == "XYZ" and got[0] == got[1] else ""
-        raise MapError(
-            f"{shown(piece.url)}: expected a picture of {width} x {height} px, got {got[0]} x {got[1]} px{hint}"
-        )
-
-
-def _decoded(content: bytes) -> Pixels:
-    """Red, green, blue and alpha (h, w, 4) of a picture.
-
-    Raises:
-        ValueError: it is none, or has more than 8 bits.
-    """
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(content), formats=_FORMATS) as picture:
-            if picture.mode not in _MODES:
-                raise ValueError(picture.mode)
-            return np.asarray(picture.convert("RGBA"))
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(str(error)) from None
-
-
-def _pixels(folder: Path, piece: Piece, mosaic: Mosaic) -> Pixels:
-    """Red, green, blue and alpha (h, w, 4) of a fetched piece; zeros where the server has none."""
-    content = piece_file(folder, piece).read_bytes()
-    return _decoded(content) if content else np.zeros((*mosaic.piece_px[::-1], 4), np.uint8)
-
-
-def write_map(mosaic: Mosaic, folder: Path, out: Path, tags: Mapping[str, object]) -> float:
-    """Join the pieces of a folder: a tiled, losslessly compressed GeoTIFF with a mask where it has gaps.
+def fetch_pictures(
+    grid: Grid,
+    out: Path,
+    tags: Mapping[str, object],
+    *,
+    url: str,
+    cached: int,
+    pause_s: float,
+    say: Callable[[str], None],
+) -> Iterator[int]:
+    """Write a tiled, losslessly compressed GeoTIFF with a mask of where the server has pictures.
 
     Args:
-        mosaic: all of whose pieces are there.
-        folder: of the pieces.
+        grid: what is wanted.
         out: the file, replaced in one step.
         tags: metadata items.
+        url: of the server, for messages.
+        cached: how many pictures an earlier fetch has left, which are read without a pause.
+        pause_s: between two requests.
+        say: takes one line for a person, when a server has to be waited for.
 
-    Returns:
-        Share of the pixels without data.
+    Yields:
+        For each picture how many of its pixels have data.
 
     Raises:
-        MapError: no pixel has data, or the file cannot be written.
+        MapError: the server refuses or sends something else, or the file cannot be written.
     """
     import rasterio
     from rasterio.errors import RasterioError
 
-    known = sum(int((_pixels(folder, piece, mosaic)[..., 3] >= _OPAQUE).sum()) for piece in mosaic.pieces)
-    share = 1.0 - known / (len(mosaic.pieces) * mosaic.piece_px[0] * mosaic.piece_px[1])
-    if known == 0:
-        raise MapError(
-            f"source: the server has no data there on level {mosaic.level!r}, {mosaic.gsd_m_per_px:.3g} m/px; it "
-            "may have some with a larger `gsd_m_per_px`"
-        )
     part = out.with_name(f"{out.name}.part")
+    level = {} if grid.overview is None else {"overview_level": grid.overview}
     try:
         with (
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
-            rasterio.open(part, "w", **_profile(mosaic)) as file,
+            rasterio.open(grid.source, **level) as source,
+            rasterio.open(part, "w", **_profile(grid)) as file,
         ):
-            for piece in mosaic.pieces:
-                _write_piece(file, piece, mosaic, _pixels(folder, piece, mosaic), masked=share > 0.0)
+            yield from _copied(source, file, grid, lambda k: pause_s * (k > cached), url, say)
             file.update_tags(**{name: str(value) for name, value in tags.items()})
         os.replace(part, out)
     except (RasterioError, OSError) as error:
-        part.unlink(missing_ok=True)
         raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
-    return share
+    finally:
+        part.unlink(missing_ok=True)
 
 
-def _profile(mosaic: Mosaic) -> dict[str, Any]:
+def _copied(
+    source: Any, file: Any, grid: Grid, pause_s: Callable[[int], float], url: str, say: Callable[[str], None]
+) -> Iterator[int]:
+    """Copy picture by picture; how many pixels of each have data.
+
+    Raises:
+        MapError: none has.
+    """
+    from rasterio.windows import Window
+
+    (width, height), (across, down), known = grid.size_px, grid.tile_px, 0
+    places = [(x, y) for y in range(0, height, down) for x in range(0, width, across)]
+    for k, (x, y) in enumerate(places):
+        time.sleep(pause_s(k))
+        size = min(across, width - x), min(down, height - y)
+        rgba = _read(source, Window(grid.offset_px[0] + x, grid.offset_px[1] + y, *size), url, say)
+        valid = rgba[3] >= _OPAQUE
+        file.write(rgba[:3] * valid, window=Window(x, y, *size))
+        file.write_mask(valid * np.uint8(255), window=Window(x, y, *size))
+        known += int(valid.sum())
+        yield int(valid.sum())
+    if known == 0:
+        raise MapError(
+            f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; it may "
+            "have some with a larger `gsd_m_per_px`"
+        )
+
+
+def _read(source: Any, window: Any, url: str, say: Callable[[str], None]) -> NDArray[np.uint8]:
+    """(4, h, w) red, green, blue and alpha; a server that is busy is asked again."""
+    from rasterio.errors import RasterioError
+
+    for attempt in range(ATTEMPTS):
+        try:
+            return np.asarray(source.read(window=window))
+        except RasterioError as error:
+            reason = reason_of(error)
+        if attempt == ATTEMPTS - 1 or not _BUSY.search(reason):
+            break
+        wait_s = FIRST_WAIT_S * 2.0**attempt
+        say(f"{shown(url)}: {_told(reason)}; waiting {wait_s:.0f} s")
+        time.sleep(wait_s)
+    raise MapError(f"{shown(url)}: {_told(reason)}" + (f", at attempt {attempt + 1}" if attempt else ""))
+
+
+def _told(reason: str) -> str:
+    """What GDAL says was wrong, for a person."""
+    status = _STATUS.search(reason)
+    if status is None:
+        if "not recognized" in reason:
+            return "expected pictures, got something else"
+        return shown(reason.removeprefix("GDALWMS: "))
+    code, text = status.groups()
+    if code == "0":
+        return shown(text)
+    more = ": it does not let you in (a key that is missing or wrong, or terms that forbid this)"
+    return f"the server answers {code}{more if code in ('401', '403') else ''}"
+
+
+def _profile(grid: Grid) -> dict[str, Any]:
     from rasterio.crs import CRS
     from rasterio.transform import Affine
 
-    (x, y), (step_x, step_y), (width, height) = mosaic.corner, mosaic.step, mosaic.size_px
+    (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
     return {
-        "driver": "GTiff",
-        "dtype": "uint8",
-        "count": 3,
-        "width": width,
-        "height": height,
-        "crs": CRS.from_wkt(mosaic.crs.to_wkt()),
-        "transform": Affine(step_x, 0.0, x, 0.0, -step_y, y),
-        "photometric": "RGB",
-        "tiled": True,
-        "blockxsize": _BLOCK_PX,
-        "blockysize": _BLOCK_PX,
-        "compress": "deflate",
-        "predictor": 2,
-        "BIGTIFF": "IF_SAFER",
-    }
+        "driver": "GTiff", "dtype": "uint8", "count": 3, "width": width, "height": height,
+        "crs": CRS.from_wkt(grid.crs.to_wkt()), "transform": Affine(step_x, 0.0, x, 0.0, -step_y, y),
+        "photometric": "RGB", "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX,
+        "compress": "deflate", "predictor": 2, "BIGTIFF": "IF_SAFER",
+    }  # fmt: skip
 
 
-def _write_piece(file: Any, piece: Piece, mosaic: Mosaic, pixels: Pixels, *, masked: bool) -> None:
-    from rasterio.windows import Window
-
-    width, height = mosaic.piece_px
-    window = Window(piece.column * width, piece.row * height, width, height)
-    valid = pixels[..., 3] >= _OPAQUE
-    file.write(np.moveaxis(pixels[..., :3] * valid[..., None], 2, 0), window=window)
-    if masked:
-        file.write_mask(valid.astype(np.uint8) * np.uint8(255), window=window)
+def kept_pictures(folder: Path) -> list[Path]:
+    """What an earlier fetch has left in a folder."""
+    return [file for file in folder.rglob("*") if file.is_file() and _CACHED.fullmatch(file.name)]
 
 
-@contextmanager
-def kept_pieces(folder: Path) -> Iterator[None]:
-    """A folder of pieces, which stays for a later fetch where anything is left in it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    finally:
-        if not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def remove_pieces(folder: Path) -> None:
-    """Remove the pieces of a folder."""
-    for pattern in ("*.piece", "*.part"):
-        for file in folder.glob(pattern):
-            file.unlink()
+def remove_pictures(folder: Path, *, all_of_them: bool) -> None:
+    """Remove what was kept in a folder if wanted, and the folders that are empty."""
+    for file in kept_pictures(folder) if all_of_them else ():
+        file.unlink()
+    for inner in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
+        if not any(inner.iterdir()):
+            inner.rmdir()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()

@@ -5,20 +5,13 @@ from __future__ import annotations
 import math
 
 from engine.errors import OptionError
-from scenematch.fetch.client import PLACEHOLDER, shown
-from scenematch.fetch.mosaic import (
-    Level,
-    Mosaic,
-    Wanted,
-    check_count,
-    fine_enough,
-    mosaic_of,
-    tiles_over,
-)
+from scenematch.fetch.crs import crs_of
+from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid, gdal_xml, part_of
+from scenematch.fetch.place import Wanted
+from scenematch.fetch.urls import PLACEHOLDER, shown
 
-MAX_ZOOM = 24
 _HALF_WORLD_M = math.pi * 6378137.0
-_KNOWN = ("z", "x", "y", "-y", "q")
+_MAX_SIDE_PX = 2**31  # of GDAL's rasters
 
 
 def is_template(url: str) -> bool:
@@ -32,68 +25,35 @@ def check_template(url: str) -> None:
     Raises:
         OptionError: a placeholder is unknown, or one is missing.
     """
-    names = PLACEHOLDER.findall(url)
-    unknown = [name for name in names if name not in _KNOWN]
-    if unknown:
+    if sorted(PLACEHOLDER.findall(url)) not in (["q"], ["x", "y", "z"], ["-y", "x", "z"]):
         raise OptionError(
-            f"source: expected {{z}}, {{x}} and {{y}} (or {{-y}}), or {{q}}, in a template of tiles, got "
-            f"{{{unknown[0]}}} in {shown(url)!r}"
-        )
-    if not ("q" in names or ({"z", "x"} <= set(names) and {"y", "-y"} & set(names))):
-        raise OptionError(
-            f"source: expected {{z}}, {{x}} and {{y}}, or {{q}}, in a template of tiles, got {shown(url)!r}"
+            "source: expected {z}, {x} and {y} (or {-y}), or {q}, in a template of tiles, got "
+            f"{shown(url)!r}"
         )
 
 
-def tile_url(template: str, zoom: int, column: int, row: int) -> str:
-    """The address of a tile.
-
-    Args:
-        template: it, checked.
-        zoom: of the tile.
-        column: from the west.
-        row: from the north.
-    """
-    values = {
-        "z": str(zoom),
-        "x": str(column),
-        "y": str(row),
-        "-y": str((1 << zoom) - 1 - row),
-        "q": "".join(str((column >> n & 1) | (row >> n & 1) << 1) for n in reversed(range(zoom))),
-    }
-    return PLACEHOLDER.sub(lambda name: values[name[1]], template)
-
-
-def plan_xyz(template: str, wanted: Wanted, tile_px: int) -> Mosaic:
-    """The tiles of a template over a place.
-
-    Args:
-        template: such as ``https://host/{z}/{x}/{y}.png``.
-        wanted: where, and how fine.
-        tile_px: side of a tile.
-
-    Raises:
-        OptionError: the template or the place cannot be, or there are more tiles.
-    """
-    from pyproj import CRS
-
+def plan_xyz(template: str, wanted: Wanted, tile_px: int, access: Access) -> Grid:
+    """The tiles of a template over a place, in Web Mercator."""
     check_template(template)
-    crs = CRS.from_epsg(3857)
-    corner = (-_HALF_WORLD_M, _HALF_WORLD_M)
-    levels = []
-    for zoom in range(MAX_ZOOM + 1):
-        step = 2.0 * _HALF_WORLD_M / (tile_px << zoom)
-        levels.append(Level(str(zoom), corner, (step, step), (tile_px, tile_px), 1 << zoom, 1 << zoom))
-    level = fine_enough(levels, wanted.gsd_m_per_px, wanted.place.metres_per_unit(crs))
-    part = tiles_over(level, wanted.place.bounds(crs))
-    check_count(part, wanted.max_tiles)
-    return mosaic_of(
-        level,
-        part,
-        crs,
-        wanted.place,
-        lambda column, row: tile_url(template, int(level.name), column, row),
-        kind="XYZ",
-        gaps=True,
-        bytes_per_px=2.0 if ".png" in template.lower() else 0.5,
-    )
+    crs, place = crs_of("EPSG:3857"), wanted.place
+    deepest = (_MAX_SIDE_PX // tile_px - 1).bit_length() - 1
+    steps = [2.0 * _HALF_WORLD_M / (tile_px << zoom) for zoom in range(deepest + 1)]
+    fine = [z for z, s in enumerate(steps) if place.gsd_m_per_px((s, s), crs) <= wanted.gsd_m_per_px * FINE_ENOUGH]
+    zoom = min(fine, default=deepest)
+    named = {"z": "${z}", "x": "${x}", "y": "${y}", "-y": "${y}", "q": "${quadkey}"}
+    half = _HALF_WORLD_M
+    window = {
+        "UpperLeftX": -half, "UpperLeftY": half, "LowerRightX": half, "LowerRightY": -half, "TileLevel": zoom,
+        "TileCountX": 1, "TileCountY": 1, "YOrigin": "bottom" if "{-y}" in template else "top",
+    }  # fmt: skip
+    service = 'Service name="VirtualEarth"' if "{q}" in template else 'Service name="TMS"'
+    source = gdal_xml(
+        "GDAL_WMS",
+        {
+            service: {"ServerUrl": PLACEHOLDER.sub(lambda name: named[name[1]], template)},
+            "DataWindow": window, "Projection": "EPSG:3857", "BlockSizeX": tile_px, "BlockSizeY": tile_px,
+            "OverviewCount": 0,
+        } | access.elements(),
+    )  # fmt: skip
+    side, step = tile_px << zoom, steps[zoom]
+    return part_of("XYZ", str(zoom), source, (-half, half), (step, step), place, crs, (side, side), tile_px)

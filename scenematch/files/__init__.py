@@ -1,1 +1,1 @@
-"""Readers and writers of files: flights, frames, telemetry, truth, tracks, logs, bags, data sets, GeoTIFF."""
+"""Readers and writers of files: flights, frames, telemetry, truth, tracks, logs, bags, GeoTIFF."""

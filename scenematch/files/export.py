@@ -1,7 +1,7 @@
-"""A finished track in the formats of other programs: GPX, GeoJSON, KML, TUM and NMEA.
+"""A finished track in the formats of other programs: GPX, GeoJSON and TUM.
 
 Convention:
-    GPX and NMEA define a height as one above the sea: they have none where that of the track is in another datum.
+    GPX defines a height as one above the sea: it has none where that of the track is in another datum.
     TUM and GeoJSON have the track's own heights, in the datum of the surface model.
     A refused frame, and a crossing of the 180th meridian, end a segment. Stamps from September 2001 on are UTC;
     earlier ones count from the start of the vehicle, and such a track is written without times of day.
@@ -13,8 +13,6 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
-from functools import reduce
-from operator import xor
 from xml.sax.saxutils import escape
 
 from engine.errors import TelemetryError
@@ -156,48 +154,6 @@ def _properties(row: PoseRow) -> dict[str, object]:
     }
 
 
-def to_kml(rows: Sequence[PoseRow]) -> str:
-    """The track as KML 2.2: lines on the ground, and each fix as a placemark with its sigmas in metres."""
-    found = segments(rows)
-    lines = [segment for segment in found if len(segment) > 1]
-    parts = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        '<kml xmlns="http://www.opengis.net/kml/2.2">',
-        "<Document><name>scenematch</name>",
-    ]
-    if lines:
-        parts.append("<Placemark><name>track</name><MultiGeometry>")
-        parts += [
-            f"<LineString><tessellate>1</tessellate><coordinates>{' '.join(map(_kml_position, segment))}"
-            "</coordinates></LineString>"
-            for segment in lines
-        ]
-        parts.append("</MultiGeometry></Placemark>")
-    parts += [
-        "<Folder><name>fixes</name>",
-        *(_kml_point(row) for segment in found for row in segment),
-        "</Folder>",
-    ]
-    return "\n".join([*parts, "</Document>", "</kml>", ""])
-
-
-def _kml_position(row: PoseRow) -> str:
-    return f"{_lon_deg(row):.9f},{row.lat_deg:.9f}"
-
-
-def _kml_point(row: PoseRow) -> str:
-    time = _utc(row)
-    stamp = "" if time is None else f"<TimeStamp><when>{_iso(time)}</when></TimeStamp>"
-    description = ""  # the truth has no sigmas
-    if row.sigma_east_m is not None and row.sigma_north_m is not None:
-        sigmas = f"sigma east {row.sigma_east_m:.2f} m, north {row.sigma_north_m:.2f} m"
-        description = f"<description>{sigmas}</description>"
-    return (
-        f"<Placemark><name>{escape(row.frame)}</name>{description}{stamp}"
-        f"<Point><coordinates>{_kml_position(row)}</coordinates></Point></Placemark>"
-    )
-
-
 def to_tum(rows: Sequence[PoseRow]) -> str:
     """The track as TUM, the format of evo: ``timestamp x y z qx qy qz qw`` in seconds and metres east, north, up.
 
@@ -239,59 +195,6 @@ def tum_rows(rows: Sequence[PoseRow]) -> list[PoseRow]:
     return kept
 
 
-def to_nmea(rows: Sequence[PoseRow]) -> str:
-    """The track as NMEA 0183: GGA and RMC per frame; a refused frame is void, so that a reader sees the gap.
-
-    The number of satellites is 0 and the dilution of precision blank; the quality is 1, as programs expect of a
-    position. Time and date are blank where stamps are not UTC, the height where it is not known above the sea.
-    """
-    sentences = (sentence for row in rows for sentence in (_gga(row), _rmc(row)))
-    return "".join(f"{sentence}\r\n" for sentence in sentences)
-
-
-def _gga(row: PoseRow) -> str:
-    time, _ = _utc_fields(row)
-    height = "" if row.alt_amsl_m is None else f"{row.alt_amsl_m:.2f}"
-    unit = "M" if height else ""
-    return nmea_sentence(f"GPGGA,{time},{_nmea_position(row)},{int(row.fixed)},00,,{height},{unit},,,,")
-
-
-def _rmc(row: PoseRow) -> str:
-    time, date = _utc_fields(row)
-    status, mode = ("A", "A") if row.fixed else ("V", "N")
-    return nmea_sentence(f"GPRMC,{time},{status},{_nmea_position(row)},,,{date},,,{mode}")
-
-
-def nmea_sentence(body: str) -> str:
-    """An NMEA sentence: ``$``, the body, and the checksum, the exclusive or of the body's bytes."""
-    return f"${body}*{reduce(xor, body.encode('ascii'), 0):02X}"
-
-
-def degrees_minutes(value_deg: float, digits: int) -> str:
-    """Unsigned degrees in ``digits`` digits and minutes with 6 decimals (2 mm); minutes stay below 60."""
-    # Rounded before the split: 59.9999999 minutes become the next degree.
-    degrees, micro_minutes = divmod(round(abs(value_deg) * 60e6), 60_000_000)
-    minutes, rest = divmod(micro_minutes, 1_000_000)
-    return f"{degrees:0{digits}d}{minutes:02d}.{rest:06d}"
-
-
-def _nmea_position(row: PoseRow) -> str:
-    if row.lat_deg is None or not row.fixed:
-        return ",,,"
-    lon_deg = _lon_deg(row)
-    lat = f"{degrees_minutes(row.lat_deg, 2)},{'S' if row.lat_deg < 0 else 'N'}"
-    return f"{lat},{degrees_minutes(lon_deg, 3)},{'W' if lon_deg < 0 else 'E'}"
-
-
-def _utc_fields(row: PoseRow) -> tuple[str, str]:
-    """Time of day and date as NMEA writes them, both after rounding to a hundredth of a second."""
-    time = _utc(row)
-    if time is None:
-        return "", ""
-    time = time.replace(microsecond=0) + timedelta(microseconds=round(time.microsecond, -4))
-    return f"{time:%H%M%S}.{time.microsecond // 10_000:02d}", f"{time:%d%m%y}"
-
-
 def _lon_deg(row: PoseRow) -> float:
     """Longitude in [-180, 180)."""
     assert row.lon_deg is not None
@@ -311,8 +214,6 @@ def _iso(time: datetime) -> str:
 WRITERS: dict[str, Callable[[Sequence[PoseRow]], str]] = {
     "gpx": to_gpx,
     "geojson": to_geojson,
-    "kml": to_kml,
     "tum": to_tum,
-    "nmea": to_nmea,
 }
 """Function that formats a track, by the name of the format."""

@@ -1,4 +1,4 @@
-"""CSV tables: the one reader and writer that telemetry, truth, track and the data sets share.
+"""CSV tables: the one reader and writer that telemetry, truth and track share.
 
 Convention:
     A blank cell is unknown; columns that were not requested are ignored. A byte order mark and either line ending
@@ -86,11 +86,11 @@ class CsvRow:
             raise self.error(column, "a whole number")
         return int(text)
 
-    def stamp(self, column: str = "timestamp_ns") -> int:
-        """A time stamp in nanoseconds that must not be blank."""
-        value = self.integer(column)
+    def stamp(self) -> int:
+        """The time stamp in nanoseconds, which must not be blank."""
+        value = self.integer("timestamp_ns")
         if value is None:
-            raise self.error(column, "whole nanoseconds")
+            raise self.error("timestamp_ns", "whole nanoseconds")
         return value
 
     def number(self, column: str, bounds: Bounds = ANY) -> float | None:

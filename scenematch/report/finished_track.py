@@ -43,7 +43,7 @@ class FinishedTrack:
 
     def plot_data(self) -> TrackPlotData:
         """Plot data of the track."""
-        return prepare_plot_data(self.rows, self.truth, self.site.frame, self.ground, "")
+        return prepare_plot_data(self.rows, self.truth, self.site.frame, self.ground)
 
     @property
     def name(self) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from engine.geo import LocalFrame
 from engine.values import Truth
 from scenematch.files.track import TrackRow
-from scenematch.report.metrics import Ground, TrackErrors, errors_en_m, height_pairs_m, summarise
+from scenematch.report.metrics import Ground, TrackErrors, errors_en_m, height_pairs_m
 
 Array = NDArray[np.float64]
 
@@ -28,8 +27,6 @@ class TrackPlotData:
         heights: (N, 2) measured and true height above the ground in metres; NaN where unknown.
         refused: (N,) whether the frame was refused.
         refused_en_m: (N, 2) position of refused frames: truth, else interpolated between fixes; NaN for fixes.
-        title: heading of every plot.
-        figures: one line of figures of merit.
     """
 
     time: Array
@@ -38,12 +35,10 @@ class TrackPlotData:
     heights: Array
     refused: NDArray[np.bool_]
     refused_en_m: Array
-    title: str
-    figures: str
 
 
 def prepare_plot_data(
-    rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: LocalFrame, ground: Ground, title: str
+    rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: LocalFrame, ground: Ground
 ) -> TrackPlotData:
     """Compute the plot data of a track.
 
@@ -52,7 +47,6 @@ def prepare_plot_data(
         truth: in the order of time, or None.
         frame: origin of east and north.
         ground: level of the ground.
-        title: heading of every plot.
     """
     stamps = [row.timestamp_ns for row in rows]
     known = [stamp for stamp in stamps if stamp is not None]
@@ -69,8 +63,6 @@ def prepare_plot_data(
         heights=height_pairs_m(rows, truth, ground),
         refused=refused,
         refused_en_m=_refused_positions(time, errors, refused),
-        title=title,
-        figures=_figures_of_merit(summarise(rows, truth, frame=frame, ground=ground)),
     )
 
 
@@ -82,21 +74,6 @@ def _refused_positions(time: Array, errors: TrackErrors, refused: NDArray[np.boo
         positions = np.where(np.isfinite(positions), positions, between)
     positions[~refused] = np.nan
     return positions
-
-
-def _figures_of_merit(summary: dict[str, Any]) -> str:
-    parts = [f"{summary['fixes']} of {summary['frames']} frames fixed"]
-    if summary.get("rms_m") is not None:
-        parts += [
-            f"{name} {format_metres(summary[key])}" for name, key in (("RMS", "rms_m"), ("median", "median_m"))
-        ]
-        parts += [f"95 % within {format_metres(summary['r95_m'])}", f"{summary['false_fixes']} false"]
-    return ", ".join(parts)
-
-
-def format_metres(value: float) -> str:
-    """Format a length with two decimals; extreme values in exponential notation."""
-    return f"{value:.2f} m" if abs(value) < 1e5 else f"{value:.1e} m"
 
 
 def larger_variance_m2(covariance: Array) -> Array:

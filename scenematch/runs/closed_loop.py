@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from engine.camera import Camera
-from engine.errors import OptionError, require
+from engine.errors import OptionError
 from engine.matching import CLASSICAL
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.state import NavigatorState
@@ -21,7 +21,7 @@ from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import write_flight_folder
 from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.track import track_row, write_track
-from scenematch.report.closed_loop import draw_loop, summarise_loop, write_loop_csv
+from scenematch.report.closed_loop import summarise_loop, write_loop_csv
 from scenematch.runs.arguments import check_choice, check_device
 from scenematch.runs.evaluation import redraw
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
@@ -104,11 +104,7 @@ def fly_closed_loop(
 
     Returns:
         The figures, as loop.json has them.
-
-    Raises:
-        MissingExtraError: matplotlib, which draws the plots, is not installed.
     """
-    require("matplotlib", "desk")
     out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
     if world.camera_pitch_deg != NADIR_PITCH_DEG:
         raise OptionError(f"camera_pitch_deg: expected none in a closed loop, got {world.camera_pitch_deg:g}")
@@ -132,7 +128,7 @@ def fly_closed_loop(
 
 
 def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
-    """Track, record, figures of merit, plots and report of a flight that was flown."""
+    """Track, record, figures of merit and report of a flight that was flown."""
     flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
     answers = [(_name(k), answer) for k, answer in enumerate(flown.answers)]
     rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
@@ -148,11 +144,6 @@ def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: P
     (out / "loop.json").write_text(
         json.dumps(figures | {"settings": record.facts()}, indent=2) + "\n", encoding="utf-8"
     )
-    scene, fault = record.more["scene"], flight.fault
-    day = scene["condition"] or "noon"
-    title = f"closed loop, seed {scene['seed']}, {day}, {record.method}, fault: {fault.kind}"
-    title += f"\ntrue track {figures['plan_rms_m']:.2f} m RMS from the plan"
-    draw_loop(out, flown, title, fault)
     return figures | {"folder": str(out.resolve())}
 
 

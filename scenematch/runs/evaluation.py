@@ -26,7 +26,7 @@ from scenematch.runs.settings import TrackSettings
 def evaluate(
     folder: StrPath, truth: StrPath | None = None, *, force: bool = False, progress: Progress = SILENT
 ) -> dict[str, Any]:
-    """Score a finished track again, if there is truth, and rewrite its summary, figures and page.
+    """Score a finished track again, if there is truth, and rewrite its summary and page.
 
     Args:
         folder: of a finished run.

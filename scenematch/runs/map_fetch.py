@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -15,7 +14,7 @@ from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
-from scenematch.fetch.client import Client, check_url, shown
+from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid
 from scenematch.fetch.heights import (
     GLO30,
     GLO30_SLOPE_SIGMA_DEG,
@@ -24,20 +23,17 @@ from scenematch.fetch.heights import (
     read_part,
     write_heights,
 )
-from scenematch.fetch.mosaic import FINE_ENOUGH, Bounds, Mosaic, Place, Wanted
-from scenematch.fetch.pictures import fetch_pieces, kept_pieces, piece_file, remove_pieces, write_map
-from scenematch.fetch.services import capabilities, query_value, with_query
-from scenematch.fetch.wms import plan_wms
-from scenematch.fetch.wmts import plan_wmts
-from scenematch.fetch.xyz import is_template, plan_xyz
+from scenematch.fetch.pictures import fetch_pictures, kept_pictures, remove_pictures
+from scenematch.fetch.place import Bounds, Place, Wanted
+from scenematch.fetch.servers import plan
+from scenematch.fetch.urls import check_url, shown
+from scenematch.fetch.xyz import is_template
 from scenematch.files.photos import exif_telemetry
 from scenematch.runs.arguments import check_above, parse_place
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.progress import SILENT, Progress
 
 MAX_TILES = 2000
-SURFACE = "surface.tif"
-"""Name of the surface model among the pieces, until the map is complete."""
 NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"
 _MAX_RADIUS_M = 100_000.0
 GSD_M_PER_PX = 0.5
@@ -118,47 +114,55 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     for file in (out, surface_out) if settings.surface else (out,):
         check_file(file, settings.force)
     progress.message(f"note: {NOTE}")
-    client = Client(settings.pause_ms, settings.timeout_s, progress.message)
-    mosaic = _planned(settings, wanted, client)
-    _check_surface_stays(_surface_files(settings, mosaic), (out, surface_out))
-    _say_what_comes(mosaic, settings, wanted, progress)
     folder = out.with_name(f"{out.name}.tiles")
-    facts = _plan_facts(settings, mosaic, folder)
+    grid = plan(settings.source, wanted, settings.tile_px, Access(settings.timeout_s, folder))
+    files = [] if settings.surface is None else files_for(settings.surface, _bounds_deg(grid))
+    _check_surface_stays(files, (out, surface_out))
+    _say_what_comes(grid, settings, wanted, progress)
+    facts = _plan_facts(settings, grid)
     if settings.dry_run:
-        return facts | {"surface_files": list(map(shown, _surface_files(settings, mosaic))), "dry_run": True}
+        return facts | {"surface_files": list(map(shown, files)), "dry_run": True}
     fetched_utc = datetime.now(UTC).isoformat(timespec="seconds")
-    with kept_pieces(folder):
-        surface = _fetch_surface(settings, mosaic, client, folder / SURFACE, fetched_utc)
-        asked = sum(progress.track(fetch_pieces(mosaic, client, folder), len(mosaic.pieces), "fetching"))
-        written = _write(mosaic, folder, out, _map_tags(settings, mosaic, fetched_utc), progress)
-        if surface is not None:
-            os.replace(folder / SURFACE, surface_out)
-        remove_pieces(folder)
-    received = {"fetched": asked, "fetched_mb": client.bytes_received / 1e6}
-    return {"file": str(out)} | facts | received | written | _surface_facts(surface, surface_out)
+    surface = (files, grid.bounds, grid.crs, settings.surface_datum, settings.timeout_s)
+    heights = read_part(*surface) if files else None
+    facts = {"file": str(out)} | facts | _write(settings, grid, folder, out, fetched_utc, progress)
+    return facts | _write_surface(settings, heights, files, surface_out, fetched_utc)
 
 
-def _say_what_comes(mosaic: Mosaic, settings: FetchSettings, wanted: Wanted, progress: Progress) -> None:
+def _say_what_comes(grid: Grid, settings: FetchSettings, wanted: Wanted, progress: Progress) -> None:
     """What a person should know before the pictures come."""
-    for name, text in mosaic.states.items():
+    for name, text in grid.states.items():
         progress.message(f"the server states as {name}: {text}")
-    got, asked = mosaic.gsd_m_per_px, wanted.gsd_m_per_px
+    got, asked = grid.gsd_m_per_px, wanted.gsd_m_per_px
     coarser = ", coarser than asked: the server has no finer level" if got > asked * FINE_ENOUGH else ""
-    progress.message(f"{mosaic.kind} level {mosaic.level}: {got:.3g} m/px{coarser}")
+    progress.message(f"{grid.kind} level {grid.level}: {got:.3g} m/px{coarser}")
     if settings.map_sigma_m is None:
         progress.message("the map's accuracy is not stated (`map_sigma_m`): matching will assume 3 m per axis")
 
 
-def _write(mosaic: Mosaic, folder: Path, out: Path, tags: dict[str, object], progress: Progress) -> dict[str, Any]:
-    """Write the map of fetched pieces."""
-    gaps = sum(piece_file(folder, piece).stat().st_size == 0 for piece in mosaic.pieces)
-    nodata_share = write_map(mosaic, folder, out, tags)
+def _write(
+    settings: FetchSettings, grid: Grid, folder: Path, out: Path, fetched_utc: str, progress: Progress
+) -> dict[str, Any]:
+    """Fetch the pictures and write the map; what was fetched stays in the folder if that fails.
+
+    Raises:
+        MapError: the server refuses, or has nothing there.
+    """
+    cached, complete = len(kept_pictures(folder)), False
+    out.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        pictures = fetch_pictures(
+            grid, out, _map_tags(settings, grid, fetched_utc), url=settings.source, cached=cached,
+            pause_s=settings.pause_ms / 1e3, say=progress.message,
+        )  # fmt: skip
+        known = sum(progress.track(pictures, grid.tiles, "fetching"))
+        complete = True
+    finally:
+        remove_pictures(folder, all_of_them=complete)
+    nodata_share = 1.0 - known / (grid.size_px[0] * grid.size_px[1])
     if nodata_share > _MUCH_EMPTY:
-        progress.message(
-            f"{nodata_share:.0%} of the map is empty: the server had nothing for {gaps} of {len(mosaic.pieces)} "
-            "pieces, or sent transparent ones; is `around` within what it covers?"
-        )
-    return {"gaps": gaps, "nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
+        progress.message(f"{nodata_share:.0%} of the map is empty; is `around` within what the server covers?")
+    return {"nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
 
 
 def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
@@ -260,70 +264,50 @@ def _seen_by_photographs(folder: Path) -> tuple[Place, float]:
     return Place(float(middle[0]), float(middle[1]), radius_m), finest_m_per_px
 
 
-def _planned(settings: FetchSettings, wanted: Wanted, client: Client) -> Mosaic:
-    """What is to be asked for; a service is asked for its capabilities first."""
-    url = settings.source
-    if is_template(url):
-        return plan_xyz(url, wanted, settings.tile_px)
-    is_document = url.partition("?")[0].lower().endswith(".xml")
-    service = query_value(url, "service") or ("WMTS" if "wmts" in url.lower() else "WMS")
-    query = {"SERVICE": service.upper(), "REQUEST": "GetCapabilities"}
-    root = capabilities(client, url if is_document else with_query(url, query))
-    return plan_wmts(root, url, wanted) if root.tag.endswith("}Capabilities") else plan_wms(root, url, wanted)
-
-
-def _plan_facts(settings: FetchSettings, mosaic: Mosaic, folder: Path) -> dict[str, Any]:
+def _plan_facts(settings: FetchSettings, grid: Grid) -> dict[str, Any]:
     """What is known before the first picture is asked for."""
-    width, height = mosaic.size_px
-    left = [piece for piece in mosaic.pieces if not piece_file(folder, piece).is_file()]
-    piece_mb = mosaic.piece_px[0] * mosaic.piece_px[1] * mosaic.bytes_per_px / 1e6
+    width, height = grid.size_px
     return {
         "source": shown(settings.source),
-        "kind": mosaic.kind,
-        "level": mosaic.level,
-        "crs": mosaic.crs.to_string(),
-        "gsd_m_per_px": mosaic.gsd_m_per_px,
+        "kind": grid.kind,
+        "level": grid.level,
+        "crs": grid.crs.to_string(),
+        "gsd_m_per_px": grid.gsd_m_per_px,
         "width_px": width,
         "height_px": height,
-        "bounds_deg": list(_bounds_deg(mosaic)),
-        "tiles": len(mosaic.pieces),
-        "tiles_to_fetch": len(left),
-        "expected_mb": len(left) * piece_mb,
+        "bounds_deg": list(_bounds_deg(grid)),
+        "tiles": grid.tiles,
         "georeference_sigma_m": settings.map_sigma_m,
         "attribution": settings.attribution,
         "licence": settings.licence,
-        "server_states": [f"{name}: {text}" for name, text in mosaic.states.items()],
+        "server_states": [f"{name}: {text}" for name, text in grid.states.items()],
         "note": NOTE,
     }
 
 
-def _bounds_deg(mosaic: Mosaic) -> Bounds:
+def _bounds_deg(grid: Grid) -> Bounds:
     """West, south, east, north of the map in degrees."""
     from pyproj import Transformer
 
-    found: Bounds = Transformer.from_crs(mosaic.crs, 4326, always_xy=True).transform_bounds(*mosaic.bounds)
+    found: Bounds = Transformer.from_crs(grid.crs, 4326, always_xy=True).transform_bounds(*grid.bounds)
     return found
 
 
-def _map_tags(settings: FetchSettings, mosaic: Mosaic, fetched_utc: str) -> dict[str, object]:
+def _map_tags(settings: FetchSettings, grid: Grid, fetched_utc: str) -> dict[str, object]:
     """Metadata items of the map: its accuracy, and where it is from."""
     tags = {
         GEOREFERENCE_TAG: settings.map_sigma_m,
         "SOURCE": shown(settings.source),
-        "SOURCE_LEVEL": mosaic.level,
+        "SOURCE_LEVEL": grid.level,
         "FETCHED_UTC": fetched_utc,
-        "ATTRIBUTION": settings.attribution or mosaic.states.get("Attribution"),
+        "ATTRIBUTION": settings.attribution or grid.states.get("Attribution"),
         "LICENCE": settings.licence,
-        "SERVER_ACCESS_CONSTRAINTS": mosaic.states.get("AccessConstraints"),
+        "SERVER_ACCESS_CONSTRAINTS": grid.states.get("AccessConstraints"),
     }
     return {name: value for name, value in tags.items() if value is not None}
 
 
 # ---------------------------------------------------------------------------------------------- surface model
-
-
-def _surface_files(settings: FetchSettings, mosaic: Mosaic) -> list[str]:
-    return [] if settings.surface is None else files_for(settings.surface, _bounds_deg(mosaic))
 
 
 def _check_surface_stays(files: Sequence[str], outputs: Sequence[Path]) -> None:
@@ -338,28 +322,18 @@ def _check_surface_stays(files: Sequence[str], outputs: Sequence[Path]) -> None:
                 raise OptionError(f"out: {output} is the `surface` that is read; choose another file")
 
 
-def _fetch_surface(
-    settings: FetchSettings, mosaic: Mosaic, client: Client, out: Path, fetched_utc: str
-) -> tuple[Heights, float | None] | None:
-    """Write the surface under the map; its heights, and its slope accuracy where it is known."""
-    if settings.surface is None:
-        return None
-    files = _surface_files(settings, mosaic)
-    heights = read_part(files, mosaic.bounds, mosaic.crs, settings.surface_datum, client)
+def _write_surface(
+    settings: FetchSettings, heights: Heights | None, files: Sequence[str], out: Path, fetched_utc: str
+) -> dict[str, Any]:
+    """Write the heights under the map, with the accuracy of their slope where it is known."""
+    if heights is None:
+        return {"surface": None}
     known = GLO30_SLOPE_SIGMA_DEG if any(GLO30 in file for file in files) else None
     slope_sigma_deg = settings.surface_slope_sigma_deg or known
     tags = {SLOPE_TAG: slope_sigma_deg, "SOURCE": ", ".join(map(shown, files)), "FETCHED_UTC": fetched_utc}
     write_heights(heights, out, {name: value for name, value in tags.items() if value is not None})
-    return heights, slope_sigma_deg
-
-
-def _surface_facts(surface: tuple[Heights, float | None] | None, file: Path) -> dict[str, Any]:
-    """What was written of a surface."""
-    if surface is None:
-        return {"surface": None}
-    heights, slope_sigma_deg = surface
     return {
-        "surface": str(file),
+        "surface": str(out),
         "surface_datum": heights.datum,
         "surface_range_m": [float(np.nanmin(heights.heights_m)), float(np.nanmax(heights.heights_m))],
         "surface_nodata_share": float(np.isnan(heights.heights_m).mean()),

@@ -1,4 +1,4 @@
-"""The results of a run: summary.json, the figures and the report page, in the run's folder."""
+"""The results of a run: summary.json and the report page, in the run's folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from engine.errors import EngineError, MissingExtraError, require
+from engine.errors import EngineError
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.values import Truth
@@ -18,7 +18,6 @@ from scenematch.files.resampling import UTC_FROM_NS
 from scenematch.files.track import TrackRow
 from scenematch.report.consistency import motion_consistency
 from scenematch.report.explain import choose_frames, explain_frames
-from scenematch.report.figures import draw_figures
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
 from scenematch.report.metrics import Ground, errors_en_m, summarise
@@ -30,8 +29,7 @@ from scenematch.runs.record import RunRecord
 TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"
 LOOP = "loop.csv"
 """Of a closed loop, beside its track."""
-FIGURES = ("path.png", "position.png", "height.png", "error.png")
-OWNED = (TRACK, SUMMARY, NOTES, PAGE, *FIGURES)
+OWNED = (TRACK, SUMMARY, NOTES, PAGE)
 """The files of an output folder."""
 
 
@@ -56,11 +54,7 @@ def write_results(
     report: bool = True,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Write summary.json and, where there is to be a report, the figures and its page, in place of older ones.
-
-    The figures are left out where matplotlib is not installed, as on a vehicle: no track is lost for them, and
-    older ones stay.
-    """
+    """Write summary.json and, where there is to be one, the report page, in place of older ones."""
     summary = summarise(rows, truth, frame=site.frame, ground=ground)
     segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
     telemetry = None if frames.flight is None else frames.flight.rows
@@ -76,14 +70,6 @@ def write_results(
     (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not report:
         return summary
-    title = f"{record.method} ({record.profile} profile)"
-    try:
-        require("matplotlib", "desk")  # first, or older figures would be lost for nothing
-        for name in FIGURES:
-            (out / name).unlink(missing_ok=True)
-        draw_figures(out, rows, truth, site=site, title=title, frame=site.frame, ground=ground)
-    except MissingExtraError as error:
-        progress.message(f"no plots are drawn: {error}")
     _write_page(out / PAGE, finished_track(out, rows, truth, site, ground, summary, frames), frames)
     return summary
 

@@ -24,7 +24,7 @@ from scenematch.simulator.town import EXACT, MAX_RELIEF_M
 
 FOLDER_OWNED = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")
 """The files of a simulated flight's folder."""
-LOOP_OWNED = ("loop.csv", "loop.json", "loop.png", "loop-path.png", *OWNED)
+LOOP_OWNED = ("loop.csv", "loop.json", *OWNED)
 """What a closed loop writes beside them."""
 START_SIGMA_M = 10.0
 MAX_PITCH_DEG = -30.0

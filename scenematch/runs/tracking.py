@@ -1,4 +1,4 @@
-"""Tracking a flight: its frames through the navigator, into track.csv, summary.json, figures and a report."""
+"""Tracking a flight: its frames through the navigator, into track.csv, summary.json and a report."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def track(
         out: the folder, created by this run.
         settings: how it is followed; None is the defaults.
         force: whether the folder may be there already.
-        report: whether there are figures and a page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
+        report: whether there is a page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
         diagnosis: whether the inputs are checked where few frames were fixed.
         live_view: where the live view goes.
         inputs: what :func:`scenematch.runs.inputs.open_inputs` read of the files, where several runs share it.

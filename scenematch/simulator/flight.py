@@ -74,7 +74,6 @@ def picture_at(
     attitude: Attitude,
     rng: np.random.Generator,
     *,
-    sensor: Sensor | None = None,
     optics: Optics | None = None,
     sway: ExposureMotion | None = None,
 ) -> Image:
@@ -87,7 +86,6 @@ def picture_at(
         east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
         attitude: of the body, about true north.
         rng: of the sensor's noise and exposure.
-        sensor: how light becomes grey levels; None takes the drone's, as it is in the town's condition.
         optics: exposure time, shutter and gain; None is an ideal camera.
         sway: motion while the picture is taken.
 
@@ -98,7 +96,7 @@ def picture_at(
         OptionError: the camera looks above the horizon, or is not above the highest roof.
     """
     grid, up = grid_at(town, origin, east_north_up_m), float(east_north_up_m[2])
-    sensor = sensor or town.condition.sensor(DRONE_SENSOR)
+    sensor = town.condition.sensor(DRONE_SENSOR)
     return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, optics=optics, sway=sway)
 
 

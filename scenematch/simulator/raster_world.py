@@ -37,8 +37,6 @@ def world_from_map(
     *,
     condition: str | Condition | None = None,
     seed: int = 1,
-    bounds_deg: tuple[float, float, float, float] | None = None,
-    crs: Any = None,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> Town:
     """A world of the user's rasters, flown over as a built town is; its map is the rasters themselves.
@@ -51,8 +49,6 @@ def world_from_map(
         surface: heights in any grid and CRS; None is flat.
         condition: of the frames, on top of the light in the photograph; None leaves the photograph as it is.
         seed: of the snow's patches and the bare branches.
-        bounds_deg: of a picture without georeference.
-        crs: of a file that names none.
         cache_dir: where resampled maps are kept.
 
     Raises:
@@ -60,7 +56,7 @@ def world_from_map(
         OptionError: there is no such condition.
     """
     day = None if condition is None else condition_by_name(condition)
-    rgb, grid = _photograph(open_source(path, bounds_deg=bounds_deg, crs=crs), cache_dir)
+    rgb, grid = _photograph(open_source(path), cache_dir)
     code = grid.crs.to_epsg()
     if code is None:
         raise MapError(f"map: expected a CRS with an EPSG code, got {grid.crs.name!r}")

@@ -16,6 +16,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.navigation.live import LiveOptions
@@ -29,7 +30,6 @@ from scenematch.cli.argument_names import ros_arguments_last
 from scenematch.files.ros.messages import (
     NO_POSITION,
     ODOMETRY_TYPES,
-    MessageFactory,
     attitude_from_message,
     body_velocity_from_message,
     camera_from_message,
@@ -48,7 +48,7 @@ NOW_NS = 1_700_000_000_123_456_789
 
 
 def maker_of(name):
-    return MessageFactory(STORES[name].types.__getitem__, name == "ros1")
+    return BagMessages(STORES[name].types.__getitem__, name == "ros1")
 
 
 def wired(name, message):

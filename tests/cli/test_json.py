@@ -50,7 +50,6 @@ def spoken(capsys, arguments, code):
         (["map", "info", "m.tif"], "MAP", 1),
         (["track", "--map=m.tif", "--frames=f", "--out=o", "--telemetry=no.csv"], "--map", 1),
         (["evaluate", "nothing/here"], "DIR", 1),
-        (["campaign", "no.toml", "--out=o"], "FILE", 1),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -71,7 +70,6 @@ def test_an_error_names_its_argument(arguments, argument, code, capsys, tmp_path
 def test_a_url_is_repeated_as_it_was_typed(url, capsys):
     for arguments in (
         ["map", "info", url],
-        ["campaign", url, "--out=o"],
         ["track", f"--map={url}", "--frames=f", "--out=o"],
         ["track", "--map", url, "--frames=f", "--out=o"],
     ):

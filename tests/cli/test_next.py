@@ -10,7 +10,6 @@ from typer.main import get_command
 
 from scenematch.cli import console
 from scenematch.cli.app import app, run
-from scenematch.report.campaign import CampaignRow
 from tests.cli.test_json import LEAVES
 
 pytestmark = pytest.mark.usefixtures("bare_runs")
@@ -61,7 +60,6 @@ def test_from_a_flight_to_its_export_by_what_is_said(flight, tmp_path, capsys, m
 def test_others_name_commands_that_exist(flight, capsys):
     assert parsed(next_of(capsys, ["map", "info", str(flight / "map.tif")])) == "audit"
     assert parsed(next_of(capsys, ["doctor"])) == "demo"
-    assert parsed(next_of(capsys, ["dataset", "check", str(flight)])) == "track"
 
 
 def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, capsys):
@@ -87,19 +85,6 @@ def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs, draw
     assert shlex.split(found[1]) == [str(out / drawn)]
     assert (out / drawn).is_file()
     assert parsed(shlex.split(found[2])) == "track"
-
-
-def test_campaign_names_runs_that_it_finished(tmp_path, capsys, monkeypatch):
-    lines = [
-        CampaignRow("group", "bad", "ncc", None, None, "its camera does not fit"),
-        *(CampaignRow("group", "good", name, None, None, None) for name in ("ncc", "sift", "auto")),
-    ]
-    monkeypatch.setattr("scenematch.runs.campaign.run_campaign", lambda *_, **__: lines)
-    monkeypatch.setattr("scenematch.report.campaign.pool_runs", lambda _: [])
-    words = next_of(capsys, ["campaign", "c.toml", f"--out={tmp_path / 'o'}"], code=1)
-    assert words == ["report", *(str(tmp_path / "o" / "runs" / "good" / name) for name in ("ncc", "sift"))]
-    del lines[1:]
-    assert next_of(capsys, ["campaign", "c.toml", "--out=o"], code=1) == ["report", "RUN"]
 
 
 @pytest.mark.parametrize(("availability", "command"), [(0.9, "export"), (0.0, "check")])

@@ -17,16 +17,15 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from bench.inputs.bags import BAG_KINDS, BagMessages, flight_bag, write_bag
 from bench.live.fuzz_bags import damaged
 from engine.camera import Camera
-from engine.errors import MissingExtraError, OptionError, TelemetryError
+from engine.errors import MissingExtraError, TelemetryError
 from engine.values import Frame, Prior, Truth
 from scenematch.cli.app import run as main
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
-from scenematch.files.ros.bag_writer import BAG_KINDS, write_bag
 from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
-from scenematch.files.ros.messages import MessageFactory
 from tests.support.odometries import odometry_message, twist_message
 from tests.support.towns import drawn_town
 
@@ -130,7 +129,7 @@ def test_others_read_what_is_written(tmp_path, kind):
 
 def test_without_a_compass_the_imu_has_the_heading(tmp_path):
     types = get_typestore(Stores.ROS1_NOETIC)
-    maker = MessageFactory(types.types.__getitem__, True)
+    maker = BagMessages(types.types.__getitem__, True)
     with Writer1(tmp_path / "imu.bag") as writer:
         connection = writer.add_connection("/imu/data", "sensor_msgs/msg/Imu", typestore=types)
         for k in range(3):
@@ -160,7 +159,7 @@ def written(path, topics):
 
 @pytest.fixture
 def maker():
-    return MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
+    return BagMessages(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
 
 
 def test_several_topics_with_pictures_ask_for_one(tmp_path, maker):
@@ -248,7 +247,7 @@ def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ma
 @pytest.mark.parametrize("variances", [(0.16, 0.04, 0.04), None])
 @pytest.mark.parametrize("ros1", [True, False])
 def test_a_twist_by_itself_is_an_odometry_too(tmp_path, ros1, variances):
-    maker = MessageFactory(get_typestore(STORES[ros1]).types.__getitem__, ros1)
+    maker = BagMessages(get_typestore(STORES[ros1]).types.__getitem__, ros1)
     path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker, variances=variances, by=twist_message)
     flight = open_flight(path, odometry_topic="/vio/odometry")
     for k, item in zip((1, 6, 11), flight, strict=True):
@@ -317,37 +316,14 @@ def test_what_counts_as_a_bag(tmp_path):
     assert len(BagFrames(next(path.glob("*.mcap"))).names) == 5
 
 
-@pytest.mark.parametrize(("name", "kind"), [("b.mcap", "ros2-mcap"), ("b.db3", "ros2-sqlite3")])
-def test_a_bag_of_ros_2_is_one_file_where_its_name_says_so(tmp_path, name, kind):
-    frames, truth = a_flight(3)
-    path = tmp_path / "deep" / name
-    for replace in (False, True):
-        assert write_bag(path, ((f, None) for f in frames), CAMERA, kind=kind, truth=truth, replace=replace) == 3
-        assert path.is_file()
-        assert list(path.parent.iterdir()) == [path]
-    read = BagFrames(path)
-    for frame, number in zip(frames, read.names, strict=True):
-        np.testing.assert_array_equal(read.read(number), frame.image)
-    other = "ros2-mcap" if kind == "ros2-sqlite3" else "ros2-sqlite3"
-    with pytest.raises(OptionError, match=r"path: expected a name that ends in .* or is a folder's for ros2"):
-        write_bag(tmp_path / name, [], CAMERA, kind=other)
-
-
-def test_misuse_is_named(tmp_path):
-    frames, _ = a_flight(1)
-    with pytest.raises(OptionError, match="kind: expected one of ros1"):
-        write_bag(tmp_path / "x", [], CAMERA, kind="ros3")
-    with pytest.raises(OptionError, match=r"ends in \.bag for ros1"):
-        write_bag(tmp_path / "x", [], CAMERA, kind="ros1")
-    with pytest.raises(TelemetryError, match="frame 0: expected a stamp"):
-        write_bag(tmp_path / "x.bag", [(Frame(frames[0].image), None)], CAMERA, kind="ros1")
-    (tmp_path / "there.bag").write_bytes(b"")
-    with pytest.raises(OptionError, match=r"there\.bag exists"):
-        write_bag(tmp_path / "there.bag", [], CAMERA, kind="ros1")
-    with pytest.raises(TelemetryError, match=r"/there\.bag/x: cannot be written"):
-        write_bag(tmp_path / "there.bag" / "x", [], CAMERA, kind="ros2-mcap")
+def test_a_bag_that_is_missing_or_without_its_reader_is_named(tmp_path, monkeypatch):
     with pytest.raises(TelemetryError, match="no such bag"):
         BagFrames(tmp_path / "missing.bag")
+    path, _, _ = a_bag(tmp_path, "ros1", count=2)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(MissingExtraError, match=r"\[bags\]"):
+        BagFrames(path)
 
 
 # -------------------------------------------------------------------------------------------------- damage
@@ -405,12 +381,7 @@ def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     folder, bag = tmp_path / "flight", tmp_path / "flight.bag"
     folder.mkdir()
     write_flight(folder, plan_flight(town=drawn_town(), frames=3))
-    assert main(["bag", str(folder), "--out", str(bag)]) == 0
-    assert main(["bag", str(folder), "--out", str(bag)]) == 2
-    assert main(["bag", str(folder), "--out", str(bag), "--force"]) == 0
-    assert main(["bag", str(folder), "--out", str(tmp_path / "x"), "--format", "ros1"]) == 2
-    assert main(["bag", str(folder), "--out", str(tmp_path / "b.mcap")]) == 0
-    assert (tmp_path / "b.mcap").is_file()
+    flight_bag(folder, bag)
     world = ["--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif")]
     inputs = {
         "folder": ["--frames", str(folder / "frames"), "--telemetry", str(folder / "telemetry.csv"),
@@ -430,57 +401,6 @@ def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
     capsys.readouterr()
     assert main(["track", *world, "--frames", str(folder / "frames"), "--out", str(tmp_path / "y")]) == 1
     assert "--camera" in capsys.readouterr().err
-
-
-def files_in(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_force_replaces_a_bag_and_nothing_else(tmp_path):
-    path, _, _ = a_bag(tmp_path, "ros2-mcap")
-    (path / "notes.txt").write_text("mine", encoding="utf-8")
-    before = files_in(tmp_path)
-    with pytest.raises(OptionError, match=r"notes\.txt"):
-        write_bag(path, [], CAMERA, kind="ros2-mcap", replace=True)
-    (tmp_path / "link").symlink_to(path)
-    (path / "notes.txt").unlink()
-    with pytest.raises(OptionError, match="it is a link"):
-        write_bag(tmp_path / "link", [], CAMERA, kind="ros2-mcap", replace=True)
-    (path / "notes.txt").write_text("mine", encoding="utf-8")
-    (tmp_path / "link").unlink()
-    assert files_in(tmp_path) == before
-
-
-def unreadable():
-    """A frame, and then one that does not decode."""
-    frames, _ = a_flight(1)
-    yield frames[0], None
-    raise TelemetryError("frame 1: expected a readable picture")
-
-
-@pytest.mark.parametrize("kind", BAG_KINDS)
-def test_a_bag_stays_until_the_next_one_is_whole(tmp_path, kind, monkeypatch):
-    path, _, _ = a_bag(tmp_path, kind, count=2)
-    before = files_in(tmp_path)
-    with pytest.raises(TelemetryError, match="readable"):
-        write_bag(path, unreadable(), CAMERA, kind=kind, replace=True)
-    assert files_in(tmp_path) == before
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "rosbags", None)
-        patch.setitem(sys.modules, "rosbags.highlevel", None)
-        with pytest.raises(MissingExtraError, match=r"\[bags\]"):
-            write_bag(path, [], CAMERA, kind=kind, replace=True)
-    assert files_in(tmp_path) == before
-    frames, _ = a_flight(3)
-    assert write_bag(path, [(frame, None) for frame in frames], CAMERA, kind=kind, replace=True) == 3
-    assert len(BagFrames(path).names) == 3
-    assert list(tmp_path.iterdir()) == [path]
-    assert sorted(files_in(tmp_path)) == sorted(before)
-
-    new = tmp_path / "deep" / path.name  # where nothing was, nothing half is left
-    with pytest.raises(TelemetryError, match="readable"):
-        write_bag(new, unreadable(), CAMERA, kind=kind)
-    assert not any(new.parent.iterdir())
 
 
 def test_topics_of_the_calibration(tmp_path, maker):

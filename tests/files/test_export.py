@@ -1,16 +1,11 @@
-"""Tracks in other programs' formats, read back by other parsers: places, times, gaps, checksums, rounding."""
+"""Tracks in other programs' formats, read back by other parsers: places, times, gaps."""
 
 import io
 import json
-import re
 import xml.etree.ElementTree as ElementTree
-from functools import reduce
-from operator import xor
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from engine.errors import TelemetryError
@@ -22,7 +17,6 @@ from scenematch.files.track import write_track
 
 T0 = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 GPX = "{http://www.topografix.com/GPX/1/1}"
-KML = "{http://www.opengis.net/kml/2.2}"
 
 
 def fix(k, lat_deg=32.5, lon_deg=35.25, *, start_ns=T0, up_m=None, **more):
@@ -93,15 +87,6 @@ def test_geojson_has_lines_of_two_points_or_more_and_every_fix_with_its_sigma():
     assert all(f["geometry"]["type"] == "Point" for f in json.loads(export.to_geojson([fix(0)]))["features"])
 
 
-def test_kml_is_longitude_first_with_a_line_a_run():
-    root = ElementTree.fromstring(export.to_kml(ROWS))
-    lines = [e.text.split() for e in root.iterfind(f".//{KML}LineString/{KML}coordinates")]
-    assert [len(line) for line in lines] == [2, 3]
-    assert lines[0][0] == "35.250000000,32.500000000"
-    assert len(root.findall(f".//{KML}Folder/{KML}Placemark")) == 6
-    assert root.find(f".//{KML}when").text == "2023-11-14T22:13:20.000000Z"
-
-
 def test_tum_keeps_every_nanosecond_and_says_what_is_not_known():
     rows = [fix(0, start_ns=T0 + 1), refusal(1), fix(2, start_ns=-600_000_000), fix(0, start_ns=5)]
     head, *lines = export.to_tum(rows).splitlines()
@@ -138,10 +123,8 @@ def test_tum_has_whole_poses_and_leaves_out_what_is_none():
 def test_heights_above_the_sea_are_only_those_that_are():
     rows = [fix(0, up_m=150.0)]
     assert "<ele>" not in export.to_gpx(rows)
-    assert export.to_nmea(rows).split(",")[9:11] == ["", ""]
     row = export.pose_rows(rows, is_amsl=True)[0]
     assert "<ele>150.000</ele>" in export.to_gpx([row])
-    assert export.to_nmea([row]).split(",")[9:11] == ["150.00", "M"]
 
 
 def test_notes_complete_the_pose_of_a_fix_and_of_no_refusal():
@@ -154,50 +137,9 @@ def test_notes_complete_the_pose_of_a_fix_and_of_no_refusal():
     assert json.loads(export.to_geojson(rows))["features"][-1]["properties"]["sigma_up_m"] is None
 
 
-def test_the_checksum_is_that_of_a_sentence_known_from_the_standards_example():
-    body = "GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
-    assert export.nmea_sentence(body) == f"${body}*47"
-
-
-def test_nmea_sentences_are_valid_and_a_refusal_is_void():
-    text = export.to_nmea([fix(0, -32.5, -35.25, alt_amsl_m=7.125), refusal(1)])
-    assert text.endswith("\r\n")
-    sentences = text.split("\r\n")[:-1]
-    for sentence in sentences:
-        body, checksum = re.fullmatch(r"\$(.+)\*([0-9A-F]{2})", sentence).groups()
-        assert reduce(xor, body.encode()) == int(checksum, 16)
-        assert len(body.split(",")) == (15 if body.startswith("GPGGA") else 13)
-    assert sentences[0].startswith("$GPGGA,221320.00,3230.000000,S,03515.000000,W,1,00,,7.12,M,")
-    assert sentences[1].startswith("$GPRMC,221320.00,A,3230.000000,S,03515.000000,W,,,141123,,,A*")
-    assert sentences[2].startswith("$GPGGA,221320.25,,,,,0,00,,,")
-    assert sentences[3].startswith("$GPRMC,221320.25,V,,,,,,,141123,,,N*")
-
-
-def test_times_of_day_are_rounded_over_midnight_and_blank_without_utc():
-    before_midnight_ns = 1_700_006_399_998_000_000
-    gga, rmc = export.to_nmea([fix(0, start_ns=before_midnight_ns)]).split("\r\n")[:2]
-    assert gga.split(",")[1] == "000000.00"
-    assert (rmc.split(",")[1], rmc.split(",")[9]) == ("000000.00", "151123")
+def test_times_of_day_are_left_out_without_utc():
     boot = [fix(0, start_ns=12_000_000_000), fix(0, start_ns=None)]
-    for sentence in export.to_nmea(boot).split("\r\n")[:-1]:
-        assert sentence.split(",")[1] == ""
     assert "<time>" not in export.to_gpx(boot)
-    assert "<when>" not in export.to_kml(boot)
-
-
-def test_minutes_carry_into_degrees():
-    assert export.degrees_minutes(48.117300, 2) == "4807.038000"
-    assert export.degrees_minutes(59.99999 / 60, 2) == "0059.999990"
-    assert export.degrees_minutes((60 - 1e-8) / 60, 3) == "00100.000000"
-    assert export.degrees_minutes(9.9999999999, 3) == "01000.000000"
-
-
-@given(st.floats(-180, 180))
-def test_minutes_stay_below_sixty_and_read_back_to_two_millimetres(value_deg):
-    text = export.degrees_minutes(value_deg, 3)
-    degrees, minutes = int(text[:3]), float(text[3:])
-    assert minutes < 60
-    assert degrees + minutes / 60 == pytest.approx(abs(value_deg), abs=1e-8)
 
 
 @pytest.mark.parametrize("kind", export.WRITERS)
@@ -266,7 +208,7 @@ def test_the_command_refuses_in_one_line(tmp_path, capfd):
     code, error = refused("--format", "gpx")
     assert (code, "expected a track with a fix, got 1 rows without" in error) == (1, True)
     code, error = refused("--format", "shp")
-    assert (code, "--format: expected one of gpx, geojson, kml, tum, nmea, got 'shp'" in error) == (2, True)
+    assert (code, "--format: expected one of gpx, geojson, tum, got 'shp'" in error) == (2, True)
     write_track(tmp_path / "track.csv", ROWS)
     code, error = refused("--format", "gpx", "--out", str(tmp_path / "none" / "x.gpx"))
     assert (code, "cannot be written" in error) == (1, True)

@@ -1,4 +1,4 @@
-"""Exported tracks opened by the libraries that people open them with: gpxpy, pynmea2, and GDAL by pyogrio."""
+"""Exported tracks opened by the libraries that people open them with: gpxpy, and GDAL by pyogrio."""
 
 import datetime
 import warnings
@@ -47,20 +47,6 @@ def test_gpxpy_finds_a_segment_a_run_with_its_places_times_and_heights():
         assert [point.time for point in segment.points] == [moment(k) for k in ks]
 
 
-def test_pynmea2_finds_the_fixes_and_none_in_void_sentences():
-    pynmea2 = pytest.importorskip("pynmea2", reason="pynmea2 is not installed")
-    timed = [FIXES.get(k, PoseRow(timestamp_ns=T0 + k * 250_000_000, frame="", status="no_fix")) for k in range(9)]
-    sentences = [pynmea2.parse(line, check=True) for line in export.to_nmea(timed).split("\r\n")[:-1]]
-    heights, places_of = sentences[::2], sentences[1::2]
-    assert [s.gps_qual for s in heights] == [int(k in FIXES) for k in range(9)]
-    assert [s.is_valid for s in places_of] == [k in FIXES for k in range(9)]
-    for k, fix in FIXES.items():
-        for sentence in (heights[k], places_of[k]):
-            assert (sentence.longitude, sentence.latitude) == pytest.approx((fix.lon_deg, fix.lat_deg), abs=1e-8)
-        assert heights[k].altitude == pytest.approx(fix.alt_amsl_m, abs=0.006)
-        assert abs(places_of[k].datetime - moment(k)) <= datetime.timedelta(milliseconds=10)
-
-
 def points_of(geometries):
     """(N, 2) of points in WKB, with a height or without."""
     return np.array([np.frombuffer(wkb, "<f8", count=2, offset=5) for wkb in geometries])
@@ -95,11 +81,3 @@ def test_gdal_opens_gpx_with_the_points_in_their_segments(tmp_path):
     assert points_of(geometries) == pytest.approx(places(FIXES), abs=1e-9)
     assert fields["track_seg_id"].tolist() == [run for run, ks in enumerate(RUNS) for _ in ks]
     assert fields["ele"].tolist() == [fix.alt_amsl_m for fix in FIXES.values()]
-
-
-def test_gdal_opens_kml(tmp_path):
-    path = tmp_path / "track.kml"
-    path.write_text(export.to_kml(ROWS), encoding="utf-8")
-    facts, geometries, _ = gdal_layer(path, "fixes")
-    assert facts["crs"] == "EPSG:4326"
-    assert points_of(geometries) == pytest.approx(places(FIXES), abs=1e-9)

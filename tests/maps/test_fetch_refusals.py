@@ -4,19 +4,17 @@ import re
 import socket
 import threading
 import time
-from http.client import HTTPException
 from xml.etree import ElementTree as Xml
 
 import pytest
 from pyproj import CRS
 
 from engine.errors import MapError, OptionError
-from scenematch.fetch import client
-from scenematch.fetch.client import Client, check_url, shown
+from scenematch.fetch.crs import chosen_crs
 from scenematch.fetch.heights import files_for, read_part
-from scenematch.fetch.mosaic import Place, Wanted
-from scenematch.fetch.services import chosen_crs
-from scenematch.fetch.wmts import plan_wmts
+from scenematch.fetch.place import Place
+from scenematch.fetch.urls import check_url, shown
+from scenematch.fetch.wmts import _extra_query
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 
 TILES = "http://127.0.0.1:9/{z}/{x}/{y}.png"  # nobody listens there
@@ -41,7 +39,7 @@ def test_the_users_own_surface_is_never_replaced_by_a_part_of_it(tmp_path, surfa
 
 
 def test_a_refusal_leaves_no_empty_folder(tmp_path):
-    with pytest.raises(MapError, match="cannot connect"):
+    with pytest.raises(MapError, match="Failed to connect"):
         fetch_map(settings(), tmp_path / "map.tif")
     assert list(tmp_path.iterdir()) == []
 
@@ -103,19 +101,6 @@ def test_an_address_that_cannot_be_is_refused_at_once(url):
     assert "\n" not in str(error.value)
 
 
-def test_what_the_client_cannot_ask_for_is_asked_for_once(monkeypatch):
-    """An address that a server names: of its capabilities, or where it sends to."""
-    said = []
-    monkeypatch.setattr(client.time, "sleep", lambda _: None)
-    for url in ("http://127.0.0.1:9/a b?key=S3CRET", "http://127.0.0.1:abc/"):
-        with pytest.raises(MapError, match="cannot be asked for") as error:
-            Client(0.0, 1.0, said.append).get(url)
-        assert "S3CRET" not in str(error.value)
-        assert "\n" not in str(error.value)
-    assert said == []
-    assert issubclass(client.InvalidURL, HTTPException)  # which else is tried again
-
-
 @pytest.mark.parametrize("surface", ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif"])
 def test_stray_braces_are_refused(surface):
     with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon} as placeholders, or none"):
@@ -153,40 +138,16 @@ def test_only_a_coordinate_system_for_the_place_is_chosen():
     assert chosen_crs(None, ["EPSG:3832"], Place(-17.0, -179.0, 50.0)) == "EPSG:3832"
 
 
-WMTS = """<Capabilities xmlns="http://www.opengis.net/wmts/1.0" xmlns:ows="http://www.opengis.net/ows/1.1"
- xmlns:xlink="http://www.w3.org/1999/xlink" version="1.0.0">{operations}<Contents>
-<Layer><ows:Identifier>o</ows:Identifier><Format>image/png</Format>
-<TileMatrixSetLink><TileMatrixSet>odd</TileMatrixSet></TileMatrixSetLink>
-<TileMatrixSetLink><TileMatrixSet>world</TileMatrixSet></TileMatrixSetLink></Layer>
-<TileMatrixSet><ows:Identifier>odd</ows:Identifier><ows:SupportedCRS>EPSG:999999</ows:SupportedCRS>{matrix}
-</TileMatrixSet><TileMatrixSet><ows:Identifier>world</ows:Identifier>
-<ows:SupportedCRS>urn:ogc:def:crs:EPSG::3857</ows:SupportedCRS>{matrix}</TileMatrixSet></Contents></Capabilities>"""
-MATRIX = """<TileMatrix><ows:Identifier>18</ows:Identifier><ScaleDenominator>2132.729583849784</ScaleDenominator>
-<TopLeftCorner>-20037508.342789244 20037508.342789244</TopLeftCorner><TileWidth>256</TileWidth>
-<TileHeight>256</TileHeight><MatrixWidth>262144</MatrixWidth><MatrixHeight>262144</MatrixHeight></TileMatrix>"""
-OPERATIONS = """<ows:OperationsMetadata><ows:Operation name="GetTile"><ows:DCP><ows:HTTP>
-<ows:Get xlink:href="/rest"><ows:Constraint name="GetEncoding"><ows:AllowedValues><ows:Value>RESTful</ows:Value>
-</ows:AllowedValues></ows:Constraint></ows:Get><ows:Get xlink:href="{href}"/></ows:HTTP></ows:DCP></ows:Operation>
-</ows:OperationsMetadata>"""
-
-
 @pytest.mark.parametrize(
-    ("href", "address"),
-    [
-        (None, "https://a.org/caps.xml?key=S3CRET&"),
-        ("https://a.org/tiles?map=m", "https://a.org/tiles?map=m&key=S3CRET&"),
-        ("kvp/", "https://a.org/kvp/?key=S3CRET&"),
-        ("https://b.org/tiles", "https://b.org/tiles?SERVICE="),  # the key is for the host that was named
-    ],
+    ("href", "sent"),
+    [("https://a.org/tiles?map=m", "key=S3CRET"), ("/kvp", "key=S3CRET"), ("https://b.org/tiles", "")],
 )
-def test_wmts_tiles_are_asked_for_where_the_server_says_in_a_set_that_is_known(href, address):
-    operations = "" if href is None else OPERATIONS.format(href=href)
-    root = Xml.fromstring(WMTS.format(matrix=MATRIX, operations=operations))
-    wanted = Wanted(place=Place(48.2, 16.4, 50.0), gsd_m_per_px=0.5, max_tiles=9)
-    mosaic = plan_wmts(root, "https://a.org/caps.xml?key=S3CRET", wanted)
-    assert mosaic.crs == CRS.from_epsg(3857)
-    assert all(piece.url.startswith(address) for piece in mosaic.pieces), mosaic.pieces[0].url
-    assert "TILEMATRIXSET=world" in mosaic.pieces[0].url.upper().replace("WORLD", "world")
+def test_a_key_is_sent_to_the_host_that_was_named_and_to_no_other(href, sent):
+    text = (
+        '<C xmlns:xlink="http://www.w3.org/1999/xlink"><Operation name="GetTile"><DCP><HTTP>'
+        f'<Get xlink:href="{href}"/></HTTP></DCP></Operation></C>'
+    )
+    assert _extra_query(Xml.fromstring(text), "https://a.org/caps.xml?key=S3CRET&Service=WMTS") == sent
 
 
 # ------------------------------------------------------------ servers that fall silent
@@ -223,5 +184,5 @@ def test_heights_are_waited_for_no_longer_than_agreed(falls_silent, monkeypatch)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     begin_s = time.monotonic()
     with pytest.raises(MapError, match=re.escape("heights.tif: cannot be read as a GeoTIFF by ranges of bytes")):
-        read_part([falls_silent], (0.0, 0.0, 1.0, 1.0), CRS.from_epsg(4326), None, Client(0.0, 1.0, print))
+        read_part([falls_silent], (0.0, 0.0, 1.0, 1.0), CRS.from_epsg(4326), None, 1.0)
     assert time.monotonic() - begin_s < 60.0  # GDAL asks again, some times

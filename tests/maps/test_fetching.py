@@ -17,10 +17,9 @@ from rasterio.transform import Affine
 from engine import Fix, OrthoMap
 from engine.errors import MapError, OptionError
 from engine.values import Window
-from scenematch.fetch import client
-from scenematch.fetch.client import shown
+from scenematch.fetch import pictures
 from scenematch.fetch.heights import files_for
-from scenematch.fetch.xyz import tile_url
+from scenematch.fetch.urls import shown
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.simulation import write_flight
@@ -76,7 +75,7 @@ def one_server(raster, files):
 def server(one_server, monkeypatch):
     """Asked without a proxy, and nothing of another test left."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.setattr(client, "FIRST_WAIT_S", 0.01)
+    monkeypatch.setattr(pictures, "FIRST_WAIT_S", 0.01)
     one_server.asked.clear()
     one_server.trouble.clear()
     one_server.wms_version, one_server.most_px, one_server.layers, one_server.kvp = "1.3.0", 200, ("ortho",), False
@@ -127,39 +126,14 @@ def offsets_px(pixels, profile):
 # ------------------------------------------------------------ what is fetched
 
 
-@pytest.mark.parametrize(
-    ("template", "path"),
-    [("{z}/{x}/{y}.png", None), ("{z}/{x}/{-y}.png", "tms"), ("{q}", "quadkey")],
-    ids=["XYZ", "TMS", "quadkey"],
-)
-def test_tiles_lie_where_they_say(server, fetched, template, path, monkeypatch):
-    if path is not None:  # the server knows XYZ only: what it is asked for is translated by the rule of the scheme
-        monkeypatch.setattr(client.Client, "_once", translated(client.Client._once, path))
-    facts, pixels, profile = fetched(f"{server.url}/tiles/{template}")
+@pytest.mark.parametrize("template", ["tiles/{z}/{x}/{y}.png", "tms/{z}/{x}/{-y}.png", "quadkeys/{q}"])
+def test_tiles_lie_where_they_say(server, fetched, template):
+    facts, pixels, profile = fetched(f"{server.url}/{template}")
     assert (facts["kind"], facts["level"], facts["crs"]) == ("XYZ", str(ZOOM), "EPSG:3857")
     assert profile["count"] == 3
     assert facts["gsd_m_per_px"] == pytest.approx(0.399, abs=0.002)  # of level 18 at 48 degrees
     assert offsets_px(pixels, profile).max() < 0.51
-    assert facts["tiles"] == facts["fetched"] == facts["width_px"] * facts["height_px"] // 256**2
-
-
-def translated(once, path):
-    def ask(self, url, first_bytes):
-        if path == "tms":
-            zoom, column, row = map(int, re.findall(r"/(\d+)", url)[-3:])
-            url = re.sub(r"\d+\.png$", f"{2**zoom - 1 - row}.png", url)
-        else:
-            key = url.rpartition("/")[2]
-            bits = [(int(digit) & 1, int(digit) >> 1) for digit in key]
-            column, row = (int("".join(str(pair[axis]) for pair in bits), 2) for axis in (0, 1))
-            url = url.replace(key, f"{len(key)}/{column}/{row}.png")
-        return once(self, url, first_bytes)
-
-    return ask
-
-
-def test_a_quadkey_is_that_of_its_inventor():
-    assert tile_url("{q}", 3, 3, 5) == "213"  # the example of Bing Maps' tile system
+    assert facts["tiles"] == len(server.asked) == facts["width_px"] * facts["height_px"] // 256**2
 
 
 @pytest.mark.parametrize(
@@ -171,10 +145,6 @@ def test_a_quadkey_is_that_of_its_inventor():
 )  # fmt: skip
 def test_a_wms_draws_on_the_grid_that_is_asked_for(server, fetched, version, crs):
     server.wms_version = version
-    if (version, crs) == ("1.1.1", "CRS:84"):
-        with pytest.raises(OptionError, match="crs: expected one that the server offers"):
-            fetched(f"{server.url}/wms", crs=crs)
-        return
     server.most_px = 200 if version == "1.3.0" else 1024  # 1.1.1 does not state it
     facts, pixels, profile = fetched(f"{server.url}/wms?map=/town.map", crs=crs)
     assert profile["crs"].to_epsg() == {None: 32633, "CRS:84": 4326}.get(crs) or profile["crs"] == crs
@@ -193,7 +163,7 @@ def test_a_wms_draws_on_the_grid_that_is_asked_for(server, fetched, version, crs
 def test_a_wmts_is_read_in_its_own_grid(server, fetched, kvp):
     server.kvp = kvp
     facts, pixels, profile = fetched(f"{server.url}/wmts" + ("" if kvp else "/1.0.0/WMTSCapabilities.xml"))
-    assert (facts["kind"], facts["level"], profile["crs"].to_epsg()) == ("WMTS", "fine", 31256)
+    assert (facts["kind"], facts["level"], profile["crs"].to_epsg()) == ("WMTS", "EPSG:31256", 31256)
     assert (profile["transform"].a, profile["transform"].e) == pytest.approx((0.5, -0.5), rel=1e-9)
     assert offsets_px(pixels, profile).max() < 0.51
     assert facts["server_states"][1] == "AccessConstraints: CC BY"
@@ -229,7 +199,6 @@ def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path
     np.testing.assert_array_equal(site.gray(part), own.gray(Window(0, 0, SIZE, SIZE)))
     everything = site.valid(Window(0, 0, site.width_px, site.height_px))
     assert everything.sum() == SIZE * SIZE  # what is beside the picture, or in a missing tile, is nodata
-    assert 0 < facts["gaps"] < facts["tiles"]
     assert facts["nodata_share"] == pytest.approx(1.0 - everything.mean())
     assert site.georeference_sigma_m == 1.5
     with rasterio.open(tmp_path / "map.tif") as file:
@@ -280,100 +249,81 @@ def test_nothing_is_asked_for_where_too_much_is_wanted_or_nothing_is_to_be_fetch
         fetch_map(settings(source, 300.0, max_tiles=9), tmp_path / "map.tif")
     count = int(re.search(r"has (\d+)", str(error.value))[1])
     facts = fetch_map(settings(source, 300.0, max_tiles=count, dry_run=True), tmp_path / "map.tif")
-    assert (facts["tiles"], facts["tiles_to_fetch"], facts["dry_run"]) == (count, count, True)
-    assert facts["expected_mb"] == pytest.approx(count * 256**2 * 2 / 1e6)
+    assert (facts["tiles"], facts["dry_run"]) == (count, True)
     assert server.asked == []
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_fetch_goes_on_where_it_was(server, settings, tmp_path):
+def test_an_interrupted_fetch_goes_on_where_it_was(server, settings, tmp_path):
     source, out = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", tmp_path / "map.tif"
-    whole = fetch_map(settings(source, 120.0), tmp_path / "whole.tif")
+    fetch_map(settings(source, 120.0), tmp_path / "whole.tif")
     first_asked = list(server.asked)
     server.asked.clear()
     server.trouble[:] = [(first_asked[4], (403, {}))]
-    with pytest.raises(MapError, match="answers 403"):
+    with pytest.raises(MapError, match="answers 403: it does not let you in"):
         fetch_map(settings(source, 120.0), out)
     assert len(server.asked) == 5
-    assert not out.exists()
-    kept = tmp_path / "map.tif.tiles"
-    assert len(list(kept.glob("*.piece"))) == 4
-    (kept / "half.part").write_bytes(b"what a kill leaves")
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith("map.tif")] == ["map.tif.tiles"]
+    (tmp_path / "map.tif.tiles" / "mine.txt").write_text("the user's own", encoding="utf-8")
     server.asked.clear()
-    facts = fetch_map(settings(source, 120.0), out)
+    fetch_map(settings(source, 120.0), out)
     assert server.asked == first_asked[4:]
-    assert (facts["tiles_to_fetch"], facts["fetched"]) == (whole["tiles"] - 4, whole["tiles"] - 4)
-    assert not kept.exists()
+    assert [path.name for path in (tmp_path / "map.tif.tiles").rglob("*")] == ["mine.txt"]
     with rasterio.open(out) as one, rasterio.open(tmp_path / "whole.tif") as other:
         np.testing.assert_array_equal(one.read(), other.read())
         assert one.transform == other.transform
 
 
-def test_a_busy_server_and_a_broken_connection_are_waited_for(server, settings, tmp_path, monkeypatch):
+def test_a_busy_server_is_waited_for(server, settings, tmp_path, monkeypatch):
     waits = []
-    monkeypatch.setattr(client.time, "sleep", waits.append)
-    tile = "/tiles/"
-    server.trouble[:] = [
-        (tile, (429, {"Retry-After": "7"})), (tile, (503, {"Retry-After": "Wed, 21 Oct 2015 07:28:00 GMT"})),
-        (tile, "break"), (tile, (502, {})),
-    ]  # fmt: skip
+    monkeypatch.setattr(pictures.time, "sleep", waits.append)
+    server.trouble[:] = [("/tiles/", (429, {})), ("/tiles/", (503, {})), ("/tiles/", (502, {}))]
     facts = fetch_map(settings(f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", pause_ms=250.0), tmp_path / "map.tif")
-    assert len(server.asked) == facts["tiles"] + 4
-    long = [wait for wait in waits if wait not in (0.0,) and not 0.2 < wait <= 0.25]
-    assert long == pytest.approx([7.0, 0.04, 0.08])  # as asked; at once, by a date gone by; then ever longer
-    assert sum(0.2 < wait <= 0.25 for wait in waits) >= facts["tiles"] - 1  # the pause
+    assert len(server.asked) == facts["tiles"] + 3
+    assert waits == pytest.approx([0.0, 0.01, 0.02, 0.04] + [0.25] * (facts["tiles"] - 1))
     assert len(server.agents) == 1
     assert server.agents.pop().startswith("scenematch")
-
-
-def test_a_server_that_stays_busy_ends_the_fetch(server, settings, tmp_path):
-    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
     server.trouble[:] = [("/tiles/", (503, {}))] * 5
-    with pytest.raises(MapError, match=r"the server answers 503 Service Unavailable, at attempt 5$"):
-        fetch_map(settings(source), tmp_path / "map.tif")
-    server.trouble[:] = [("/tiles/", (429, {"Retry-After": "3600"}))]
-    with pytest.raises(MapError, match="at attempt 1, and asks for a wait of 3600 s"):
-        fetch_map(settings(source), tmp_path / "map.tif")
+    with pytest.raises(MapError, match=r"the server answers 503, at attempt 5$"):
+        fetch_map(settings(f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"), tmp_path / "other.tif")
 
 
-def test_what_is_no_picture_is_refused_with_what_it_says(server, settings, tmp_path):
-    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
+def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
+    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png?key=S3CRET"
     picture = io.BytesIO()
     Image.new("RGB", (512, 512)).save(picture, "PNG")
     for answer, text in (
-        (
-            b"<html><body>Please <b>log in</b></body></html>",
-            "expected a picture, got text/html that says 'Please log in'",
-        ),
-        (picture.getvalue(), "expected a picture of 256 x 256 px, got 512 x 512 px; give `tile_px` 512"),
-        (picture.getvalue()[:-30], "expected a picture"),
-        ((401, {}), "the server answers 401 Unauthorized: it does not let you in"),
+        (b"<html><body>Please <b>log in</b></body></html>", "expected pictures, got something else"),
+        (picture.getvalue(), "Incorrect size 512 x 512 of downloaded block, expected 256 x 256"),
+        ("break", "expected pictures, got something else"),
+        ((401, {}), "the server answers 401: it does not let you in"),
     ):
         server.trouble[:] = [("/tiles/", answer)]
-        with pytest.raises(MapError, match=re.escape(text)):
+        with pytest.raises(MapError, match=re.escape(text)) as error:
             fetch_map(settings(source), tmp_path / "map.tif")
-    assert not (tmp_path / "map.tif").exists()
-    assert list((tmp_path / "map.tif.tiles").glob("*.piece")) == []
+        assert "\n" not in str(error.value)
+        assert "S3CRET" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_where_nothing_is(server, settings, tmp_path):
     with pytest.raises(MapError, match=r"source: the server has no data there on level '18', 0.398 m/px"):
         fetch_map(settings(f"{server.url}/nowhere/{{z}}/{{x}}/{{y}}.png"), tmp_path / "a.tif")
-    with pytest.raises(MapError, match=r"/nowhere\?SERVICE=WMS&REQUEST=GetCapabilities: the server has nothing"):
+    with pytest.raises(MapError, match=r"/nowhere\?SERVICE=WMS&REQUEST=GetCapabilities: the server answers 404"):
         fetch_map(settings(f"{server.url}/nowhere"), tmp_path / "b.tif")
-    with pytest.raises(MapError, match=r"the host no-such-host.invalid is unknown, or there is no network"):
+    with pytest.raises(MapError, match="Could not resolve host: no-such-host"):
         fetch_map(settings("http://no-such-host.invalid/{z}/{x}/{y}.png"), tmp_path / "c.tif")
-    with pytest.raises(MapError, match=r"cannot connect to 127.0.0.1"):
+    with pytest.raises(MapError, match="Failed to connect to 127"):
         fetch_map(settings("http://127.0.0.1:9/{z}/{x}/{y}.png"), tmp_path / "d.tif")
     server.wms_version = "1.3.0"
-    with pytest.raises(OptionError, match="around: expected a place that the layer covers"):
+    with pytest.raises(MapError, match="source: the server has no data there on level 'EPSG:3857'"):
         fetch_map(FetchSettings(around="10,10", radius_m=50, source=f"{server.url}/wms"), tmp_path / "e.tif")
 
 
-def test_a_proxy_that_is_not_there_is_named(settings, tmp_path, monkeypatch):
+def test_a_proxy_that_is_not_there_is_one_line_without_its_password(settings, tmp_path, monkeypatch):
     monkeypatch.setenv("http_proxy", "http://user:secret@127.0.0.1:9")
     monkeypatch.delenv("no_proxy", raising=False)
-    with pytest.raises(MapError, match=r"cannot connect to example.org, through the proxy 127.0.0.1 ") as error:
+    with pytest.raises(MapError, match=r"Failed to connect to example\.org port 80 via 127") as error:
         fetch_map(settings("http://example.org/{z}/{x}/{y}.png"), tmp_path / "map.tif")
     assert "secret" not in str(error.value)
 
@@ -386,19 +336,18 @@ def test_a_wms_says_which_layers_it_has_and_what_was_wrong(server, settings, tmp
         fetch_map(settings(f"{server.url}/wms", layer="roofs"), tmp_path / "map.tif")
     server.trouble[:] = [("GetMap", b"<ServiceExceptionReport><ServiceException code='X'>Style &lt;no&gt; unknown"
                           b"</ServiceException></ServiceExceptionReport>")]  # fmt: skip
-    with pytest.raises(MapError, match="that says 'Style <no> unknown'"):
+    with pytest.raises(MapError, match="Style <no> unknown"):
         fetch_map(settings(f"{server.url}/wms?LAYERS=ortho"), tmp_path / "map.tif")
-    facts = fetch_map(
-        settings(f"{server.url}/wms", layer="cadastre", image_format="image/jpeg"), tmp_path / "map.tif"
-    )
-    assert facts["expected_mb"] < facts["width_px"] * facts["height_px"] * 0.6 / 1e6
+    server.asked.clear()
+    fetch_map(settings(f"{server.url}/wms", layer="cadastre", image_format="image/jpeg"), tmp_path / "map.tif")
+    assert all("format=image/jpeg" in path.lower() for path in server.asked[1:]), server.asked
 
 
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("https://tiles.example.org/{z}/{x}.png", "expected {z}, {x} and {y}, or {q}"),
-        ("https://{s}.example.org/{z}/{x}/{y}.png", "got {s}"),
+        ("https://tiles.example.org/{z}/{x}.png", "expected {z}, {x} and {y} (or {-y}), or {q}"),
+        ("https://{s}.example.org/{z}/{x}/{y}.png", "expected {z}, {x} and {y} (or {-y}), or {q}"),
         ("ftp://example.org/{z}/{x}/{y}.png", "begins with https:// or http://"),
         ("map.tif", "begins with https:// or http://"),
         ("https://me:word@example.org/wms", "without user and password"),

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -38,15 +37,6 @@ def moved(finished, tmp_path):
     frames.rename(frames.with_name("moved"))
     yield out
     frames.with_name("moved").rename(frames)
-
-
-def test_figures_stay_where_they_cannot_be_drawn_again(finished, tmp_path, monkeypatch):
-    out = Path(shutil.copytree(finished / "out", tmp_path / "out"))
-    before = {path.name for path in out.glob("*.png")}
-    assert len(before) == 4
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert run(["evaluate", str(out)]) == 0
-    assert {path.name for path in out.glob("*.png")} == before
 
 
 def test_a_page_loses_frames_that_were_moved_only_where_it_may(moved, capsys):

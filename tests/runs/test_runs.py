@@ -39,7 +39,6 @@ from scenematch.cli.tables import print_summary
 from scenematch.files.ros.bags import import_rosbags
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
-from scenematch.runs.executors import on_ray
 from scenematch.runs.inputs import FOLDER_LAYOUT
 
 FRAMES = 3
@@ -199,7 +198,7 @@ def test_the_library_imports_nothing_optional_and_no_command_line():
     )
     script = (
         "import sys; from scenematch import *; wanted = "
-        "{'rerun', 'ray', 'pymavlink', 'serial', 'rospy', 'rclpy', 'rosbags', 'pyulog', 'rich', 'typer'}; "
+        "{'rerun', 'pymavlink', 'serial', 'rospy', 'rclpy', 'rosbags', 'pyulog', 'rich', 'typer'}; "
     )
     done = subprocess.run([sys.executable, "-c", script + loaded], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
@@ -227,11 +226,6 @@ def ulog():
         read_ulog(Path(file.name))
 
 
-def cluster():
-    with on_ray("local", 1):
-        pass
-
-
 def local_affine_frames():
     sift(torch.zeros(1, 1, 64, 64)).lafs()
 
@@ -245,7 +239,6 @@ def local_affine_frames():
         ("rosbags", "rosbags", "bags", import_rosbags),
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
         ("pyulog", "pyulog", "logs", ulog),
-        ("ray", "ray", "ray", cluster),
         ("kornia.feature", "kornia", "learned", local_affine_frames),
         ("matplotlib", "matplotlib", "desk", lambda: run_demo("demo")),
         ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),

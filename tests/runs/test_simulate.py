@@ -20,7 +20,7 @@ from scenematch.simulator import build_town
 from tests.support.runs import bare_runs
 
 FOLDER = {"frames", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif"}
-LOOP = {"track.csv", "loop.csv", "summary.json", "loop.json", "loop.png", "loop-path.png", "path.png"}
+LOOP = {"track.csv", "loop.csv", "summary.json", "loop.json"}
 pytestmark = pytest.mark.usefixtures("bare_runs")
 
 

@@ -107,6 +107,13 @@ class _Handler(BaseHTTPRequestHandler):
                 return
         if path.startswith("/tiles/"):
             self._tile(*(int(n) for n in re.findall(r"\d+", path)))
+        elif path.startswith("/tms/"):
+            zoom, column, row = (int(n) for n in re.findall(r"\d+", path))
+            self._tile(zoom, column, 2**zoom - 1 - row)
+        elif path.startswith("/quadkeys/"):
+            digits = path.rpartition("/")[2]
+            column, row = (int("".join(str(int(d) >> axis & 1) for d in digits), 2) for axis in (0, 1))
+            self._tile(len(digits), column, row)
         elif path.startswith("/wmts"):
             self._wmts(path, {name.upper(): value for name, value in query.items()})
         elif path.startswith("/wms"):
@@ -252,9 +259,11 @@ def wmts_capabilities(server: MapServer) -> str:
     address = f'<ResourceURL format="image/png" resourceType="tile" template="{server.url}{template}"/>'
     resource = "" if server.kvp else address
     return f"""<?xml version="1.0"?><Capabilities xmlns="http://www.opengis.net/wmts/1.0"
- xmlns:ows="http://www.opengis.net/ows/1.1" version="1.0.0">
+ xmlns:ows="http://www.opengis.net/ows/1.1" xmlns:xlink="http://www.w3.org/1999/xlink" version="1.0.0">
 <ows:ServiceIdentification><ows:Title>Tiles</ows:Title><ows:AccessConstraints>CC BY</ows:AccessConstraints>
-</ows:ServiceIdentification><Contents>
+</ows:ServiceIdentification><ows:OperationsMetadata>
+<ows:Operation name="GetTile"><ows:DCP><ows:HTTP><ows:Get
+ xlink:href="{server.url}/wmts?"/></ows:HTTP></ows:DCP></ows:Operation></ows:OperationsMetadata><Contents>
 <Layer><ows:Identifier>ortho</ows:Identifier>
 <Style isDefault="true"><ows:Identifier>normal</ows:Identifier></Style>
 <Format>image/png</Format><TileMatrixSetLink><TileMatrixSet>national</TileMatrixSet></TileMatrixSetLink>{resource}

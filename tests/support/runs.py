@@ -14,7 +14,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from engine import OrthoMap, SceneMatcher
-from scenematch.report import figures
 
 BLANK = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
 
@@ -42,8 +41,6 @@ def bare_runs() -> Iterator[None]:
     """Plots are one pixel, nothing is warmed up, and a map is opened once: seconds less, and the same track."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OrthoMap, "open", opened_once)
-        for plot in ("_path", "_position", "_height", "_error"):
-            patch.setattr(figures, plot, lambda *_: Figure(figsize=(1, 1)))
         patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(BLANK))
         patch.setattr(SceneMatcher, "warmup", lambda *_: None)
         yield

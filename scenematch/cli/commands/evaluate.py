@@ -32,7 +32,7 @@ def evaluate(
 ) -> None:
     """Score finished tracks and draw their report again.
 
-    Of one run, prints the errors and rewrites the folder's summary.json, figures and report.html. Of several,
+    Of one run, prints the errors and rewrites the folder's summary.json and report.html. Of several,
     draws one page: all tracks on one map and one time axis, and a table.
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track

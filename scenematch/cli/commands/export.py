@@ -13,7 +13,7 @@ from scenematch.cli.options import OUTPUT, ForceOption, JsonOption
 
 def export(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
-    kind: Annotated[str, typer.Option("--format", metavar="gpx|geojson|kml|tum|nmea", help="What is written.")],
+    kind: Annotated[str, typer.Option("--format", metavar="gpx|geojson|tum", help="What is written.")],
     out: Annotated[
         Path | None,
         typer.Option(
@@ -27,7 +27,7 @@ def export(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """A finished track as GPX, GeoJSON, KML, TUM, NMEA.
+    """A finished track as GPX, GeoJSON, TUM.
 
     Refused frames leave gaps. Times of day are written where the frames' stamps are UTC.
     """

@@ -57,9 +57,9 @@ def track(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Follow a flight; track.csv and figures.
+    """Follow a flight; track.csv and a report.
 
-    Writes track.csv (one row a frame), summary.json and figures into the output folder. Without --start the
+    Writes track.csv (one row a frame), summary.json and report.html into the output folder. Without --start the
     flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
     """
     from scenematch.runs.tracking import track as track_flight

@@ -301,51 +301,6 @@ class MessageFactory:
             data=self.octets(np.ascontiguousarray(pixels).ravel()),
         )
 
-    def camera_info(self, time_ns: int, frame_id: str, camera: Camera) -> Any:
-        """A sensor_msgs/CameraInfo; it has no field for the mount."""
-        K = camera.matrix
-        blocks = {
-            "D": camera.distortion,
-            "K": K.ravel(),
-            "R": np.eye(3).ravel(),
-            "P": np.c_[K, np.zeros(3)].ravel(),
-        }
-        roi = self.make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        return self.make(
-            "sensor_msgs/msg/CameraInfo",
-            header=self.header(time_ns, frame_id),
-            height=camera.height_px,
-            width=camera.width_px,
-            distortion_model=camera.distortion_model,
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
-            **(blocks if self.ros1 else {name.lower(): values for name, values in blocks.items()}),
-        )
-
-    def imu(self, time_ns: int, frame_id: str, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
-        """A sensor_msgs/Imu with orientation only."""
-        unknown = np.array([-1.0, *(0.0,) * 8])
-        return self.make(
-            "sensor_msgs/msg/Imu",
-            header=self.header(time_ns, frame_id),
-            orientation=self.quaternion(roll_deg, pitch_deg, heading_deg),
-            orientation_covariance=np.zeros(9),
-            angular_velocity=self.vector(0.0, 0.0, 0.0),
-            angular_velocity_covariance=unknown,
-            linear_acceleration=self.vector(0.0, 0.0, 0.0),
-            linear_acceleration_covariance=unknown,
-        )
-
-    def velocity(self, time_ns: int, frame_id: str, east_mps: float, north_mps: float) -> Any:
-        """A geometry_msgs/TwistStamped of a velocity over ground; the unknown components are NaN."""
-        nan = math.nan
-        linear, angular = self.vector(east_mps, north_mps, nan), self.vector(nan, nan, nan)
-        twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
-        return self.make("geometry_msgs/msg/TwistStamped", header=self.header(time_ns, frame_id), twist=twist)
-
     def position(self, time_ns: int, frame_id: str, lat_deg: float, lon_deg: float, covariance_m2: Array) -> Any:
         """A sensor_msgs/NavSatFix with covariance (3, 3) of east, north, up; the altitude is NaN, unknown."""
         status = self.make("sensor_msgs/msg/NavSatStatus", status=0, service=0)
