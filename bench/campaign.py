@@ -2,13 +2,15 @@
 
     python -m bench.campaign PLAN.toml --out DIR [--workers N]
 
-The plan gives options of `track` and `simulate` by their names; paths are as seen from where this is started::
+The plan gives options of `track` and `simulate` by their names, a list for one that is given several times; paths
+are as seen from where this is started::
 
     [runs.ncc]                      # by what the flights are followed
     method = "ncc"
     [runs.sift-paper]
     method = "sift"
     profile = "paper"
+    settings = ["navigator.odometry=true"]
     [flights.campus]                # a flight folder
     folder = "flights/campus"
     [flights.valley]                # other files; flights of one group are pooled
@@ -84,12 +86,15 @@ def jobs_of(plan: Mapping[str, Any], out: Path) -> tuple[list[Job], list[Job]]:
 
 
 def options(given: Mapping[str, Any]) -> list[str]:
-    """Options of the command line; true is a flag, "none" leaves one out."""
-    return [
-        f"--{name.replace('_', '-')}" if value is True else f"--{name.replace('_', '-')}={value}"
-        for name, value in given.items()
-        if value not in (False, "none")
-    ]
+    """Options of the command line; true is a flag, "none" leaves one out, a list repeats it."""
+    words = []
+    for name, value in given.items():
+        option = f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(option)
+        elif value not in (False, "none"):
+            words += [f"{option}={each}" for each in (value if isinstance(value, list) else [value])]
+    return words
 
 
 def done(job: Job, unfinished: Path) -> str | None:

@@ -18,6 +18,7 @@ from engine.runtime.lazy_names import imported_on_use
 if TYPE_CHECKING:
     from scenematch.files.corrections import Corrections
     from scenematch.runs.bridge_files import BridgeFiles
+    from scenematch.runs.cameras import CameraInput
     from scenematch.runs.checking import diagnose_flight
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
     from scenematch.runs.comparison import compare, parse_runs
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.map_audit import AuditFiles, MapAudit, audit_map
     from scenematch.runs.map_fetch import FetchSettings, fetch_map
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import (
         BridgeSettings,
         MavlinkSettings,
@@ -46,12 +48,14 @@ __all__ = [
     "AuditFiles",
     "BridgeFiles",
     "BridgeSettings",
+    "CameraInput",
     "ClosedLoopSettings",
     "Corrections",
     "FetchSettings",
     "FlightFiles",
     "LiveViewTarget",
     "MapAudit",
+    "MapInput",
     "MavlinkSettings",
     "Progress",
     "RosSettings",
@@ -78,6 +82,7 @@ __all__ = [
 
 _NAMES = {
     "scenematch.files.corrections": "Corrections",
+    "scenematch.runs.cameras": "CameraInput",
     "scenematch.runs.checking": "diagnose_flight",
     "scenematch.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
     "scenematch.runs.comparison": "compare parse_runs",
@@ -87,6 +92,7 @@ _NAMES = {
     "scenematch.runs.live_viewing": "LiveViewTarget",
     "scenematch.runs.map_audit": "AuditFiles MapAudit audit_map",
     "scenematch.runs.map_fetch": "FetchSettings fetch_map",
+    "scenematch.runs.map_input": "MapInput",
     "scenematch.runs.bridge_files": "BridgeFiles",
     "scenematch.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
     "scenematch.runs.mavlink_parameters": "write_parameter_file",

@@ -204,14 +204,14 @@ def command_options():
             continue
         words = {word for option in command.params for word in (*option.opts, *option.secondary_opts)}
         options = {word for word in words if word.startswith("--")}
-        yield name, sorted(options - {"--help", "--json", "--threads", "--force"})
+        yield name, sorted(options - {"--help", "--json", "--force"})
 
 
 @pytest.mark.parametrize(("command", "options"), sorted(command_options()), ids=lambda value: str(value)[:20])
 def test_every_option_is_in_the_lines_of_its_command(command, options):
     section = read("docs/command-line.md").split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
     lines = next(iter(re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)), "")
-    stated = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force", "--threads"}
+    stated = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force"}
     assert stated == set(options)
 
 

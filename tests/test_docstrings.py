@@ -13,15 +13,10 @@ ARRAYS = re.compile(
     r"\b(NDArray|ArrayLike|Tensor|(?:Any)?Array|NamedArrays|FloatImage|Image|Mask|Gray|Float32|Heights|Pixels|Pictures)\b"
 )
 """Types of numpy and torch, and their names in the engine."""
-FOLDERS = [
-    "engine",
-    "engine/kernels",
-    "engine/maps",
-    "engine/navigation",
-    "engine/runtime",
-    "engine/sift",
+FOLDERS = (
+    "engine", "engine/kernels", "engine/maps", "engine/navigation", "engine/runtime", "engine/sift",
     "scenematch/simulator",
-]
+)  # fmt: skip
 CALLED = {  # by others; the steps of a method state shapes in a line
     "engine/matching": "acceptance align confidence covariance matcher pnp pose",
     "scenematch/check": "availability plan self_match",

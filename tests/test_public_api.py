@@ -76,7 +76,7 @@ MODULES = {
     "scenematch.simulator.pilot": None,
     "scenematch.simulator.quadrotor": None,
 }
-"""Public modules besides the engine, whose ``__all__`` counts, and the optional package that each needs."""
+"""Public modules besides the engine's, whose ``__all__`` counts, and the optional package that each needs."""
 PACKAGES = ("engine", "scenematch")
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
 UNUSED = (

@@ -26,7 +26,7 @@ from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
 from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-from engine.options import ACCEPT_ALL
+from engine.options import ACCEPT_ALL, LearnedOptions
 from engine.runtime.threads import set_threads
 from engine.values import Window
 from scenematch import FlightFiles, TrackSettings, track
@@ -35,7 +35,6 @@ from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightInputs, open_inputs
-from scenematch.runs.settings import with_weights
 
 Array = NDArray[np.float64]
 
@@ -107,7 +106,7 @@ def inputs_of(name: str, step: int) -> tuple[FlightFiles, FlightInputs]:
 
 def _with_video(folder: Path) -> FlightFiles:
     names = {"map": "map.tif", "camera": "camera.yaml", "frames": VIDEO, "telemetry": "telemetry.csv"}
-    return FlightFiles(**{what: folder / name for what, name in names.items()})
+    return FlightFiles.from_flat(**{what: folder / name for what, name in names.items()})
 
 
 def fly(name: str, method: str, step: int, weights: Sequence[Path]) -> Figures:
@@ -120,7 +119,7 @@ def fly(name: str, method: str, step: int, weights: Sequence[Path]) -> Figures:
         device="cpu",
         method=method.removeprefix("paper-"),
         profile=profile,
-        learned=with_weights(method, weights if method == "learned" else ()),
+        learned=LearnedOptions(weights=tuple(map(str, weights)) if method == "learned" else ()),
     )
     rows = _middles(inputs, settings) if name in MIDDLE else _tracked(files, inputs, settings)
     errors = errors_en_m(rows, inputs.truth, inputs.site.frame)

@@ -1,11 +1,12 @@
 """A pilot who flies a simulated ArduCopter (SITL) along a video's subtitles with GNSS off, and measures it.
 
-``python -m bench.live.fly_sitl VIDEO [--link udpin:127.0.0.1:14552]``, beside SITL with the parameters of
-``bridge mavlink-params --takeoff gnss``, the bridge and its camera (:mod:`bench.live.video_camera`). It arms in
-GUIDED, climbs to the first height on the receiver, waits for fixes, selects them (source set 2), switches the
-simulated receiver off, holds, flies the subtitles' positions at their own pace, and holds again. Where a failsafe
-takes over (LAND, RTL), it steers no more and ends when the vehicle has landed and disarmed. Of each part it prints
-how far the estimate was from SITL's own true state, both as they arrive here.
+``python -m bench.live.fly_sitl VIDEO [--link udpin:127.0.0.1:14552]``, beside SITL with the parameters of ``bridge
+mavlink --settings parameters.takeoff=gnss --write-params FILE``, the bridge and its camera
+(:mod:`bench.live.video_camera`). It arms in GUIDED, climbs to the first height on the receiver, waits for fixes,
+selects them (source set 2), switches the simulated receiver off, holds, flies the subtitles' positions at their
+own pace, and holds again. Where a failsafe takes over (LAND, RTL), it steers no more and ends when the vehicle has
+landed and disarmed. Of each part it prints how far the estimate was from SITL's own true state, both as they
+arrive here.
 """
 
 from __future__ import annotations

@@ -141,9 +141,10 @@ def main():
         folder = Path(name)
         plan, frames = write_world(folder, wanted.frames, wanted.rate_hz, wanted.seed)
         row = plan.truth_rows()[0]
-        node = (sys.executable, "-m", "scenematch.cli", "bridge", "ros", "--map", str(folder / "map.tif"),
-                "--surface", str(folder / "dsm.tif"), "--method", wanted.method, "--json",
-                "--start", f"{row.lat_deg},{row.lon_deg},15", "--deadline-ms", "250")  # fmt: skip
+        node = (sys.executable, "-m", "scenematch.cli", "bridge", "ros", "--ros=1",
+                "--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif"),
+                "--method", wanted.method, "--json",
+                "--start", f"{row.lat_deg},{row.lon_deg},15", "--settings=bridge.deadline_ms=250")  # fmt: skip
         with process("rosmaster", "--core", "-p", str(PORT)):
             import rosgraph
 

@@ -85,29 +85,29 @@ def _signed(angles: Array) -> Array:
 
 
 _DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
-    ("radians", "roll, pitch and heading are in radians", "--angles radians",
+    ("radians", "roll, pitch and heading are in radians", "--correct angles=radians",
      lambda a: np.degrees(_signed(a))),
-    ("radians", "the heading is in radians", '--column "heading_deg=57.29578*heading_deg"',
+    ("radians", "the heading is in radians", '--correct "heading_deg=57.29578*heading_deg"',
      lambda a: _signed(a) * [1.0, 1.0, 180.0 / math.pi]),
     ("radians", "roll and pitch are in radians",
-     '--column "roll_deg=57.29578*roll_deg" --column "pitch_deg=57.29578*pitch_deg"',
+     '--correct "roll_deg=57.29578*roll_deg" --correct "pitch_deg=57.29578*pitch_deg"',
      lambda a: a * [180.0 / math.pi, 180.0 / math.pi, 1.0]),
     ("degrees", "the angles were multiplied by 57.3, as if they had been in radians",
      "look at the conversion of the telemetry", np.radians),
     ("swapped", "roll and pitch are in each other's place",
-     "--column roll_deg=pitch_deg --column pitch_deg=roll_deg",
+     "--correct roll_deg=pitch_deg --correct pitch_deg=roll_deg",
      lambda a: a[:, [1, 0, 2]]),
-    ("sign", "roll and pitch have the other sign", "--column roll_deg=-roll_deg --column pitch_deg=-pitch_deg",
+    ("sign", "roll and pitch have the other sign", "--correct roll_deg=-roll_deg --correct pitch_deg=-pitch_deg",
      lambda a: a * [-1.0, -1.0, 1.0]),
-    ("sign", "roll has the other sign: positive is right side down", "--column roll_deg=-roll_deg",
+    ("sign", "roll has the other sign: positive is right side down", "--correct roll_deg=-roll_deg",
      lambda a: a * [-1.0, 1.0, 1.0]),
-    ("sign", "pitch has the other sign: positive is nose up", "--column pitch_deg=-pitch_deg",
+    ("sign", "pitch has the other sign: positive is nose up", "--correct pitch_deg=-pitch_deg",
      lambda a: a * [1.0, -1.0, 1.0]),
     ("heading_convention", "the heading is counted counter-clockwise from north",
-     "--column heading_deg=-heading_deg",
+     "--correct heading_deg=-heading_deg",
      lambda a: a * [1.0, 1.0, -1.0]),
     ("heading_convention", "the heading is counted counter-clockwise from east, as ROS' yaw is",
-     "--column heading_deg=-heading_deg+90", lambda a: a * [1.0, 1.0, -1.0] + [0.0, 0.0, 90.0]),
+     "--correct heading_deg=-heading_deg+90", lambda a: a * [1.0, 1.0, -1.0] + [0.0, 0.0, 90.0]),
 )  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
     text = f"the heading reads {abs(off_deg):.1f} degrees too {'low' if off_deg > 0 else 'high'}"
     if abs(off_deg) < 30.0:
         text += " (a magnetic heading, or a compass that is not calibrated)"
-    return cost, Finding("heading", text, f"--heading-offset-deg {off_deg:+.1f}", off_deg, sigma_deg)
+    return cost, Finding("heading", text, f"--correct heading_offset_deg={off_deg:+.1f}", off_deg, sigma_deg)
 
 
 def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding]:
@@ -211,7 +211,7 @@ def _late(measured: Array, series: TelemetrySeries, index: NDArray[np.intp]) -> 
     late = "late" if shift_s > 0.0 else "early"
     text = f"the telemetry is {abs(shift_s):.2f} s {late} against the pictures"
     return costs[best] + _PENALTY["shift"], Finding(
-        "clock", text, f"--telemetry-offset-s {-shift_s:+.2f}", shift_s, 0.05
+        "clock", text, f"--correct offset_s={-shift_s:+.2f}", shift_s, 0.05
     )
 
 
@@ -266,16 +266,16 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
         return Finding("height", text, "look at the telemetry's height")
     if abs(factor / _FEET - 1.0) < 0.04:
         text = "the height is in feet"
-        return Finding("height_feet", text, '--column "height_agl_m=0.3048*height_agl_m"', factor)
+        return Finding("height_feet", text, '--correct "height_agl_m=0.3048*height_agl_m"', factor)
     side = "low" if off_m > 0.0 else "high"
     if by_factor < by_offset - 0.3:
         text = f"heights are to be multiplied by {factor:.3f}, or the focal length divided by it"
-        return Finding("focal", text, f'--column "height_agl_m={factor:.3f}*height_agl_m"', factor, 0.01)
+        return Finding("focal", text, f'--correct "height_agl_m={factor:.3f}*height_agl_m"', factor, 0.01)
     text = (
         f"the height reads {abs(off_m):.1f} m too {side} (above sea level, above another ground?), "
         f"or the focal length {abs(100.0 * (factor - 1.0)):.0f} % too {'short' if off_m < 0.0 else 'long'}"
     )
-    return Finding("height", text, f"--height-offset-m {off_m:+.1f}", off_m, sigma_m)
+    return Finding("height", text, f"--correct height_offset_m={off_m:+.1f}", off_m, sigma_m)
 
 
 # ---------------------------------------------------------------------------------------------- position

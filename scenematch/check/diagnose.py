@@ -141,7 +141,7 @@ def _stamps(telemetry: Sequence[Telemetry]) -> Finding | None:
     if factor == 1.0:
         return None
     text = f"timestamp_ns seems to be in {unit}: between pictures it grows by less than 5 ms"
-    return Finding("stamps", text, f'--column "timestamp_ns={factor:.0f}*timestamp_ns"', factor)
+    return Finding("stamps", text, f'--correct "timestamp_ns={factor:.0f}*timestamp_ns"', factor)
 
 
 def _frozen(

@@ -74,13 +74,13 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
         return _limited((moved - expected) / sigma)
 
     tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
-              "--column east_velocity_mps=north_velocity_mps --column north_velocity_mps=east_velocity_mps"),
+              "--correct east_velocity_mps=north_velocity_mps --correct north_velocity_mps=east_velocity_mps"),
              (cost(-reckoned), "the velocity has the other sign",
-              "--column east_velocity_mps=-east_velocity_mps "
-              "--column north_velocity_mps=-north_velocity_mps")]  # fmt: skip
+              "--correct east_velocity_mps=-east_velocity_mps "
+              "--correct north_velocity_mps=-north_velocity_mps")]  # fmt: skip
     tried += [
         (cost(factor * reckoned), f"the velocity is in {unit}",
-         " ".join(f'--column "{n}_velocity_mps={factor:.4g}*{n}_velocity_mps"' for n in ("east", "north")))
+         " ".join(f'--correct "{n}_velocity_mps={factor:.4g}*{n}_velocity_mps"' for n in ("east", "north")))
         for unit, factor in _VELOCITY_FACTORS.items()
     ]  # fmt: skip
     square = float((reckoned**2).sum())

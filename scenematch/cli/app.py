@@ -27,9 +27,7 @@ from scenematch.cli.commands import (
     doctor,
     evaluate,
     export,
-    init,
     locate,
-    report,
     simulate,
     track,
 )
@@ -50,19 +48,15 @@ app.command(cls=Command)(demo.demo)
 app.command(cls=Command)(check.check)
 app.command(cls=Command)(track.track)
 app.command(cls=Command)(compare.compare)
-app.command(cls=Command)(init.init)
 app.command(cls=Command)(locate.locate)
 app.command(cls=Command)(simulate.simulate)
 app.command(cls=Command)(evaluate.evaluate)
-app.command(cls=Command)(report.report)
 app.command(cls=Command)(export.export)
 app.command(cls=Command)(doctor.doctor)
 map_app.command("info", cls=Command)(map_commands.info)
 map_app.command("audit", cls=Command)(map_commands.audit)
 map_app.command("fetch", cls=Command)(map_commands.fetch)
 bridge_app.command("mavlink", cls=Command)(bridge.mavlink)
-bridge_app.command("mavlink-params", cls=Command)(bridge.mavlink_params)
-bridge_app.command("camera-delay", cls=Command)(bridge.camera_delay)
 bridge_app.command("ros", cls=Command)(bridge.ros)
 app.add_typer(map_app, name="map")
 app.add_typer(bridge_app, name="bridge")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +13,8 @@ from typer.core import TyperCommand
 from engine.errors import CalibrationError, EngineError, MapError
 from scenematch.runs.renaming import rename_arguments, rename_quoted
 
+_PANELS = ("Arguments", "Map", "Input", "Options", "Expert", "Output")
+"""Of the help, in their order."""
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 _typed: ContextVar[Mapping[str, str]] = ContextVar("typed", default=_NOTHING)
 """Of the command that runs: what was typed, by argument."""
@@ -20,21 +22,52 @@ _paths: ContextVar[Mapping[str, str]] = ContextVar("paths", default=_NOTHING)
 """Of the command that runs: what was typed for an argument, by the path that it holds."""
 
 
+_MADE_OF: Mapping[str, Sequence[str]] = MappingProxyType(
+    {
+        "--rerun": ("recording", "viewer"),
+        "--correct": ("columns", "angles", "heading_offset_deg", "height_offset_m", "offset_s"),
+    }
+)
+"""Arguments that one option gives, by that option."""
+
+
 class Command(TyperCommand):
     """A command whose parameters have the names of the arguments that it passes on, or an option like them."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the options into the help, a section for each panel; rich draws none, for it takes a while."""
+        panels: dict[str, list[Any]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                default = "Arguments" if parameter.param_type_name == "argument" else "Options"
+                panels.setdefault(getattr(parameter, "rich_help_panel", None) or default, []).append(record)
+        for name in sorted(panels, key=_PANELS.index):
+            with formatter.section(name):
+                formatter.write_dl(panels[name])
 
     def invoke(self, ctx: Any) -> Any:
         """Run it."""
         _typed.set({name: typed for parameter in self.params for name, typed in _names(parameter).items()})
-        values = {typed_name(parameter): ctx.params.get(parameter.name) for parameter in self.params}
-        _paths.set({str(value): typed for typed, value in values.items() if isinstance(value, Path)})
+        values = ((typed_name(parameter), ctx.params.get(parameter.name)) for parameter in self.params)
+        every = (
+            (name, each) for name, value in values for each in (value if isinstance(value, list) else [value])
+        )
+        _paths.set({str(each): name for name, each in every if isinstance(each, Path)})
         return super().invoke(ctx)
 
 
 def _names(parameter: Any) -> dict[str, str]:
     """The argument that a parameter may be called below the command line, with what was typed for it."""
     typed = typed_name(parameter)
-    return {parameter.name: typed, typed.removeprefix("--").replace("-", "_").lower(): typed}
+    names = (parameter.name, typed.removeprefix("--").replace("-", "_").lower(), *_MADE_OF.get(typed, ()))
+    return dict.fromkeys(names, typed)
+
+
+def name_settings(table: str, names: Iterable[str]) -> None:
+    """Let errors name what a table of the settings gives as ``--settings`` sets it; options count more."""
+    typed = {name: f"--settings {table}.{name}" for name in names}
+    _typed.set(typed | {f"{table}.{name}": text for name, text in typed.items()} | dict(_typed.get()))
 
 
 def typed_name(parameter: Any) -> str:

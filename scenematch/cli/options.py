@@ -2,42 +2,62 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from scenematch.cli import console
+from scenematch.cli.argument_names import name_settings
 
 if TYPE_CHECKING:
-    from scenematch.files.corrections import Corrections
+    from scenematch.runs.cameras import CameraInput
     from scenematch.runs.inputs import FlightFiles
+    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.map_input import MapInput
+    from scenematch.runs.settings import Settings
 
-MapOption = Annotated[Path, typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.")]
-FramesOption = Annotated[
-    Path, typer.Option("--frames", metavar="DIR|VIDEO|BAG", help="Folder of pictures, a video, or a ROS bag.")
+INPUT, MAP, OUTPUT, EXPERT = "Input", "Map", "Output", "Expert"
+"""Panels of the help."""
+
+MapOption = Annotated[
+    Path,
+    typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.", rich_help_panel=MAP),
 ]
 SurfaceOption = Annotated[
-    Path | None, typer.Option("--surface", metavar="FILE", help="Surface model, a GeoTIFF of heights.")
-]
-MapSigmaOption = Annotated[
-    float | None,
-    typer.Option("--map-sigma-m", metavar="M", help="Georeferencing accuracy, per axis; else as the map says."),
-]
-MapBoundsOption = Annotated[
-    str | None,
-    typer.Option("--map-bounds", metavar="W,S,E,N", help="Edges of a bare picture, in degrees or in --map-crs."),
-]
-MapCrsOption = Annotated[
-    str | None, typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.")
-]
-OptionalCameraOption = Annotated[
     Path | None,
-    typer.Option("--camera", metavar="FILE", help="Calibration file; without it a bag's own, or EXIF."),
+    typer.Option("--surface", metavar="FILE", help="Surface model, a GeoTIFF of heights.", rich_help_panel=MAP),
+]
+FramesOption = Annotated[
+    Path,
+    typer.Option(
+        "--frames",
+        metavar="DIR|VIDEO|BAG",
+        help="Folder of pictures, a video, or a ROS bag.",
+        rich_help_panel=INPUT,
+    ),
+]
+CameraOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        metavar="FILE",
+        help="Calibration file; else a bag's or a topic's own, or EXIF.",
+        rich_help_panel=INPUT,
+    ),
 ]
 HfovOption = Annotated[
-    float | None, typer.Option("--hfov-deg", metavar="DEG", help="Horizontal field of view, without --camera.")
+    float | None,
+    typer.Option(
+        "--hfov-deg",
+        metavar="DEG",
+        help="Horizontal field of view, without --camera.",
+        rich_help_panel=INPUT,
+    ),
 ]
 MountOption = Annotated[
     str | None,
@@ -45,178 +65,238 @@ MountOption = Annotated[
         "--mount",
         metavar="NAME",
         help="nadir, nadir-right, nadir-tail, nadir-left (where the top of the picture points), forward-45.",
+        rich_help_panel=INPUT,
     ),
 ]
-CameraPitchOption = Annotated[
-    float | None,
-    typer.Option("--camera-pitch-deg", metavar="DEG", help="Of the camera: -90 looks straight down."),
+TelemetryOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--telemetry",
+        metavar="FILE",
+        help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; else a video's .SRT, or EXIF.",
+        rich_help_panel=INPUT,
+    ),
 ]
-ScaleCalibrationOption = Annotated[
-    bool,
-    typer.Option("--scale-calibration", help="Scale --camera to pictures of another size and the same shape."),
+TruthOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--truth",
+        metavar="FILE",
+        help="truth.csv, a log or photographs; else the one beside the telemetry.",
+        rich_help_panel=INPUT,
+    ),
 ]
-MethodOption = Annotated[
-    str, typer.Option("--method", metavar="ncc|sift|auto|learned", help="auto is ncc, and sift where ncc refuses.")
-]
-WeightsOption = Annotated[
-    list[Path] | None,
-    typer.Option("--weights", metavar="FILE", help="Of method learned: once for each file that it takes."),
-]
-DeviceOption = Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live.")]
-BudgetOption = Annotated[
-    float | None,
-    typer.Option("--budget-ms", metavar="MS", help="Time that one frame may take; later answers are refused."),
-]
-OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder, created by this run.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace the results in a folder that exists.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Results as JSON on standard output.")]
-ThreadsOption = Annotated[
-    int, typer.Option("--threads", min=1, metavar="N", help="Threads of torch and OpenCV.", show_default=True)
-]
-
-AnglesOption = Annotated[
-    str, typer.Option("--angles", metavar="degrees|radians", help="Unit of the telemetry's angles.")
-]
-ColumnOption = Annotated[
+CorrectOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--column", metavar="NAME=[-][F*]NAME[+C]", help="A column made of another: roll_deg=-pitch_deg; repeated."
+        "--correct",
+        metavar="NAME=VALUE",
+        help="Correct the telemetry as check says: heading_offset_deg=3, roll_deg=-pitch_deg; repeated.",
+        rich_help_panel=INPUT,
     ),
-]
-HeadingOffsetOption = Annotated[
-    float, typer.Option("--heading-offset-deg", metavar="DEG", help="Added to the heading: the declination.")
-]
-HeightOffsetOption = Annotated[
-    float, typer.Option("--height-offset-m", metavar="M", help="Added to the height above ground.")
-]
-TelemetryOffsetOption = Annotated[
-    float,
-    typer.Option("--telemetry-offset-s", metavar="S", help="Added to the telemetry's times, not the pictures'."),
-]
-
-SettingsOption = Annotated[
-    Path | None,
-    typer.Option("--settings", metavar="FILE", help="Settings from init; options given here count more."),
-]
-FirmwareOption = Annotated[
-    str, typer.Option("--firmware", metavar="ardupilot|px4", help="What the autopilot runs.")
-]
-SystemIdOption = Annotated[
-    int, typer.Option("--system-id", min=1, max=255, metavar="N", help="Of the vehicle; others are not heard.")
-]
-KeyOption = Annotated[
-    Path | None, typer.Option("--key", metavar="FILE", help="Secret of MAVLink's signing; unsigned is ignored.")
-]
-ListenAnywhereOption = Annotated[
-    bool, typer.Option("--listen-anywhere", help="Allow udpin on addresses that other machines reach.")
-]
-MessageOption = Annotated[
-    str,
-    typer.Option(
-        "--message",
-        metavar="NAME",
-        help="What is sent; without it vision_position_estimate or global_position_sensor.",
-    ),
-]
-MaxSigmaOption = Annotated[
-    float, typer.Option("--max-sigma-m", metavar="M", help="A fix that is less certain is not sent.")
 ]
 StartOption = Annotated[
     str | None,
-    typer.Option("--start", metavar="LAT,LON[,SIGMA_M]", help="Where the flight begins, in degrees."),
+    typer.Option(
+        "--start",
+        metavar="LAT,LON[,SIGMA_M]",
+        help="Where the flight begins; else the telemetry's first position, or anywhere on the map.",
+        rich_help_panel=INPUT,
+    ),
 ]
-DeadlineOption = Annotated[
-    float, typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered.")
-]
-BridgeDeadlineOption = Annotated[
-    float | None,
-    typer.Option("--deadline-ms", metavar="MS", help="Age by which a frame is answered; 250, as autopilots take."),
-]
-SecondsOption = Annotated[
-    float | None, typer.Option("--seconds", min=0.0, metavar="S", help="End after this time.")
-]
-OdometryOption = Annotated[
-    bool, typer.Option("--odometry", help="Follow the pictures where the telemetry has no velocity.")
-]
-OptionalDeviceOption = Annotated[
-    str | None, typer.Option("--device", metavar="auto|cpu|cuda", help="Where tensors live; auto unless given.")
-]
-ImageTopicOption = Annotated[
-    str | None, typer.Option("--image-topic", metavar="NAME", help="Of a bag with pictures on several.")
-]
-EveryOption = Annotated[int, typer.Option("--every", metavar="N", help="Use one frame in N, from the first on.")]
-OdometryTopicOption = Annotated[
+MethodOption = Annotated[
     str | None,
-    typer.Option("--odometry-topic", metavar="NAME", help="Of a bag: another odometry, that has the velocity."),
+    typer.Option("--method", metavar="auto|ncc|sift|learned", help="auto: ncc, and sift where ncc refuses."),
 ]
-FrameStampsOption = Annotated[
-    Path | None,
-    typer.Option("--frame-stamps", metavar="FILE", help="With a log: a CSV with timestamp_ns and frame."),
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--device",
+        metavar="auto|cpu|cuda",
+        help="Where tensors live; auto unless given.",
+        rich_help_panel=EXPERT,
+    ),
 ]
-LogOffsetOption = Annotated[
-    float, typer.Option("--log-offset-s", metavar="S", help="With a log: added to the frames' own stamps.")
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--settings",
+        metavar="FILE|NAME=VALUE",
+        help="Settings as `doctor --settings` lists them; repeated.",
+        rich_help_panel=EXPERT,
+    ),
+]
+OutOption = Annotated[
+    Path,
+    typer.Option("--out", metavar="DIR", help="Output folder, created by this run.", rich_help_panel=OUTPUT),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace results that exist.", rich_help_panel=OUTPUT)]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Results as JSON on standard output.", rich_help_panel=OUTPUT)
 ]
 RerunOption = Annotated[
-    Path | None, typer.Option("--rerun", metavar="FILE.rrd", help="Record the live view, for rerun's viewer.")
-]
-RerunConnectOption = Annotated[
-    str | None,
-    typer.Option("--rerun-connect", metavar="HOST:PORT", help="Show it live in a viewer of rerun that listens."),
-]
-
-RealtimeOption = Annotated[
-    bool, typer.Option("--realtime", help="Match with a real-time priority and locked memory (Linux).")
-]
-NiceOption = Annotated[
-    int | None,
-    typer.Option("--nice", metavar="N", help="With --realtime: a nice value, -20 to -1, in place of SCHED_FIFO."),
-]
-CoresOption = Annotated[
-    str | None, typer.Option("--cores", metavar="N,N", help="With --realtime: the cores that match.")
+    list[str] | None,
+    typer.Option(
+        "--rerun",
+        metavar="FILE.rrd|HOST:PORT",
+        help="Record the live view, or show it in a viewer of rerun that listens; both if repeated.",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 
 
-def use_threads(count: int) -> None:
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """The map."""
+
+    map: MapOption
+    surface: SurfaceOption = None
+
+    def map_input(self, settings: Settings) -> MapInput:
+        """The map with what the settings say of it."""
+        from scenematch.runs.map_input import MapInput
+
+        rest = table(settings, "input").of(MapInput)
+        return MapInput(self.map, surface=self.surface, **rest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """The camera."""
+
+    camera: CameraOption = None
+    hfov_deg: HfovOption = None
+    mount: MountOption = None
+
+    def camera_input(self, settings: Settings) -> CameraInput:
+        """The camera with what the settings say of it."""
+        from scenematch.runs.cameras import CameraInput
+
+        rest = table(settings, "input").of(CameraInput)
+        return CameraInput(self.camera, hfov_deg=self.hfov_deg, mount=self.mount, **rest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightOptions(CameraOptions, MapOptions):
+    """The files of a flight."""
+
+    frames: FramesOption
+    telemetry: TelemetryOption = None
+    truth: TruthOption = None
+
+    def files(self, settings: Settings, correct: Sequence[str] | None = None) -> FlightFiles:
+        """The files with what the settings say of them."""
+        from scenematch.files.corrections import Corrections
+        from scenematch.runs.inputs import FlightFiles
+
+        return FlightFiles(
+            map=self.map_input(settings),
+            camera=self.camera_input(settings),
+            frames=self.frames,
+            telemetry=self.telemetry,
+            truth=self.truth,
+            corrections=Corrections.from_texts(correct or ()),
+            **table(settings, "input").of(FlightFiles),
+        )
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose parameters of the types above are replaced by their fields, one option each."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, type[Any]] = {
+        name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)
+    }
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        kind, keyword = groups.get(name), inspect.Parameter.KEYWORD_ONLY
+        if kind is None:
+            parameters.append(parameter.replace(kind=keyword, annotation=hints[name]))
+            continue
+        types = get_type_hints(kind, include_extras=True)
+        for each in fields(kind):
+            default = inspect.Parameter.empty if each.default is MISSING else each.default
+            parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
+
+    @wraps(command)
+    def call(**given: Any) -> None:
+        made = {
+            name: kind(**{each.name: given.pop(each.name) for each in fields(kind)})
+            for name, kind in groups.items()
+        }
+        command(**given, **made)
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {each.name: each.annotation for each in parameters}
+    return call
+
+
+def read_settings(texts: Sequence[str] | None) -> Settings:
+    """The settings that were given, with their threads of torch and OpenCV in use."""
+    from scenematch.runs.settings import Settings
+
+    name_settings("learned", ["weights"])
+    settings = Settings.read(texts or ())
+    use_threads(settings.threads)
+    return settings
+
+
+def use_threads(count: int = 1) -> None:
     """Threads of torch and OpenCV."""
     from engine.runtime.threads import set_threads
 
     set_threads(count)
 
 
-def corrections(
-    angles: str, columns: list[str] | None, heading_offset_deg: float, height_offset_m: float, offset_s: float
-) -> Corrections:
-    """What is done to the telemetry, by the options above."""
-    from scenematch.files.corrections import Corrections
-    from scenematch.runs.renaming import renamed_in_errors
+def table(settings: Settings, name: str, **given: Any) -> Any:
+    """A table of the settings; an error of one of its settings names it so."""
+    from importlib import import_module
 
-    with renamed_in_errors(columns="column", offset_s="telemetry_offset_s"):
-        return Corrections(
-            angles=angles, columns=tuple(columns or ()), heading_offset_deg=heading_offset_deg,
-            height_offset_m=height_offset_m, offset_s=offset_s,
-        )  # fmt: skip
+    from scenematch.runs.settings import TABLES
+
+    module, kind, hidden = TABLES[name]
+    names = [each.name for each in fields(getattr(import_module(module), kind))]
+    name_settings(name, [each for each in names if each not in hidden])
+    return settings.table(name, **given)
 
 
-def flight_options(files: FlightFiles, *, settings: Path | None = None, start: str | None = None) -> str:
+def live_view(rerun: Sequence[str] | None) -> LiveViewTarget:
+    """Where the live view goes: into a file, to a viewer, or both.
+
+    Raises:
+        OptionError: there are two files, or two viewers.
+    """
+    from engine.errors import OptionError
+    from scenematch.runs.live_viewing import LiveViewTarget
+
+    given: dict[str, str] = {}
+    for text in rerun or ():
+        kind = "viewer" if ":" in text and not text.endswith(".rrd") else "recording"
+        if kind in given:
+            raise OptionError(f"{kind}: expected one file and one viewer at most, got {given[kind]} and {text}")
+        given[kind] = text
+    return LiveViewTarget(**given)
+
+
+def flight_options(files: FlightFiles, *, settings: Sequence[str] | None = None, start: str | None = None) -> str:
     """The files of a flight with all that was given of them, as options of `check` and `track` are typed."""
-    from scenematch.files.corrections import Corrections
+    from scenematch.runs.settings import InputSettings
 
-    values: dict[str, object] = {field.name: getattr(files, field.name) for field in fields(files)}
-    given, nothing = files.corrections, Corrections()
-    is_scaled = values.pop("scale_calibration")
-    values |= {"corrections": None, "settings": settings, "start": start}
-    values |= {"every": files.every if files.every > 1 else None, "log_offset_s": files.log_offset_s or None}
-    for name in ("angles", "heading_offset_deg", "height_offset_m"):
-        values[name] = getattr(given, name) if getattr(given, name) != getattr(nothing, name) else None
-    values["telemetry_offset_s"] = given.offset_s or None
-    columns = [f"--column {console.quoted(rule)}" for rule in given.columns]
-    return " ".join([console.options(**values), *columns, *(["--scale-calibration"] if is_scaled else [])])
+    values = files.flat()
+    named = {each.name: values[each.name] for each in fields(FlightOptions)}
+    if settings is None:
+        nothing = InputSettings()
+        rest = {name: values[name] for name in nothing.of(type(files), type(files.map), type(files.camera))}
+        changed = {name: value for name, value in rest.items() if value != getattr(nothing, name)}
+        settings = [f"input.{name}={str(v).lower() if v is True else v}" for name, v in changed.items()]
+    words = [f"--correct {console.quoted(text)}" for text in files.corrections.texts()]
+    words += [f"--settings {console.quoted(text)}" for text in settings]
+    return " ".join([console.options(**named, start=start), *words])
 
 
 def after_track(
-    files: FlightFiles, out: Path, fixes: int, *, settings: Path | None = None, start: str | None = None
+    files: FlightFiles, out: Path, fixes: int, *, settings: Sequence[str] | None = None, start: str | None = None
 ) -> str:
-    """What comes after a track: its export, or where it has no fix, what shows why."""
+    """What comes after a track: its export, or if it has no fix, what shows why."""
     if fixes:
         return f"export {console.quoted(out)} --format geojson"
     return f"check {flight_options(files, settings=settings, start=start)}"

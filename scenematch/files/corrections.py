@@ -18,6 +18,7 @@ _ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 _NUMBERS = tuple(f.name for f in fields(TelemetryRow) if f.name != "frame")
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?"
 _RULE = re.compile(rf"(\w+)=([+-]?)(?:({_NUMBER})\*)?([A-Za-z]\w*)([+-]{_NUMBER})?")
+_OFFSETS = {"heading_offset_deg": 360.0, "height_offset_m": 1e4, "offset_s": 1e5}
 _MOST_RADIANS = 2.0 * math.pi + 1e-3  # of a heading; what is more was negative before it was wrapped
 _INTERPOLATED = (
     *_ANGLES, "height_agl_m", "alt_amsl_m", "east_velocity_mps", "north_velocity_mps", "lat_deg", "lon_deg",
@@ -49,7 +50,7 @@ class Corrections:
     def __post_init__(self) -> None:
         if self.angles not in ("degrees", "radians"):
             raise OptionError(f"angles: expected degrees or radians, got {self.angles!r}")
-        for name, most in (("heading_offset_deg", 360.0), ("height_offset_m", 1e4), ("offset_s", 1e5)):
+        for name, most in _OFFSETS.items():
             value = getattr(self, name)
             if not abs(value) <= most:  # NaN fails too
                 raise OptionError(f"{name}: expected {-most:g} to {most:g}, got {value:g}")
@@ -70,6 +71,34 @@ class Corrections:
     def from_facts(cls, values: Any) -> Corrections:
         """From :meth:`facts`; None is the defaults."""
         return cls() if values is None else cls(**{**values, "columns": tuple(values.get("columns", ()))})
+
+    @classmethod
+    def from_texts(cls, texts: Sequence[str]) -> Corrections:
+        """From NAME=VALUE each: a field by its name, or one of the columns.
+
+        Raises:
+            OptionError: a text is none of these.
+        """
+        values: dict[str, Any] = {}
+        columns = []
+        for text in texts:
+            name, _, value = text.partition("=")
+            if name == "angles":
+                values[name] = value
+            elif name in _OFFSETS:
+                try:
+                    values[name] = float(value)
+                except ValueError:
+                    raise OptionError(f"{name}: expected a number, got {value!r}") from None
+            else:
+                columns.append(text)
+        return cls(columns=tuple(columns), **values)
+
+    def texts(self) -> list[str]:
+        """What :meth:`from_texts` reads."""
+        nothing = Corrections()
+        names = [name for name in ("angles", *_OFFSETS) if getattr(self, name) != getattr(nothing, name)]
+        return [*(f"{name}={getattr(self, name)}" for name in names), *self.columns]
 
     def applied(self, rows: Sequence[TelemetryRow]) -> list[TelemetryRow]:
         """The rows as they should have been.

@@ -14,7 +14,7 @@ import textwrap
 import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +25,7 @@ Options = TypeVar("Options")
 
 NONE = "none"
 """Stands for None, which TOML cannot express."""
+_SETTING = re.compile(r"([a-z0-9_]+(?:\.[a-z0-9_]+)*)=(.*)")
 _WIDTH = 110
 _ROLE = re.compile(r":\w+:`([^`]*)`")
 _UNITS = {
@@ -34,15 +35,50 @@ _UNITS = {
 }  # fmt: skip
 
 
-def settings_text(options: Any) -> str:
+def settings_text(options: Any, table: str = "", without: Collection[str] = ()) -> str:
     """The text of a settings file with all keys of ``options``, each below its description.
 
     The keys are commented out, so that a file pins only what its user changes and the rest follows the defaults.
 
     Args:
         options: a dataclass whose docstring has an ``Attributes:`` section.
+        table: that the keys are in.
+        without: keys that are left out.
     """
-    return "\n".join(_table(options, ())).lstrip("\n") + "\n"
+    return "\n".join(_table(options, (table,) if table else (), without)).lstrip("\n") + "\n"
+
+
+def read_values(path: Path) -> dict[str, Any]:
+    """The values of a settings file.
+
+    Raises:
+        OptionError: the file is not TOML.
+        OSError: the file cannot be read.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path}: expected TOML, got something else: {error}") from None
+
+
+def parse_setting(text: str) -> dict[str, Any] | None:
+    """The value of NAME=VALUE, where NAME has dots and a word needs no quotes; None for a text of another form."""
+    found = _SETTING.fullmatch(text)
+    if found is None:
+        return None
+    try:
+        return nested({found[1]: tomllib.loads(f"value = {found[2]}")["value"]})
+    except tomllib.TOMLDecodeError:
+        return nested({found[1]: found[2]})
+
+
+def merged(values: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values with others in their place."""
+    out = dict(values)
+    for name, value in more.items():
+        old = out.get(name)
+        out[name] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return out
 
 
 def read_settings(path: Path, cls: type[Options]) -> Options:
@@ -57,10 +93,7 @@ def read_settings(path: Path, cls: type[Options]) -> Options:
             names the file, the key and the closest known key.
         OSError: the file cannot be read.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path}: expected TOML, got something else: {error}") from None
+    values = read_values(path)
     try:
         return options_from_mapping(cls, values)
     except OptionError as error:
@@ -94,13 +127,16 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def options_from_mapping(cls: type[Options], values: Mapping[str, Any], within: str = "") -> Options:
+def options_from_mapping(
+    cls: type[Options], values: Mapping[str, Any], within: str = "", given: Mapping[str, Any] = {}
+) -> Options:
     """Create options from nested mappings of names and values.
 
     Args:
         cls: dataclass of the options.
         values: values of its fields as parsed from TOML; "none" is None where a field is optional.
         within: dotted name of the enclosing table, for messages.
+        given: fields that are no setting, or count more.
 
     Raises:
         OptionError: a name is not a field of ``cls``, or a value has the wrong type or range.
@@ -110,15 +146,18 @@ def options_from_mapping(cls: type[Options], values: Mapping[str, Any], within: 
     arguments: dict[str, Any] = {}
     for name, value in values.items():
         if name not in kinds:
-            raise OptionError(f"{prefix}{name}: not a setting; {_nearest(name, list(kinds))}")
+            raise OptionError(f"{prefix}{name}: not a setting; {nearest(name, list(kinds))}")
         arguments[name] = _value(kinds[name], value, f"{prefix}{name}")
     try:
-        return cls(**arguments)
+        return cls(**{**arguments, **given})
     except OptionError as error:
+        if str(error).partition(":")[0] in given:
+            raise
         raise OptionError(f"{prefix}{error}") from None
 
 
-def _nearest(name: str, known: list[str]) -> str:
+def nearest(name: str, known: list[str]) -> str:
+    """What an unknown name was meant to be."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
 
@@ -148,9 +187,10 @@ def _value(kind: Any, value: Any, name: str) -> Any:
             raise OptionError(f"{name}: expected a table, got {value!r}")
         return options_from_mapping(typing.cast("type[Any]", kind), value, name)
     if typing.get_origin(kind) is tuple:
-        if not isinstance(value, list):
+        if isinstance(value, dict):
             raise OptionError(f"{name}: expected a list, got {value!r}")
-        return tuple(_value(typing.get_args(kind)[0], item, name) for item in value)
+        items = value if isinstance(value, list) else [value]  # a single one stands for a list of it
+        return tuple(_value(typing.get_args(kind)[0], item, name) for item in items)
     if typing.get_origin(kind) is dict:
         if not isinstance(value, dict):
             raise OptionError(f"{name}: expected tables [{name}.NAME], got {value!r}")
@@ -166,7 +206,7 @@ def _value(kind: Any, value: Any, name: str) -> Any:
     return value
 
 
-def _table(options: Any, path: tuple[str, ...]) -> list[str]:
+def _table(options: Any, path: tuple[str, ...], without: Collection[str] = ()) -> list[str]:
     """Lines of a table and its nested tables, which TOML requires after the table's own keys."""
     descriptions, lines = field_descriptions(type(options)), []
     if path:
@@ -174,6 +214,8 @@ def _table(options: Any, path: tuple[str, ...]) -> list[str]:
         lines += ["", "", f"[{'.'.join(path)}]", f"# {about}"]
     tables: list[str] = []
     for name in _kinds(type(options)):
+        if name in without:
+            continue
         value = getattr(options, name)
         if is_dataclass(value):
             tables += _table(value, (*path, name))

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from engine.budget import Budget
 from engine.errors import OptionError
 from engine.runtime import device as devices
-from engine.runtime.realtime import Realtime
 from engine.values import MAX_SIGMA_M, Prior
 
 START_SIGMA_M = 15.0
@@ -147,27 +146,6 @@ def check_unused(given: Mapping[str, object], other: str) -> None:
     for name, value in given.items():
         if value is not None:
             raise OptionError(f"{name}: expected with `{other}` only")
-
-
-def parse_realtime(realtime: bool, nice: int | None, cores: str | None) -> Realtime | None:
-    """How the threads that match are scheduled; None is as usual.
-
-    Args:
-        realtime: whether in real time.
-        nice: in place of SCHED_FIFO.
-        cores: their numbers, "2,3".
-
-    Raises:
-        OptionError: a number is none that can be, or has no effect without ``realtime``.
-    """
-    if not realtime:
-        check_unused({"nice": nice, "cores": cores}, "realtime")
-        return None
-    try:
-        numbers = () if cores is None else tuple(int(part) for part in cores.split(","))
-    except ValueError:
-        raise OptionError(f"cores: expected numbers N,N, got {cores!r}") from None
-    return Realtime(nice=nice, cores=numbers)
 
 
 def check_device(device: str) -> None:

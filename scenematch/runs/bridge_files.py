@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from engine.camera import Camera
@@ -13,8 +13,9 @@ from scenematch.bridges.pictures import CapturedImage, capture, replay
 from scenematch.files.flight import open_flight
 from scenematch.files.frames import VIDEO_SUFFIXES
 from scenematch.runs.arguments import check_every, check_unused
-from scenematch.runs.cameras import CameraFiles
+from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
 
 _MAX_GRAB_MS = 10_000.0
@@ -25,46 +26,31 @@ class BridgeFiles:
     """The map, the camera, and where pictures come from: files or a camera, one of the two.
 
     Attributes:
-        map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration; None takes ``hfov_deg``, or that of the pictures that are played.
-        hfov_deg: horizontal field of view, in place of a calibration; of a camera with the size of its pictures.
-        surface: surface model, a GeoTIFF of heights.
+        map: the map with its surface.
+        camera: what is said of the camera; else by the pictures that are played.
         frames: pictures that are played at their own pace, a folder or a video.
         telemetry: telemetry.csv or a log, whose stamps set that pace; None takes a video's own times.
         camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: pace of pictures without stamps; None is 10.
         every: one of the pictures that are played in so many is used, at its own time.
         exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
-        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
-        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
-        map_crs: of a map that names none.
-        mount: how the camera is mounted, by name; None is the calibration's.
-        camera_pitch_deg: of the camera, -90 looks straight down.
-        gimbal: whether a gimbal, whose attitude the autopilot reports, turns it from there.
+        gimbal: whether a gimbal, whose attitude the autopilot reports, turns the camera from its mount.
 
     Raises:
         OptionError: a number is out of its range, or an argument does not go with another.
     """
 
-    map: StrPath
-    camera: StrPath | None = None
-    hfov_deg: float | None = None
-    surface: StrPath | None = None
+    map: MapInput
+    camera: CameraInput = field(default_factory=CameraInput)
     frames: StrPath | None = None
     telemetry: StrPath | None = None
     camera_source: str | None = None
     rate_hz: float | None = None
     every: int = 1
     exposure_to_grab_ms: float | None = None
-    map_sigma_m: float | None = None
-    map_bounds: str | None = None
-    map_crs: str | None = None
-    mount: str | None = None
-    camera_pitch_deg: float | None = None
     gimbal: bool = False
 
     def __post_init__(self) -> None:
-        self.camera_files()
         if (self.frames is None) == (self.camera_source is None):
             raise OptionError("frames: expected either `frames` or `camera_source`")
         if self.frames is None:
@@ -82,7 +68,7 @@ class BridgeFiles:
             )
 
     def _check_live_camera(self) -> None:
-        if self.camera is None and self.hfov_deg is None:
+        if self.camera.camera is None and self.camera.hfov_deg is None:
             raise OptionError(
                 "camera: expected a calibration of the camera that `camera_source` opens, or `hfov_deg`"
             )
@@ -90,21 +76,14 @@ class BridgeFiles:
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():  # it would be read as fast as it can
             raise OptionError(f"camera_source: expected a camera, got the video {source}; `frames` plays it")
 
-    def camera_files(self) -> CameraFiles:
-        """What is said of the camera."""
-        return CameraFiles(
-            calibration=None if self.camera is None else Path(self.camera),
-            hfov_deg=self.hfov_deg, mount=self.mount, camera_pitch_deg=self.camera_pitch_deg,
-        )  # fmt: skip
-
     def load_camera(self, progress: Progress = SILENT) -> Camera:
         """The calibration, else what is said of the pictures or by them, for which a camera is opened once."""
         if self.camera_source is not None:
-            return self.camera_files().load_live(self.camera_source, progress=progress)
-        if self.camera is not None or self.frames is None:
-            return self.camera_files().load(None)
+            return self.camera.load_live(self.camera_source, progress=progress)
+        if self.camera.camera is not None or self.frames is None:
+            return self.camera.load(None)
         flight = open_flight(self.frames, self.telemetry)
-        return self.camera_files().load(flight.source, flight.names, progress=progress)
+        return self.camera.load(flight.source, flight.names, progress=progress)
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Generator[CapturedImage | None, None, None]:
         """Pictures as they are captured, None where a camera gives none for a while.

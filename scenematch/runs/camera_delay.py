@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,8 +17,8 @@ from engine.navigation.lag import Lag, camera_lag, turn_between
 from engine.values import Frame, NoFix, Reason
 from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage, capture
-from scenematch.runs.cameras import CameraFiles
-from scenematch.runs.folders import StrPath
+from scenematch.runs.cameras import CameraInput
+from scenematch.runs.mavlink_bridge import MavlinkSettings
 from scenematch.runs.progress import SILENT, Progress
 
 if TYPE_CHECKING:
@@ -35,32 +36,20 @@ class _Idle:
 
 
 def measure_camera_delay(
-    connect: str,
-    camera: StrPath | None,
+    link: MavlinkSettings,
+    camera: CameraInput,
     camera_source: str,
     *,
-    hfov_deg: float | None = None,
-    seconds: float = 20.0,
-    mount: str | None = None,
-    firmware: str = "ardupilot",
-    system_id: int = 1,
-    key: StrPath | None = None,
-    listen_anywhere: bool = False,
+    seconds: float | None = None,
     progress: Progress = SILENT,
 ) -> Lag:
     """The time from exposure to grab, while the vehicle is tilted to and fro by hand over a textured ground.
 
     Args:
-        connect: the autopilot, as of the bridge.
-        camera: calibration; None is by ``hfov_deg``.
+        link: the autopilot, as of the bridge.
+        camera: a calibration, or a field of view.
         camera_source: as of the bridge.
-        hfov_deg: horizontal field of view, in place of a calibration.
-        seconds: how long pictures are taken.
-        mount: how the camera is mounted, by name; None is the calibration's.
-        firmware: of the autopilot, "ardupilot" or "px4".
-        system_id: of the vehicle; others are not heard.
-        key: secret of MAVLink's signing; with it unsigned packets are ignored.
-        listen_anywhere: allow udpin on addresses that other machines reach.
+        seconds: how long pictures are taken, 5 or more; None is 20.
         progress: is shown what to do.
 
     Raises:
@@ -72,23 +61,29 @@ def measure_camera_delay(
     from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions
     from scenematch.bridges.packets import read_key
 
-    if camera is None and hfov_deg is None:
+    seconds = 20.0 if seconds is None else seconds
+    if not 5.0 <= seconds < math.inf:
+        raise OptionError(f"seconds: expected 5 or more, got {seconds:g}")
+    if camera.camera is None and camera.hfov_deg is None:
         raise OptionError("camera: expected a calibration, or `hfov_deg`")
-    calibration = None if camera is None else Path(camera)
-    described = CameraFiles(calibration=calibration, hfov_deg=hfov_deg, mount=mount)
-    model = described.load_live(camera_source, progress=progress)
-    options, secret = MavlinkOptions(firmware=firmware), None if key is None else read_key(Path(key))
-    connection = parse_connection(connect, listen_anywhere=listen_anywhere)
+    model = camera.load_live(camera_source, progress=progress)
+    options, secret = (
+        MavlinkOptions(firmware=link.firmware),
+        None if link.key is None else read_key(Path(link.key)),
+    )
+    connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
     try:
         idle: Any = _Idle()
-        bridge = MavlinkBridge(connection, lambda _: idle, options, system_id=system_id, key=secret)
+        bridge = MavlinkBridge(connection, lambda _: idle, options, system_id=link.system_id, key=secret)
     except OSError as error:
-        raise BackendError(f"connect: {connect} cannot be opened: {error.strerror or error}") from None
+        raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")
     with bridge, closing(capture(camera_source)) as pictures:
         times_s, turns_rad, attitude = _recorded(bridge.telemetry, pictures, model.focal_px, seconds)
     if not attitude:
-        raise TelemetryError(f"connect: expected an autopilot that reports its attitude, got none on {connect}")
+        raise TelemetryError(
+            f"connect: expected an autopilot that reports its attitude, got none on {link.connect}"
+        )
     return camera_lag(np.array(times_s), np.array(turns_rad), np.array(attitude), model.mount)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
 from engine.camera import Camera, mount_rotation
@@ -13,16 +13,16 @@ from scenematch.bridges.pictures import first_picture
 from scenematch.files.frames import FrameSource, PictureFolder
 from scenematch.files.photo_camera import photo_camera
 from scenematch.files.ros.bags import is_bag, read_bag_camera
+from scenematch.runs.folders import StrPath
 from scenematch.runs.progress import SILENT, Progress
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraFiles:
+@dataclass(frozen=True, slots=True)
+class CameraInput:
     """What is said of a camera; None where it is not.
 
     Attributes:
-        calibration: a file of ROS, OpenCV or Kalibr, or a bag that has the calibration.
-        image_topic: of the pictures, where it is a bag with several.
+        camera: calibration of ROS, OpenCV or Kalibr, or a bag that has one.
         hfov_deg: horizontal field of view, in place of a calibration.
         mount: a key of :data:`engine.camera.MOUNTS`; None is the calibration's, else nadir.
         camera_pitch_deg: of the optical axis, -90 looks straight down.
@@ -33,17 +33,18 @@ class CameraFiles:
             calibration to scale.
     """
 
-    calibration: Path | None = None
-    image_topic: str | None = None
+    camera: StrPath | None = None
+    _: KW_ONLY
     hfov_deg: float | None = None
     mount: str | None = None
     camera_pitch_deg: float | None = None
     scale_calibration: bool = False
 
     def __post_init__(self) -> None:
-        if self.scale_calibration and self.calibration is None:
+        object.__setattr__(self, "camera", None if self.camera is None else Path(self.camera))
+        if self.scale_calibration and self.camera is None:
             raise OptionError("scale_calibration: expected with `camera`, a calibration to scale")
-        if self.hfov_deg is not None and self.calibration is not None and not is_bag(self.calibration):
+        if self.hfov_deg is not None and self.camera is not None and not is_bag(self.camera):
             raise OptionError("hfov_deg: expected without `camera`, which has its own field of view")
         if self.hfov_deg is not None and not 0.0 < self.hfov_deg < 180.0:
             raise OptionError(f"hfov_deg: expected above 0 and below 180, got {self.hfov_deg:g}")
@@ -54,6 +55,11 @@ class CameraFiles:
             mount_rotation(self.mount or "nadir", self.camera_pitch_deg)
         except CalibrationError as error:
             raise OptionError(str(error).replace(", or 9 numbers", "")) from None
+
+    @classmethod
+    def of(cls, value: CameraInput | StrPath | None) -> CameraInput:
+        """The camera of which only the calibration is named, or nothing, or as it is."""
+        return value if isinstance(value, CameraInput) else cls(value)
 
     @property
     def has_mount(self) -> bool:
@@ -67,13 +73,19 @@ class CameraFiles:
         return replace(camera, mount=mount_rotation(self.mount or "nadir", self.camera_pitch_deg))
 
     def load(
-        self, frames: FrameSource | None, names: Sequence[str] = (), *, progress: Progress = SILENT
+        self,
+        frames: FrameSource | None,
+        names: Sequence[str] = (),
+        *,
+        image_topic: str | None = None,
+        progress: Progress = SILENT,
     ) -> Camera:
         """The camera of some frames.
 
         Args:
             frames: the pictures; None where they are not known before they are taken.
             names: of those pictures that are used; none is all.
+            image_topic: of the pictures, where the calibration is that of a bag with several.
             progress: receives what a photograph's EXIF said.
 
         Raises:
@@ -82,8 +94,9 @@ class CameraFiles:
         """
         if self.hfov_deg is not None and frames is not None:
             return self.with_field_of_view(frames.read(frames.names[0]).shape)
-        if self.calibration is not None:
-            camera = self._calibrated(self.calibration)
+        if self.camera is not None:
+            path = Path(self.camera)
+            camera = read_bag_camera(path, image_topic) if is_bag(path) else Camera.load(path)
             if self.scale_calibration and frames is not None:
                 camera = _scaled(camera, frames.read((names or frames.names)[0]).shape, progress)
             return self.mounted(camera)
@@ -121,9 +134,6 @@ class CameraFiles:
         camera = self.with_field_of_view(first_picture(camera_source).shape)
         progress.message(f"camera: {camera.width_px} x {camera.height_px}, {self.hfov_deg:g} degrees wide")
         return camera
-
-    def _calibrated(self, path: Path) -> Camera:
-        return read_bag_camera(path, self.image_topic) if is_bag(path) else Camera.load(path)
 
 
 def _scaled(camera: Camera, shape: tuple[int, ...], progress: Progress) -> Camera:

@@ -63,7 +63,7 @@ def diagnose_flight(
         )
     # A bag holds its calibration, which cannot be written to.
     cures = [
-        _that_can_be_set(one, flight.has_gimbal, files.camera not in (None, files.frames))
+        _that_can_be_set(one, flight.has_gimbal, files.camera.camera not in (None, files.frames))
         for one in found.findings
     ]
     return replace(found, findings=cures)
@@ -76,8 +76,8 @@ def _that_can_be_set(finding: Finding, has_gimbal: bool, has_calibration: bool) 
         return finding
     if has_gimbal:
         return replace(
-            finding, cure="beside a gimbal's angles no mount is set: correct the angles, with --column "
-            "roll_deg=roll_deg+DEG, --column pitch_deg=pitch_deg+DEG or --heading-offset-deg DEG",
+            finding, cure="beside a gimbal's angles no mount is set: correct the angles, with --correct "
+            "roll_deg=roll_deg+DEG, --correct pitch_deg=pitch_deg+DEG or --correct heading_offset_deg=DEG",
         )  # fmt: skip
     return (
         finding

@@ -27,13 +27,16 @@ DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
 
 
 def parse_runs(
-    texts: Sequence[str] = (), *, weights: Sequence[StrPath] = (), **overrides: Any
+    texts: Sequence[str] = (),
+    *,
+    settings: Sequence[StrPath] = (),
+    **overrides: Any,
 ) -> dict[str, TrackSettings]:
     """Settings by the name of their run, from METHOD, METHOD/PROFILE or a settings file each.
 
     Args:
         texts: one a run; none of them is :data:`DEFAULT_RUNS`.
-        weights: files of the runs by the learned method.
+        settings: of all runs, files or NAME=VALUE; a run's own file counts more.
         overrides: settings that hold for all of them, where not None.
 
     Raises:
@@ -42,26 +45,23 @@ def parse_runs(
     texts = texts or DEFAULT_RUNS
     runs: dict[str, TrackSettings] = {}
     for text in texts:
-        name, settings = _parse_run(text, weights, overrides)
+        name, parsed = _parse_run(text, settings, overrides)
         if name in runs:
             raise OptionError(f"runs: expected runs of different names, got {name!r} twice")
-        runs[name] = settings
-    if weights and not any(settings.method == "learned" for settings in runs.values()):
-        raise OptionError(f"weights: expected them with a run by learned, got {', '.join(runs)}")
+        runs[name] = parsed
     return runs
 
 
-def _parse_run(text: str, weights: Sequence[StrPath], overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
+def _parse_run(text: str, settings: Sequence[StrPath], overrides: Mapping[str, Any]) -> tuple[str, TrackSettings]:
     method, slash, profile = text.partition("/")
-    weights = weights if method == "learned" else ()
     if method in METHODS and not Path(text).is_file():
         chosen: dict[str, Any] = {"method": method, "profile": profile} if slash else {"method": method}
-        return text.replace("/", "-"), load_settings(None, weights=weights, **overrides, **chosen)
+        return text.replace("/", "-"), load_settings(*settings, **overrides, **chosen)
     if not Path(text).is_file():
         raise OptionError(
             f"runs: expected {', '.join(METHODS)}, one of them with /paper, or a settings file, got {text!r}"
         )
-    return Path(text).stem, load_settings(text, **overrides)
+    return Path(text).stem, load_settings(*settings, text, **overrides)
 
 
 def compare(

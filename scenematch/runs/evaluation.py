@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,32 +15,33 @@ from scenematch.files.track import TrackRow, read_track
 from scenematch.report.metrics import Ground
 from scenematch.report.page_frames import shows_frames
 from scenematch.runs.folders import StrPath
-from scenematch.runs.inputs import FlightFiles, open_map, open_run_truth
+from scenematch.runs.inputs import FlightFiles, open_run_truth
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import RunRecord, read_record
 from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
 
 
-def evaluate(folder: StrPath, truth: StrPath | None = None, *, progress: Progress = SILENT) -> dict[str, Any]:
-    """Score a finished track again, and rewrite its summary and page.
+def evaluate(
+    folder: StrPath, truth: StrPath | None = None, *, force: bool = False, progress: Progress = SILENT
+) -> dict[str, Any]:
+    """Score a finished track again, if there is truth, and rewrite its summary and page.
 
     Args:
         folder: of a finished run.
         truth: truth.csv, a log or a folder of photographs; None is the one that the run had.
+        force: without another truth, whether the page may lose frames that are not there any more.
         progress: is shown what the run does.
 
     Returns:
         The summary.
 
     Raises:
-        TelemetryError: the folder holds no finished track, or no truth is known.
+        TelemetryError: the folder holds no finished track.
+        OptionError: the page would lose its frames.
     """
-    folder = Path(folder)
-    read_track(folder / TRACK)  # what is wrong with it is said first
-    if truth is None and read_record(folder / SUMMARY).truth is None:
-        raise TelemetryError(f"{folder}: the track was made without truth; name one with `truth`")
-    return redraw(folder, truth, progress=progress)
+    return redraw(Path(folder), truth, keep_frames=truth is None and not force, progress=progress)
 
 
 def redraw(
@@ -83,10 +84,7 @@ def redraw(
 
 def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:
     """The map of a finished run."""
-    return open_map(
-        record.map, record.surface, record.map_sigma_m, bounds=record.map_bounds, crs=record.map_crs,
-        progress=progress,
-    )  # fmt: skip
+    return MapInput(**{each.name: getattr(record, each.name) for each in fields(MapInput)}).open(progress)
 
 
 def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> ReportFrames:
@@ -115,7 +113,7 @@ def recorded_files(record: RunRecord) -> FlightFiles:
     """
     if record.frames is None:
         raise TelemetryError("the record of the run lacks its frames")
-    return FlightFiles(
+    return FlightFiles.from_flat(
         map=record.map,
         surface=record.surface,
         camera=record.camera,

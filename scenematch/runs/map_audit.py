@@ -20,7 +20,7 @@ from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
 from scenematch.runs.arguments import parse_circle
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
-from scenematch.runs.inputs import open_map
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.renaming import renamed_in_errors
 
@@ -35,28 +35,22 @@ class AuditFiles:
     """The files of an audit, the height, and what part of the map it is of; None where not given.
 
     Attributes:
-        map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        surface: surface model, a GeoTIFF of heights.
+        map: the map with its surface.
         camera: calibration; None is the paper's camera.
         route: GeoJSON LineString, or a QGroundControl .plan.
         other: the same ground at another date.
         height_agl_m: above the ground; None is the paper's height.
         around: only what lies within "LAT,LON,RADIUS_M".
         corridor_m: only what lies so near to the route.
-        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
-        map_crs: of a map that names none.
     """
 
-    map: StrPath
-    surface: StrPath | None = None
+    map: MapInput
     camera: StrPath | None = None
     route: StrPath | None = None
     other: StrPath | None = None
     height_agl_m: float | None = None
     around: str | None = None
     corridor_m: float | None = None
-    map_bounds: str | None = None
-    map_crs: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +71,8 @@ class MapAudit:
 def audit_map(
     files: AuditFiles,
     out: StrPath,
+    options: AuditOptions | None = None,
     *,
-    prior_sigma_m: float = 10.0,
     force: bool = False,
     progress: Progress = SILENT,
 ) -> MapAudit:
@@ -87,7 +81,7 @@ def audit_map(
     Args:
         files: the map, and what it is audited for.
         out: the folder.
-        prior_sigma_m: of the position before a match.
+        options: what is assumed; None is the defaults.
         force: whether the folder may be there already.
         progress: is shown what the audit does.
 
@@ -99,25 +93,25 @@ def audit_map(
     require("matplotlib", "desk")
     out = Path(out)
     check_folder(out, force)
-    plan, waypoints = _plan(files, prior_sigma_m, progress)
+    plan, waypoints = _plan(files, options or AuditOptions(), progress)
     prepare_folder(out, force, OWNED)
     audit = gather(plan, progress.track(measure_self_match(plan), len(plan), "auditing"))
     route = None if waypoints is None else predict_route(audit, *waypoints.T)
-    _write(out, audit, route, Path(files.map).name)
+    _write(out, audit, route, Path(files.map.map).name)
     facts = _summary(audit, route, files)
     (out / "summary.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     return MapAudit(audit, route, facts)
 
 
 def _plan(
-    files: AuditFiles, prior_sigma_m: float, progress: Progress
+    files: AuditFiles, options: AuditOptions, progress: Progress
 ) -> tuple[AuditPlan, NDArray[np.float64] | None]:
     """What is audited, and the (N, 2) waypoints of the route in degrees."""
     around = parse_circle("around", files.around)
     if files.corridor_m is not None and files.route is None:
         raise OptionError("corridor_m: expected a `route` with it, got none")
-    site = open_map(files.map, files.surface, bounds=files.map_bounds, crs=files.map_crs, progress=progress)
-    other = None if files.other is None else _same_ground(open_map(files.other, progress=progress), site)
+    site = files.map.open(progress)
+    other = None if files.other is None else _same_ground(MapInput(files.other).open(progress), site)
     camera = Camera.from_fov(*PAPER_CAMERA) if files.camera is None else Camera.load(files.camera)
     waypoints = None if files.route is None else read_route(files.route)
     if waypoints is not None:
@@ -125,7 +119,7 @@ def _plan(
     height_m = PAPER_HEIGHT_M if files.height_agl_m is None else files.height_agl_m
     with renamed_in_errors(part="route"):
         part = _part(around, waypoints, files.corridor_m, site)
-        plan = plan_audit(site, camera, height_m, AuditOptions(prior_sigma_m=prior_sigma_m), other, part)
+        plan = plan_audit(site, camera, height_m, options, other, part)
     _check_size(plan, part)
     return plan, waypoints
 
@@ -215,8 +209,8 @@ def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -
     known = np.isfinite(audit.availability)
     scale = 2.0**plan.level * plan.site.gsd_m_per_px
     return {
-        "map": str(files.map),
-        "surface": None if files.surface is None else str(files.surface),
+        "map": str(files.map.map),
+        "surface": None if files.map.surface is None else str(files.map.surface),
         "camera": None if files.camera is None else str(files.camera),
         "other": None if files.other is None else str(files.other),
         "height_agl_m": plan.height_agl_m,

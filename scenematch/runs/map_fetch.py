@@ -58,7 +58,8 @@ class FetchSettings:
         image_format: of a service that offers several, such as image/jpeg.
         tile_px: side of the tiles of a template.
         map_sigma_m: georeferencing accuracy per axis, which the file states then.
-        attribution, licence: texts that the file states.
+        attribution: whom to credit, which the file states then.
+        licence: what may be done with it, which the file states then.
         surface: file or URL of heights, or a template with {lat} and {lon}.
         surface_datum: vertical datum of its heights, EPSG:N.
         surface_slope_sigma_deg: slope accuracy over one frame, which the file states then.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,13 +26,10 @@ from scenematch.bridges.vehicle import NedOrigin
 from scenematch.runs.arguments import check_choice, check_device, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.checks import check_position
-from scenematch.runs.folders import StrPath
-from scenematch.runs.inputs import open_map
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
-from scenematch.runs.settings import with_weights
 from scenematch.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 
 if TYPE_CHECKING:
@@ -72,7 +69,7 @@ class MavlinkSettings:
     listen_anywhere: bool = False
     system_id: int = 1
     component_id: int = 197
-    key: StrPath | None = None
+    key: str | None = None
     firmware: str = "ardupilot"
     message: str = ""
     max_sigma_m: float = 10.0
@@ -99,7 +96,11 @@ class MavlinkSettings:
         Raises:
             OptionError: the firmware, the message or the accuracy is none that can be.
         """
-        return outgoing_options(self.firmware, self.message, self.max_sigma_m, self.gps_id)
+        from scenematch.bridges.mavlink_out import MavlinkOptions
+
+        return MavlinkOptions(
+            firmware=self.firmware, message=self.message, max_sigma_m=self.max_sigma_m, gps_id=self.gps_id
+        )
 
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
         """The start of the flight or else the map's middle; None where none is to be set.
@@ -122,13 +123,15 @@ class BridgeSettings:
 
     Attributes:
         method: "auto", "ncc", "sift" or "learned".
-        weights: files of the learned method.
         device: where tensors live.
+        matcher: settings of the methods.
+        navigator: how a position is carried from frame to frame.
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
         seconds: ends after this time; None ends with the pictures.
-        odometry: whether pictures are followed from one to the next where there is no velocity.
-        realtime: how the threads that match are scheduled; None is as usual.
+        realtime: match with a real-time priority and locked memory (Linux).
+        nice: with realtime, a nice value, -20 to -1, in place of SCHED_FIFO.
+        cores: with realtime, the cores that match; none leaves them those of the process.
 
     Raises:
         OptionError: a word or a number is none of those that are expected, or real time is not this system's.
@@ -137,34 +140,40 @@ class BridgeSettings:
     """
 
     method: str = "auto"
-    weights: tuple[StrPath, ...] = ()
     device: str = "auto"
     start: str | None = None
+    matcher: MatcherOptions = field(default_factory=MatcherOptions)
+    navigator: NavigatorOptions = field(default_factory=NavigatorOptions)
     deadline_ms: float | None = None
     seconds: float | None = None
-    odometry: bool = False
-    realtime: Realtime | None = None
+    realtime: bool = False
+    nice: int | None = None
+    cores: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
-        self.matcher_options()
         check_device(self.device)
         parse_position("start", self.start)
         self.live_options()
-        check_realtime(self.realtime)
+        check_realtime(self.scheduling())
+        if self.matcher.profile != "engine":
+            raise OptionError(f"profile: expected engine in a bridge, got {self.matcher.profile!r}")
 
-    def matcher_options(self) -> MatcherOptions:
-        """What of it is the matcher's."""
-        return MatcherOptions(learned=with_weights(self.method, self.weights))
+    def scheduling(self) -> Realtime | None:
+        """How the threads that match are scheduled; None is as usual.
 
-    def navigator_options(self) -> NavigatorOptions:
-        """What of it is the navigator's."""
-        return NavigatorOptions(odometry=self.odometry)
+        Raises:
+            OptionError: a number is none that can be, or has no effect without ``realtime``.
+        """
+        if not self.realtime:
+            check_unused({"nice": self.nice, "cores": self.cores or None}, "realtime")
+            return None
+        return Realtime(nice=self.nice, cores=self.cores)
 
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, with the one that counts where none was set."""
         deadline_ms = deadline_ms if self.deadline_ms is None else self.deadline_ms
-        return LiveOptions(deadline_ms=deadline_ms, realtime=self.realtime)
+        return LiveOptions(deadline_ms=deadline_ms, realtime=self.scheduling())
 
 
 def run_mavlink_bridge(
@@ -204,18 +213,16 @@ def run_mavlink_bridge(
     outgoing = link.outgoing()
     start = parse_position("start", settings.start)
     key = None if link.key is None else read_key(Path(link.key))
-    site = open_map(
-        files.map, files.surface, files.map_sigma_m, bounds=files.map_bounds, crs=files.map_crs, progress=progress
-    )
+    site = files.map.open(progress)
     camera = files.load_camera(progress)
     check_position("start", start, site, OptionError)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
     # A camera's bridge may start in the air; a flight that is played begins where it began.
     resumes = files.camera_source is not None
     last_fix = LastFix(
-        last_fix_file(link.connect, link.system_id, Path(files.map).absolute()) if resumes else None
+        last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
     end_on_sigterm()  # before there is a worker, which has it from its first instruction on
     if supervise:
@@ -225,7 +232,7 @@ def run_mavlink_bridge(
 
     # Before the link: an autopilot on the bench takes off when the bridge listens.
     pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
-    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
@@ -236,8 +243,9 @@ def run_mavlink_bridge(
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
-            if settings.realtime is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
+            scheduling = settings.scheduling()
+            if scheduling is not None:  # this thread, too, may hold Python's lock
+                set_realtime(replace(scheduling, cores=()))  # of which a camera's command would inherit
             # Ctrl-C is the usual end beside a camera, and no reason to lose the counts.
             with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress, beat)
@@ -256,17 +264,6 @@ def _resumed(last: Prior | None, start: Prior | None, site: OrthoMap, progress: 
         return start
     progress.message(f"goes on from the last fix, which has grown uncertain by {last.sigma_m:.0f} m")
     return last
-
-
-def outgoing_options(firmware: str, message: str, max_sigma_m: float, gps_id: int) -> MavlinkOptions:
-    """What is sent.
-
-    Raises:
-        OptionError: the firmware, the message or a number is none that can be.
-    """
-    from scenematch.bridges.mavlink_out import MavlinkOptions
-
-    return MavlinkOptions(firmware=firmware, message=message, max_sigma_m=max_sigma_m, gps_id=gps_id)
 
 
 def _run(

@@ -9,7 +9,7 @@ from engine.errors import require
 from scenematch.bridges.delay_memory import measured_delay_ms
 from scenematch.bridges.parameters import ParameterOptions, parameter_file
 from scenematch.runs.folders import StrPath, check_file
-from scenematch.runs.mavlink_bridge import outgoing_options
+from scenematch.runs.mavlink_bridge import MavlinkSettings
 
 _DEFAULT_DELAY_MS = 100
 
@@ -27,38 +27,39 @@ class WrittenParameters:
     delay_source: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterSettings:
+    """What a parameter file is for, beside the bridge's own settings.
+
+    Attributes:
+        takeoff: "none" without GNSS, or "gnss", from which ArduPilot is switched over in flight.
+        delay_ms: from capture to arrival; none is what the last bridge with a camera measured, else 100.
+    """
+
+    takeoff: str = "none"
+    delay_ms: int | None = None
+
+
 def write_parameter_file(
-    firmware: str,
-    message: str,
-    out: StrPath,
-    *,
-    takeoff: str = "none",
-    gps_id: int = 0,
-    delay_ms: int | None = None,
-    max_sigma_m: float = 10.0,
-    force: bool = False,
+    out: StrPath, link: MavlinkSettings, settings: ParameterSettings | None = None, *, force: bool = False
 ) -> WrittenParameters:
     """Write the parameters that let an autopilot fly by the bridge's fixes.
 
     Args:
-        firmware: "ardupilot" or "px4".
-        message: that is sent; "" is the firmware's usual one.
         out: the file.
-        takeoff: "none" without GNSS, or "gnss", from which ArduPilot is switched over in flight.
-        gps_id: receiver that GPS_INPUT poses as.
-        delay_ms: from capture to arrival; None is what the last bridge with a camera measured, else 100.
-        max_sigma_m: of the fixes that are sent.
+        link: what is sent to the autopilot.
+        settings: what the file is for; None is the defaults.
         force: whether the file may be there already.
 
     Returns:
         The delay that was written, and where it came from.
     """
     require("pymavlink", "mavlink")
-    out, outgoing = Path(out), outgoing_options(firmware, message, max_sigma_m, gps_id)
-    written = _delay(delay_ms)
+    out, outgoing, settings = Path(out), link.outgoing(), settings or ParameterSettings()
+    written = _delay(settings.delay_ms)
     options = ParameterOptions(
-        firmware=firmware, message=outgoing.kind, takeoff=takeoff, gps_id=gps_id, delay_ms=written.delay_ms,
-        max_sigma_m=max_sigma_m,
+        firmware=link.firmware, message=outgoing.kind, takeoff=settings.takeoff, gps_id=link.gps_id,
+        delay_ms=written.delay_ms, max_sigma_m=link.max_sigma_m,
     )  # fmt: skip
     text = parameter_file(options)
     check_file(out, force)

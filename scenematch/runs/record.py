@@ -12,6 +12,8 @@ from typing import Any
 from engine.errors import EngineError, TelemetryError
 from scenematch.files.corrections import Corrections
 
+PATHS = ("map", "surface", "camera", "frames", "telemetry", "truth", "frame_stamps")
+"""The files of a record."""
 _TEXTS = ("map", "method", "profile")
 _TEXTS_OR_NONE = (
     "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "odometry_topic",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from engine.camera import Camera
 from engine.errors import BackendError, OptionError
@@ -15,11 +14,10 @@ from scenematch.bridges.ros_out import RosOptions
 from scenematch.bridges.vehicle import NedOrigin
 from scenematch.files.ros.messages import camera_from_message, image_from_message
 from scenematch.runs.arguments import parse_position
-from scenematch.runs.cameras import CameraFiles
+from scenematch.runs.cameras import CameraInput
 from scenematch.runs.checks import check_position
-from scenematch.runs.folders import StrPath
-from scenematch.runs.inputs import open_map
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.mavlink_bridge import BridgeSettings
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
@@ -34,16 +32,9 @@ class RosSettings:
 
     Attributes:
         version: 1 for rospy, 2 for rclpy.
-        map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        surface: surface model, a GeoTIFF of heights.
-        camera: calibration; None takes ``hfov_deg``, else the topic's, of a nadir camera.
-        hfov_deg: horizontal field of view, in place of a calibration; with the size of the first picture.
+        map: the map with its surface.
+        camera: what is said of the camera; its calibration else is the topic's.
         topics: that are heard.
-        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
-        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
-        map_crs: of a map that names none.
-        mount: how the camera is mounted, by name; None is the calibration's.
-        camera_pitch_deg: of the camera, -90 looks straight down.
         firmware: for whom the poses are, behind MAVROS: "none", "ardupilot" or "px4".
         origin: of the poses, "LAT,LON"; None is the map's.
         arguments: for ROS: "NAME:=VALUE" for ROS 1, those from "--ros-args" on for ROS 2.
@@ -52,17 +43,10 @@ class RosSettings:
         OptionError: the topic of the images has no name, or the arguments are not for this ROS.
     """
 
-    map: StrPath
-    surface: StrPath | None = None
-    camera: StrPath | None = None
-    hfov_deg: float | None = None
+    map: MapInput
+    camera: CameraInput = field(default_factory=CameraInput)
     topics: RosTopics = field(default_factory=RosTopics)
-    map_sigma_m: float | None = None
-    map_bounds: str | None = None
-    map_crs: str | None = None
-    mount: str | None = None
-    camera_pitch_deg: float | None = None
-    version: int = 1
+    version: int = 2
     firmware: str = "none"
     origin: str | None = None
     arguments: tuple[str, ...] = ()
@@ -75,15 +59,6 @@ class RosSettings:
             raise OptionError(f"ros_arguments: expected --ros-args -r NAME:=VALUE, got {self.arguments[0]}")
         if not self.topics.image:
             raise OptionError("image_topic: expected a name, got nothing")
-        self.camera_files()
-
-    def camera_files(self) -> CameraFiles:
-        """What is said of the camera."""
-        calibration = None if self.camera is None else Path(self.camera)
-        return CameraFiles(
-            calibration=calibration, hfov_deg=self.hfov_deg, mount=self.mount,
-            camera_pitch_deg=self.camera_pitch_deg,
-        )  # fmt: skip
 
     def options(self) -> RosOptions:
         """What is published.
@@ -124,24 +99,23 @@ def run_ros_bridge(
     end_on_sigterm()  # before rospy, which calls this handler, too
     settings = settings or BridgeSettings()
     start, options = parse_position("start", settings.start), ros.options()
-    site = open_map(
-        ros.map, ros.surface, ros.map_sigma_m, bounds=ros.map_bounds, crs=ros.map_crs, progress=progress
-    )
+    site = ros.map.open(progress)
     check_position("start", start, site, OptionError)
     check_position("origin", parse_position("origin", ros.origin), site, OptionError)
-    camera = None if ros.camera is None else ros.camera_files().load(None)
+    camera = None if ros.camera.camera is None else ros.camera.load(None)
     node = node or _node(ros.version, ros.arguments)
     camera = camera or _heard_camera(node, ros, progress)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher_options())
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
 
-    with open_bridge_view(matcher, live_view, settings.navigator_options()) as (make_navigator, watcher):
+    with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:
-            if settings.realtime is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(settings.realtime, cores=()))  # of which a camera's command would inherit
+            scheduling = settings.scheduling()
+            if scheduling is not None:  # this thread, too, may hold Python's lock
+                set_realtime(replace(scheduling, cores=()))  # of which a camera's command would inherit
             report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat, suppress(KeyboardInterrupt):  # the usual end, with its counts
 
@@ -170,8 +144,8 @@ def _node(version: int, arguments: tuple[str, ...]) -> RosNode:
 
 def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera:
     """The camera by its field of view and a picture of it, else the calibration that is published."""
-    described, topics = ros.camera_files(), ros.topics
-    if ros.hfov_deg is None:
+    described, topics = ros.camera, ros.topics
+    if described.hfov_deg is None:
         return described.mounted(_published_camera(node, topics.camera_info, progress))
     progress.message(f"waiting for a picture on {topics.image}, whose size is not known")
     message = node.wait_for(topics.image, topics.image_type, _CAMERA_INFO_TIMEOUT_S)

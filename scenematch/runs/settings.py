@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from engine.errors import OptionError
 from engine.matching import METHODS
 from engine.options import PROFILES, LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, SiftOptions
-from scenematch.files.settings import read_settings
+from scenematch.files.settings import (
+    merged,
+    nearest,
+    options_from_mapping,
+    parse_setting,
+    read_values,
+    settings_text,
+)
 from scenematch.files.telemetry import COLUMNS
 from scenematch.runs.arguments import check_choice, check_device, parse_budget, parse_position
 from scenematch.runs.folders import StrPath
@@ -39,7 +47,7 @@ class TrackSettings:
         DeviceError: the device is missing.
     """
 
-    method: str = "ncc"
+    method: str = "auto"
     profile: str = "engine"
     device: str = "auto"
     start: str | None = None
@@ -73,36 +81,179 @@ class TrackSettings:
         return MatcherOptions(profile=self.profile, ncc=self.ncc, sift=self.sift, learned=self.learned)
 
 
-def load_settings(
-    path: StrPath | None, *, weights: Sequence[StrPath] = (), odometry: bool = False, **overrides: Any
-) -> TrackSettings:
-    """The settings of a file, or the defaults, with what overrides them.
+@dataclass(frozen=True, slots=True)
+class InputSettings:
+    """What is rarely said of a flight's or a bridge's files.
+
+    Attributes:
+        every: one frame in so many is used, from the first on.
+        frame_stamps: with a log, a CSV with timestamp_ns and frame.
+        log_offset_s: with a log, added to the frames' own stamps.
+        image_topic: of the pictures, if the frames are a bag with several.
+        odometry_topic: another odometry that the velocity is taken from, if the telemetry is a bag.
+        camera_pitch_deg: of the camera, -90 looks straight down.
+        scale_calibration: scale the calibration to pictures of another size and the same shape.
+        map_sigma_m: georeferencing accuracy of the map per axis; none is what the map states.
+        map_bounds: "W,S,E,N", edges of a picture without georeference, in degrees or in map_crs.
+        map_crs: of a map that names none, EPSG:N.
+        rate_hz: of a bridge: pace of played pictures without stamps; none is 10.
+        exposure_to_grab_ms: of a bridge: how long the pictures of its camera take to get here.
+        gimbal: of a bridge: the camera hangs on a gimbal that the autopilot reports.
+    """
+
+    every: int = 1
+    frame_stamps: str | None = None
+    log_offset_s: float = 0.0
+    image_topic: str | None = None
+    odometry_topic: str | None = None
+    camera_pitch_deg: float | None = None
+    scale_calibration: bool = False
+    map_sigma_m: float | None = None
+    map_bounds: str | None = None
+    map_crs: str | None = None
+    rate_hz: float | None = None
+    exposure_to_grab_ms: float | None = None
+    gimbal: bool = False
+
+    def of(self, *kinds: type[Any]) -> dict[str, Any]:
+        """The values of the fields that these dataclasses have too, by name."""
+        names = {each.name for kind in kinds for each in fields(kind)}
+        return {each.name: getattr(self, each.name) for each in fields(self) if each.name in names}
+
+
+TABLES = {
+    "input": ("scenematch.runs.settings", "InputSettings", ()),
+    "bridge": (
+        "scenematch.runs.mavlink_bridge", "BridgeSettings", ("method", "device", "start", "matcher", "navigator")
+    ),
+    "mavlink": ("scenematch.runs.mavlink_bridge", "MavlinkSettings", ("connect",)),
+    "parameters": ("scenematch.runs.mavlink_parameters", "ParameterSettings", ()),
+    "ros": ("scenematch.runs.ros_bridge", "RosSettings", ("map", "camera", "version", "arguments")),
+    "audit": ("scenematch.check.plan", "AuditOptions", ("ncc",)),
+    "fetch": ("scenematch.runs.map_fetch", "FetchSettings", ("around", "source", "dry_run", "force")),
+}  # fmt: skip
+"""Tables of a settings file beside those of :class:`TrackSettings`: module and class, and what is no setting.
+
+A module is imported with its table only: a map is fetched without torch.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of files and of NAME=VALUE, the later ones counting more.
+
+    Attributes:
+        sources: values with the file that they are from; None is no file.
+    """
+
+    sources: tuple[tuple[Path | None, Mapping[str, Any]], ...] = ()
+
+    @classmethod
+    def read(cls, texts: Sequence[StrPath]) -> Settings:
+        """Read them.
+
+        Raises:
+            OptionError: a file is not TOML, or a name is unknown.
+            OSError: a file cannot be read.
+        """
+        sources: list[tuple[Path | None, Mapping[str, Any]]] = []
+        known = [*(each.name for each in fields(TrackSettings)), *TABLES, "threads"]
+        for text in texts:
+            values = None if Path(text).is_file() else parse_setting(str(text))
+            path = Path(text) if values is None else None
+            sources.append((path, read_values(Path(text)) if values is None else values))
+            for name in sources[-1][1]:
+                if name not in known:
+                    where = "" if path is None else f"{path}: "
+                    raise OptionError(f"{where}{name}: not a setting; {nearest(name, known)}")
+        return cls(tuple(sources))
+
+    @property
+    def threads(self) -> int:
+        """Of torch and OpenCV.
+
+        Raises:
+            OptionError: it is no number above 0.
+        """
+        count = self._values().get("threads", 1)
+        if type(count) is not int or count < 1:
+            raise OptionError(f"threads: expected a whole number above 0, got {count!r}")
+        return count
+
+    def track(self, **given: Any) -> TrackSettings:
+        """How frames are matched.
+
+        Args:
+            given: settings that count more; None is none.
+
+        Raises:
+            OptionError: a name is unknown, or a value is none that can be.
+        """
+        values = {name: value for name, value in self._values().items() if name not in (*TABLES, "threads")}
+        found: TrackSettings = self._built(TrackSettings, values, "", given)
+        weights = tuple(str(Path(path).resolve()) for path in found.learned.weights)  # as a record keeps them
+        return replace(found, learned=replace(found.learned, weights=weights))
+
+    def table(self, name: str, **given: Any) -> Any:
+        """A table of :data:`TABLES`.
+
+        Args:
+            name: of the table.
+            given: what is no setting, or counts more; None is none.
+
+        Raises:
+            OptionError: a name is unknown, or a value is none that can be.
+        """
+        module, kind, hidden = TABLES[name]
+        values = self._values().get(name, {})
+        if not isinstance(values, dict):
+            raise OptionError(f"{name}: expected a table, got {values!r}")
+        for key in hidden:
+            if key in values:
+                raise OptionError(f"{name}.{key}: not a setting")
+        return self._built(getattr(import_module(module), kind), values, name, given)
+
+    def _built(self, cls: Any, values: Mapping[str, Any], within: str, given: Mapping[str, Any]) -> Any:
+        given = {name: value for name, value in given.items() if value is not None}
+        try:
+            return options_from_mapping(cls, values, within, given)
+        except OptionError as error:
+            *path, last = str(error).partition(":")[0].split(".")
+            for file, table in reversed(self.sources):
+                for part in path:
+                    table = table.get(part, {}) if isinstance(table, Mapping) else {}
+                if file is not None and last in table:
+                    raise OptionError(f"{file}: {error}") from None
+                if last in table:
+                    break
+            raise
+
+    def _values(self) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for _, values in self.sources:
+            out = merged(out, values)
+        return out
+
+
+def documented_settings() -> str:
+    """A settings file with every setting, its meaning and its default, all commented out."""
+    texts = ["# Threads of torch and OpenCV.\n#threads = 1\n", settings_text(TrackSettings())]
+    for name, (module, kind, hidden) in TABLES.items():
+        cls = getattr(import_module(module), kind)
+        needed = {each.name: "" for each in fields(cls) if each.default is each.default_factory is MISSING}
+        texts.append(settings_text(cls(**needed), name, hidden))
+    return "\n".join(texts)
+
+
+def load_settings(*texts: StrPath | None, **overrides: Any) -> TrackSettings:
+    """The settings of files, or the defaults, with what overrides them.
 
     Args:
-        path: a TOML file as ``scenematch init`` writes it; None is the defaults.
-        weights: files of the learned method, in place of those of the settings file.
-        odometry: whether pictures are followed where there is no velocity, whatever the file says.
-        overrides: settings by name that count more than the file; None is none.
+        texts: TOML files as ``scenematch doctor --settings`` prints one, or NAME=VALUE, the later counting more;
+            None is the defaults.
+        overrides: settings by name that count more; None is none.
 
     Raises:
-        OptionError, OSError: see :func:`scenematch.files.settings.read_settings`.
+        OptionError, OSError: see :meth:`Settings.read` and :meth:`Settings.track`.
     """
-    settings = TrackSettings() if path is None else read_settings(Path(path), TrackSettings)
-    settings = replace(settings, **{name: value for name, value in overrides.items() if value is not None})
-    if odometry:
-        settings = replace(settings, navigator=replace(settings.navigator, odometry=True))
-    if not weights:
-        return settings
-    return replace(settings, learned=with_weights(settings.method, weights, settings.learned))
-
-
-def with_weights(method: str, weights: Sequence[StrPath], options: LearnedOptions | None = None) -> LearnedOptions:
-    """The settings of the learned method with these files, by their whole paths.
-
-    Raises:
-        OptionError: there are files, and the method is another.
-    """
-    options = options or LearnedOptions()
-    if weights and method != "learned":
-        raise OptionError(f"weights: expected them with method learned, got method {method!r}")
-    return replace(options, weights=tuple(str(Path(path).resolve()) for path in weights))
+    return Settings.read([text for text in texts if text is not None]).track(**overrides)

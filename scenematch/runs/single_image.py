@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from engine.errors import OptionError, TelemetryError
@@ -13,59 +13,42 @@ from engine.options import MatcherOptions
 from engine.values import Fix, Frame, NoFix
 from scenematch.files.frames import PICTURE_SUFFIXES, open_frames, read_image
 from scenematch.runs.arguments import check_choice, check_device, parse_position
-from scenematch.runs.cameras import CameraFiles, check_size
+from scenematch.runs.cameras import CameraInput, check_size
 from scenematch.runs.checks import check_position
 from scenematch.runs.folders import StrPath
-from scenematch.runs.inputs import open_map
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
-from scenematch.runs.settings import with_weights
 
 
 def locate_image(
     image: StrPath,
-    map: StrPath,  # noqa: A002 - what the file is, as everywhere
-    camera: StrPath | None = None,
+    map: MapInput | StrPath,  # noqa: A002 - what it is, as everywhere
+    camera: CameraInput | StrPath | None = None,
     *,
-    surface: StrPath | None = None,
-    map_sigma_m: float | None = None,
-    map_bounds: str | None = None,
-    map_crs: str | None = None,
-    hfov_deg: float | None = None,
-    mount: str | None = None,
-    camera_pitch_deg: float | None = None,
-    scale_calibration: bool = False,
     height_agl_m: float | None = None,
     heading_deg: float | None = None,
     roll_deg: float | None = None,
     pitch_deg: float | None = None,
-    near: str | None = None,
+    start: str | None = None,
     method: str = "auto",
-    weights: Sequence[StrPath] = (),
     device: str = "auto",
+    options: MatcherOptions | None = None,
     progress: Progress = SILENT,
 ) -> Fix | NoFix:
     """Match one image. Height, attitude and position are the arguments', not those of a photograph's EXIF.
 
     Args:
         image: the file.
-        map: GeoTIFF, a picture with a world file, or a folder of tiles.
-        camera: calibration file of ROS, OpenCV or Kalibr; None takes ``hfov_deg`` or the photograph's EXIF.
-        surface: surface model, a GeoTIFF of heights.
-        map_sigma_m: georeferencing accuracy of the map per axis; None is what the map states.
-        map_bounds: "W,S,E,N" of a picture without georeference, in degrees or in ``map_crs``.
-        map_crs: of a map that names none.
-        hfov_deg: horizontal field of view, in place of a calibration.
-        mount: how the camera is mounted, by name; None is the calibration's, else nadir.
-        camera_pitch_deg: of the camera, -90 looks straight down.
-        scale_calibration: to a picture of another size and the same shape.
+        map: the map with its surface; of a map that says all else itself, its path.
+        camera: what is said of the camera, or the path of its calibration; None takes the photograph's EXIF.
         height_agl_m: above the ground; None is unknown, as of the next three.
         heading_deg: clockwise from true north.
         roll_deg: right side down.
         pitch_deg: nose up.
-        near: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
+        start: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
         method: "ncc", "sift", "auto" or "learned".
-        weights: files of the learned method.
         device: where tensors live.
+        options: settings of the methods; None is the defaults.
         progress: is shown the copying of the map.
 
     Raises:
@@ -77,20 +60,12 @@ def locate_image(
     }  # fmt: skip
     _check_numbers(known)
     check_choice("method", method, METHODS)
-    options = MatcherOptions(learned=with_weights(method, weights))
     check_device(device)
-    prior = parse_position("near", near)
-    described = CameraFiles(
-        calibration=None if camera is None else Path(camera),
-        hfov_deg=hfov_deg,
-        mount=mount,
-        camera_pitch_deg=camera_pitch_deg,
-        scale_calibration=scale_calibration,
-    )
-    site = open_map(map, surface, map_sigma_m, bounds=map_bounds, crs=map_crs, progress=progress)
+    prior = parse_position("start", start)
+    site = MapInput.of(map).open(progress)
     _check_picture(Path(image))
-    calibration = described.load(open_frames(image), progress=progress)
-    check_position("near", prior, site, OptionError)
+    calibration = CameraInput.of(camera).load(open_frames(image), progress=progress)
+    check_position("start", prior, site, OptionError)
     pixels = read_image(image)
     check_size(calibration, pixels.shape)
     frame = Frame(

@@ -27,7 +27,7 @@ from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
 from scenematch.runs.progress import SILENT, Progress
-from scenematch.runs.record import RunRecord
+from scenematch.runs.record import PATHS, RunRecord
 from scenematch.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
 
@@ -126,30 +126,16 @@ def _record(
     attitude: AttitudeCheck | None,
 ) -> RunRecord:
     """What a run was made of, for summary.json."""
-
-    def absolute(path: Path | None) -> str | None:
-        return None if path is None else str(path.resolve())
-
+    given = files.flat() | {"truth": inputs.truth_path}
+    for name in PATHS:
+        given[name] = None if given[name] is None else str(Path(given[name]).resolve())
+    given |= {
+        "log_offset_s": files.log_offset_s if files.has_clock else None,
+        "every": files.every if files.every > 1 else None,
+        "corrections": None if files.corrections.changes_nothing else files.corrections.facts(),
+    }
     return RunRecord(
-        map=str(files.map.resolve()),
-        surface=absolute(files.surface),
-        camera=absolute(files.camera),
-        frames=absolute(files.frames),
-        telemetry=absolute(files.telemetry),
-        truth=absolute(inputs.truth_path),
-        frame_stamps=absolute(files.frame_stamps),
-        log_offset_s=files.log_offset_s if files.has_clock else None,
-        image_topic=files.image_topic,
-        odometry_topic=files.odometry_topic,
-        every=files.every if files.every > 1 else None,
-        map_sigma_m=files.map_sigma_m,
-        map_bounds=files.map_bounds,
-        map_crs=files.map_crs,
-        hfov_deg=files.hfov_deg,
-        mount=files.mount,
-        camera_pitch_deg=files.camera_pitch_deg,
-        scale_calibration=files.scale_calibration,
-        corrections=None if files.corrections.changes_nothing else files.corrections.facts(),
+        **given,
         heights=dict(inputs.flight.heights),
         method=settings.method,
         profile=settings.profile,

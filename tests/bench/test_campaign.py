@@ -28,8 +28,8 @@ frames = 2
 
 
 def test_options_are_those_of_the_command_line():
-    given = {"map_sigma_m": 1.5, "odometry": True, "surface": "none", "force": False}
-    assert campaign.options(given) == ["--map-sigma-m=1.5", "--odometry"]
+    given = {"hfov_deg": 60.0, "closed_loop": True, "surface": "none", "force": False, "settings": ["a=1", "b=2"]}
+    assert campaign.options(given) == ["--hfov-deg=60.0", "--closed-loop", "--settings=a=1", "--settings=b=2"]
 
 
 def test_fixes_count_alike_in_a_pool():

@@ -789,7 +789,7 @@ def test_gps_input_stands_beside_a_receiver_as_the_second():
 
 def test_the_delay_is_what_the_last_bridge_measured(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    words = ["bridge", "mavlink-params", "--force", "--out", str(tmp_path / "x.param")]
+    words = ["bridge", "mavlink", "--force", "--write-params", str(tmp_path / "x.param")]
     assert main(words) == 0
     assert "100 ms" in capsys.readouterr().err
     remember_delay(33.4)
@@ -799,12 +799,14 @@ def test_the_delay_is_what_the_last_bridge_measured(tmp_path, monkeypatch, capsy
 
 def test_the_command_line_writes_them_and_refuses_in_one_line(tmp_path, capsys):
     out = tmp_path / "x.param"
-    words = ["bridge", "mavlink-params", "--firmware", "px4", "--out", str(out)]
+    words = ["bridge", "mavlink", "--firmware", "px4", "--write-params", str(out)]
     assert main(words) == 0
     assert "EKF2_AGP0_CTRL" in out.read_text(encoding="utf-8")
     assert main(words) == 2
-    assert main([*words, "--force", "--message", "gps_input"]) == 2
-    assert "--message: expected one of global_position_sensor, odometry" in capsys.readouterr().err
+    assert main([*words, "--force", "--settings", "mavlink.message=gps_input"]) == 2
+    assert (
+        "--settings mavlink.message: expected one of global_position_sensor, odometry" in capsys.readouterr().err
+    )
     live = ["bridge", "mavlink", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--connect"]
     assert main([*live, "udpin:0.0.0.0:14550"]) == 2
     assert main([*live, "nonsense"]) == 2
@@ -1213,8 +1215,11 @@ def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(bri
 @pytest.mark.parametrize("number", ["1", "0", "256"])
 def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
     given = ["--connect", "udp:14550", "--map", "m.tif", "--frames", "f", "--camera", "c.yaml"]
-    assert main(["bridge", "mavlink", *given, "--component-id", number]) == 2
-    assert f"--component-id: expected 2 to 255, 1 is the autopilot, got {number}" in capsys.readouterr().err
+    assert main(["bridge", "mavlink", *given, "--settings", f"mavlink.component_id={number}"]) == 2
+    assert (
+        f"--settings mavlink.component_id: expected 2 to 255, 1 is the autopilot, got {number}"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("by_camera", [True, False])

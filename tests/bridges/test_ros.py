@@ -1016,6 +1016,8 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
 
 def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp_path, monkeypatch):
     """Of its field of view; nothing but the picture's topic is waited for."""
+    from scenematch.runs.cameras import CameraInput
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
     from scenematch.runs.simulation import write_flight
     from scenematch.simulator import plan_flight
@@ -1038,7 +1040,9 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp
 
     monkeypatch.setattr("scenematch.runs.ros_bridge.SceneMatcher", matcher)
     write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
-    settings = RosSettings(map=tmp_path / "map.tif", hfov_deg=90.0, topics=RosTopics(image="/down"))
+    settings = RosSettings(
+        map=MapInput(tmp_path / "map.tif"), camera=CameraInput(hfov_deg=90.0), topics=RosTopics(image="/down")
+    )
     node = Spun(maker)
     with pytest.raises(LoadedError) as ended:
         run_ros_bridge(settings, node=node)
@@ -1049,7 +1053,7 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp
     with pytest.raises(BackendError, match=r"image_topic: expected a picture on /down within 30 s, got none"):
         run_ros_bridge(settings, node=node)
     with pytest.raises(OptionError, match="hfov_deg: expected without `camera`"):
-        RosSettings(map="m.tif", hfov_deg=90.0, camera="c.yaml")
+        RosSettings(map=MapInput("m.tif"), camera=CameraInput("c.yaml", hfov_deg=90.0))
 
 
 def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
@@ -1094,16 +1098,15 @@ def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
 
 
 def test_an_odometry_of_another_message_is_refused(capsys, tmp_path):
-    given = ["--odometry-topic", "/vio", "--odometry-type", "PoseStamped"]
+    given = ["--settings", "ros.topics.odometry=/vio", "--settings", "ros.topics.odometry_type=PoseStamped"]
     assert main(["bridge", "ros", "--map", str(tmp_path / "m.tif"), *given]) == 2
-    stated = (
-        "--odometry-type: expected one of Odometry, TwistWithCovarianceStamped, TwistStamped, got 'PoseStamped'"
-    )
+    names = "Odometry, TwistWithCovarianceStamped, TwistStamped"
+    stated = f"ros.topics.odometry_type: expected one of {names}, got 'PoseStamped'"
     assert stated in capsys.readouterr().err
 
 
-def test_the_command_line_names_the_topics_of_the_code(capsys):
-    assert main(["bridge", "ros", "--help"]) == 0
+def test_the_settings_name_the_topics_of_the_code(capsys):
+    assert main(["doctor", "--settings"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert all(name in text for name in ODOMETRY_TYPES)
     for name in RosTopics.__slots__:

@@ -361,7 +361,7 @@ def test_a_folder_that_exists_is_kept_unless_forced(map_file, tmp_path, capsys):
         (["--height-agl=0"], 2, "--height-agl: expected"),
         (["--height-agl=nan"], 2, "--height-agl: expected"),
         (["--height-agl=9000"], 2, "--height-agl: expected"),
-        (["--sigma-m=-1"], 2, "--sigma-m: expected"),
+        (["--settings=audit.prior_sigma_m=-1"], 2, "--settings audit.prior_sigma_m: expected"),
         (["--route=nowhere.plan"], 1, "nowhere.plan"),
         (["--camera=nowhere.yaml"], 1, "nowhere.yaml"),
         (["--surface=nowhere.tif"], 1, "nowhere.tif"),

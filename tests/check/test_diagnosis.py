@@ -129,7 +129,7 @@ def test_an_offset_has_its_value_within_three_sigma():
     for off_deg in (-12.0, 5.0, 8.1):
         (found,) = findings(series(angles_deg=ANGLES + np.array([0, 0, off_deg])), seen(), 1.0)
         assert abs(found.value + off_deg) < 3.0 * found.sigma
-        assert found.cure.startswith(f"--heading-offset-deg {found.value:+.1f}")
+        assert found.cure.startswith(f"--correct heading_offset_deg={found.value:+.1f}")
 
 
 @pytest.mark.parametrize("turn_deg", [90, 180, 270])
@@ -265,7 +265,7 @@ def radians_near_north(turning):
 def test_headings_in_radians_are_named_where_most_of_them_are_near_north(turning):
     wrong, poses = radians_near_north(turning)
     (found,) = findings(wrong, poses, 1.0)
-    assert (found.cause, found.cure) == ("radians", '--column "heading_deg=57.29578*heading_deg"')
+    assert (found.cause, found.cure) == ("radians", '--correct "heading_deg=57.29578*heading_deg"')
     counted = {one.field: (one.pictures, one.compared) for one in contradictions(wrong, poses)}
     assert counted == {"roll": (0, 16), "pitch": (0, 16), "heading": (turning, 16), "height": (0, 16),
                        "velocity": (0, 15)}  # fmt: skip

@@ -54,14 +54,14 @@ def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
     truth = (flight / "truth.csv").read_text(encoding="utf-8").splitlines()[1].split(",")
     lines = [
         ["doctor"],
-        ["init", f"--out={tmp_path / 's.toml'}"],
+        ["doctor", "--settings"],
         ["track", *files, f"--out={out}"],
         ["evaluate", out],
         ["export", out, "--format=geojson"],
-        ["locate", picture, *files[:3], "--height-agl=150", "--method=sift", f"--near={truth[1]},{truth[2]}"],
+        ["locate", picture, *files[:3], "--height-agl=150", "--method=sift", f"--start={truth[1]},{truth[2]}"],
         ["check", *files],
         ["map", "info", flight / "map.tif"],
-        ["bridge", "mavlink", "--connect=udpout:127.0.0.1:9", *files, "--seconds=0.1"],
+        ["bridge", "mavlink", "--connect=udpout:127.0.0.1:9", *files, "--settings=bridge.seconds=0.1"],
     ]
     codes, stated = run_without(lines)
     assert dict(zip([" ".join(map(str, line[:2])) for line in lines], codes, strict=True)) == {
@@ -75,7 +75,7 @@ def test_a_flight_is_tracked_without_an_extra_of_a_desk(files, tmp_path, monkeyp
     for name in OF_DESKS:
         monkeypatch.setitem(sys.modules, name, None)
     out = tmp_path / "out"
-    assert run(["track", *files, "--threads=1", f"--out={out}"]) == 0
+    assert run(["track", *files, f"--out={out}"]) == 0
     assert (out / "report.html").is_file()
 
 

@@ -65,7 +65,7 @@ def test_completion_loads_nothing_that_only_work_needs():
         [sys.executable, "-c", program],
         capture_output=True, text=True, cwd=ROOT, check=True, env=os.environ | asked,
     )  # fmt: skip
-    assert done.stdout.split("HEAVY")[0].split() == ["mavlink", "mavlink-params"]
+    assert done.stdout.split("HEAVY")[0].split() == ["mavlink"]
     assert done.stdout.endswith("HEAVY []\n")
 
 
@@ -73,6 +73,6 @@ def test_completion_loads_nothing_that_only_work_needs():
 def test_commands_that_match_nothing_load_no_torch(tmp_path):
     site, affine = tmp_path / "m.tif", [[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_000_000.0]]
     write_geotiff(site, np.full((500, 500), 9, np.uint8), affine, 32633)
-    printed, loaded = loaded_after([["init", f"--out={tmp_path / 's.toml'}"], ["map", "info", str(site)]])
+    printed, loaded = loaded_after([["evaluate", "--help"], ["map", "info", str(site)]])
     assert "gsd_m_per_px" in printed
     assert not loaded.intersection(MATCHING)

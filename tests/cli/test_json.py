@@ -45,7 +45,7 @@ def spoken(capsys, arguments, code):
         (["nonsense"], None, 2),
         (["demo", "--frames=x"], "--frames", 2),
         (["demo", "--frames=1"], "--frames", 2),
-        (["demo", "--device=gpu", "--out=o"], "--device", 2),
+        (["track", "--map=m", "--frames=f", "--out=o", "--device=gpu"], "--device", 2),
         (["simulate", "--out=o", "--minutes=1"], "--minutes", 2),
         (["map", "info", "m.tif"], "MAP", 1),
         (["track", "--map=m.tif", "--frames=f", "--out=o", "--telemetry=no.csv"], "--map", 1),
@@ -77,14 +77,13 @@ def test_a_url_is_repeated_as_it_was_typed(url, capsys):
 
 
 def test_files_that_commands_write_are_named(tmp_path, capsys):
-    settings = tmp_path / "s.toml"
-    assert run(["init", f"--out={settings}", "--json"]) == 0
-    printed = capsys.readouterr()
-    assert (json.loads(printed.out), printed.err) == ({"settings": str(settings)}, "")
-    assert spoken(capsys, ["init", f"--out={settings}"], 2)["argument"] == "--out"
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
     parameters = tmp_path / "p.param"
-    assert run(["bridge", "mavlink-params", f"--out={parameters}", "--delay-ms=90", "--json"]) == 0
+    assert (
+        run(["bridge", "mavlink", f"--write-params={parameters}", "--settings=parameters.delay_ms=90", "--json"])
+        == 0
+    )
     assert json.loads(capsys.readouterr().out) == {
         "parameters": str(parameters), "delay_ms": 90, "delay_source": "given"
     }  # fmt: skip
+    assert spoken(capsys, ["bridge", "mavlink", f"--write-params={parameters}"], 2)["argument"] == "--write-params"

@@ -50,15 +50,14 @@ def test_from_a_flight_to_its_export_by_what_is_said(flight, tmp_path, capsys, m
     monkeypatch.chdir(tmp_path)
     words = next_of(capsys, ["simulate", f"--out={tmp_path / 'again'}", "--frames=1"])
     assert parsed(words) == "track"
-    words = next_of(capsys, [*words, "--device=cpu"])  # what simulate said, as it stands
+    words = next_of(capsys, [*words, "--device=cpu", "--method=ncc"])  # what simulate said, as it stands
     assert parsed(words) == "export"
     words = next_of(capsys, words)
-    assert parsed(words) == "report"
+    assert parsed(words) == "evaluate"
     assert (tmp_path / "again-track" / "track.geojson").is_file()
 
 
-def test_others_name_commands_that_exist(flight, tmp_path, capsys):
-    assert parsed(next_of(capsys, ["init", f"--out={tmp_path / 's.toml'}"])) == "track"
+def test_others_name_commands_that_exist(flight, capsys):
     assert parsed(next_of(capsys, ["map", "info", str(flight / "map.tif")])) == "audit"
     assert parsed(next_of(capsys, ["doctor"])) == "demo"
 
@@ -67,12 +66,12 @@ def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, 
     names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
     given = ["check", *(f"--{option}={flight / name}" for option, name in names.items())]
     for every, looked_at in ((1, 2), (2, 1)):
-        assert run([*given, f"--every={every}", "--json"]) == 0
+        assert run([*given, f"--settings=input.every={every}", "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["looked_at"] == looked_at
-    words = next_of(capsys, [*given, "--every=2"])
+    words = next_of(capsys, [*given, "--settings=input.every=2"])
     assert parsed(words) == "track"
-    assert words[words.index("--every") + 1] == "2"
-    assert "--every" not in next_of(capsys, given)
+    assert words[words.index("--settings") + 1] == "input.every=2"
+    assert "--settings" not in next_of(capsys, given)
 
 
 @pytest.mark.parametrize(("runs", "drawn"), [(["ncc"], "comparison.png"), (["ncc", "sift"], "comparison.html")])
@@ -85,7 +84,7 @@ def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs, draw
     found = re.fullmatch(r"next: open (.+); scenematch (.+)", last)
     assert shlex.split(found[1]) == [str(out / drawn)]
     assert (out / drawn).is_file()
-    assert parsed(shlex.split(found[2])) == "init"
+    assert parsed(shlex.split(found[2])) == "track"
 
 
 @pytest.mark.parametrize(("availability", "command"), [(0.9, "export"), (0.0, "check")])
@@ -106,8 +105,8 @@ def test_a_path_with_two_spaces_stays_as_it_is(capsys):
     assert capsys.readouterr().err == "one line\n"
 
 
-def test_a_program_is_told_nothing(tmp_path, capsys):
-    assert run(["init", f"--out={tmp_path / 's.toml'}", "--json"]) == 0
+def test_a_program_is_told_nothing(capsys):
+    assert run(["doctor", "--settings", "--json"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)
     assert "next:" not in printed.err
@@ -123,7 +122,8 @@ def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_
     """An export would refuse it. By ncc every frame is refused under a heading that is 90 degrees off."""
     names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
     files = [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
-    wrong = ["--height-offset-m", "900.0", "--every", "2", "--column", "heading_deg=heading_deg+90"]
+    corrected = ("height_offset_m=900.0", "heading_deg=heading_deg+90")
+    wrong = [*(word for text in corrected for word in ("--correct", text)), "--settings", "input.every=2"]
     out = tmp_path / "out"
     words = next_of(capsys, ["track", *files, *wrong, "--out", str(out), "--method", "ncc", "--profile", "paper"])
     assert json.loads((out / "summary.json").read_text())["fixes"] == 0
@@ -132,17 +132,17 @@ def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_
     words = next_of(capsys, ["evaluate", str(out), "--truth", str(flight / "truth.csv")])
     assert parsed(words) == "check"
     assert set(files) | set(wrong) <= set(words)
-    assert parsed(next_of(capsys, ["report", str(out)])) == "check"
     words = next_of(capsys, words)
     assert parsed(words) == "track"
     assert set(files) | set(wrong) <= set(words)
 
 
-def test_compare_uses_the_settings_file_that_is_there(flight, tmp_path, capsys, monkeypatch):
+def test_compare_names_its_settings_again(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenematch.toml").touch()
     names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
     files = [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
-    words = next_of(capsys, ["compare", *files, "--out=compared", "--run=ncc"])
+    given = ["--out=compared", "--run=ncc", "--settings=scenematch.toml"]
+    words = next_of(capsys, ["compare", *files, *given])
     assert parsed(words) == "track"
     assert set(files) | {"--settings", "scenematch.toml"} <= set(words)

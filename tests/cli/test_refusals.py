@@ -12,14 +12,13 @@ from scenematch.files.telemetry import read_telemetry
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
 PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]
 ROS = ["bridge", "ros", "--map=m.tif"]
+GRAB = "input.exposure_to_grab_ms"
+REALTIME = "--settings=bridge.realtime=true"
+NO_ORIGIN = ["--settings=mavlink.set_origin=false", "--settings=mavlink.origin_alt_m=3"]
 SIMULATE = ["simulate", "--out=o"]
 TRACK = ["track", "--map=m.tif", "--camera=c.yaml", "--frames=f", "--out=o"]
 CHECK = ["check", "--map=m.tif", "--camera=c.yaml", "--frames=f"]
 LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
-COMMANDS = {
-    "bridge": PLAYED, "ros": ROS, "simulate": [*SIMULATE, "--closed-loop"], "track": TRACK, "locate": LOCATE,
-    "demo": ["demo", "--out=o"],
-}  # fmt: skip
 
 
 def said(capsys, arguments, code=2):
@@ -33,35 +32,41 @@ def said(capsys, arguments, code=2):
 @pytest.mark.parametrize(
     ("command", "option", "value"),
     [
-        *((PLAYED, "--origin-alt-m", value) for value in ("nan", "inf", "-inf", "1e9", "-10001")),
-        *((LIVE, "--exposure-to-grab-ms", value) for value in ("nan", "inf", "1e308", "-1")),
-        *((PLAYED, "--rate-hz", value) for value in ("nan", "inf", "0", "1e-300")),
-        *((command, "--deadline-ms", value) for command in (PLAYED, ROS) for value in ("nan", "0", "-1")),
-        *((command, "--map-sigma-m", value) for command in (TRACK, LOCATE) for value in ("nan", "0", "1e200")),
+        *((PLAYED, "mavlink.origin_alt_m", value) for value in ("nan", "inf", "-inf", "1e9", "-10001")),
+        *((LIVE, "input.exposure_to_grab_ms", value) for value in ("nan", "inf", "1e308", "-1")),
+        *((PLAYED, "input.rate_hz", value) for value in ("nan", "inf", "0", "1e-300")),
+        *((command, "bridge.deadline_ms", value) for command in (PLAYED, ROS) for value in ("nan", "0", "-1")),
+        *((command, "input.map_sigma_m", value) for command in (TRACK, LOCATE) for value in ("nan", "0", "1e200")),
         *((command, "--start", "48,16,1e200") for command in (PLAYED, ROS, TRACK)),
-        *((TRACK, "--log-offset-s", value) for value in ("nan", "inf", "1e10")),
-        *(([*command, "--realtime"], "--nice", value) for command in (PLAYED, ROS) for value in ("0", "5", "-21")),
+        *((TRACK, "input.log_offset_s", value) for value in ("nan", "inf", "1e10")),
         *(
-            ([*command, "--realtime"], "--cores", value)
+            ([*command, REALTIME], "bridge.nice", value)
+            for command in (PLAYED, ROS)
+            for value in ("0", "5", "-21")
+        ),
+        *(
+            ([*command, REALTIME], "bridge.cores", value)
             for command in (PLAYED, ROS)
             for value in ("x", "-1", "99999")
         ),
-        *((command, "--every", value) for command in (TRACK, CHECK, PLAYED) for value in ("0", "-3")),
-        (LOCATE, "--near", "48,16,1e200"),
+        *((command, "input.every", value) for command in (TRACK, CHECK, PLAYED) for value in ("0", "-3")),
+        (LOCATE, "--start", "48,16,1e200"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
-        *((command, "--device", "gpu") for command in COMMANDS.values()),
+        *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
         (PLAYED, "--firmware", "x"),
-        (PLAYED, "--message", "x"),
-        (PLAYED, "--max-sigma-m", "1e308"),
+        (PLAYED, "mavlink.message", "x"),
+        (PLAYED, "mavlink.max_sigma_m", "1e308"),
         (ROS, "--firmware", "x"),
     ],
 )
 def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, tmp_path, monkeypatch, capsys):
-    if option in ("--firmware", "--message", "--max-sigma-m"):
+    if option in ("--firmware", "mavlink.message", "mavlink.max_sigma_m"):
         pytest.importorskip("pymavlink", reason="pymavlink is not installed")
     monkeypatch.chdir(tmp_path)
-    assert said(capsys, [*command, f"{option}={value}"]).startswith(f"{option}: expected ")
+    name = option if option.startswith("--") else f"--settings {option}"
+    given = [f"{option}={value}"] if name == option else ["--settings", f"{option}={value}"]
+    assert said(capsys, [*command, *given]).startswith(f"{name}: expected ")
     assert not list(tmp_path.iterdir())
 
 
@@ -69,13 +74,16 @@ def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, t
     ("command", "option", "wanted"),
     [
         ([*LIVE, "--telemetry=t.csv"], "--telemetry", "--frames"),
-        ([*LIVE, "--rate-hz=3"], "--rate-hz", "--frames"),
-        ([*LIVE, "--every=3"], "--every", "--frames"),
-        ([*PLAYED, "--exposure-to-grab-ms=3"], "--exposure-to-grab-ms", "--camera-source"),
-        ([*PLAYED, "--nice=-5"], "--nice", "--realtime"),
-        ([*ROS, "--cores=0"], "--cores", "--realtime"),
-        ([*PLAYED, "--no-set-origin", "--origin-alt-m=3"], "--origin-alt-m", "--set-origin"),
-        ([*SIMULATE, "--device=cpu"], "--device", "--closed-loop"),
+        ([*LIVE, "--settings=input.rate_hz=3"], "--settings input.rate_hz", "--frames"),
+        ([*LIVE, "--settings=input.every=3"], "--settings input.every", "--frames"),
+        (
+            [*PLAYED, "--settings=input.exposure_to_grab_ms=3"],
+            "--settings input.exposure_to_grab_ms",
+            "--camera-source",
+        ),
+        ([*PLAYED, "--settings=bridge.nice=-5"], "--settings bridge.nice", "--settings bridge.realtime"),
+        ([*ROS, "--settings=bridge.cores=0"], "--settings bridge.cores", "--settings bridge.realtime"),
+        ([*PLAYED, *NO_ORIGIN], "--settings mavlink.origin_alt_m", "--settings mavlink.set_origin"),
         ([*SIMULATE, "--minutes=1"], "--minutes", "--closed-loop"),
     ],
 )
@@ -84,7 +92,10 @@ def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, ca
 
 
 def test_a_topic_is_of_a_bag(capsys):
-    assert said(capsys, [*TRACK, "--image-topic=/down"]) == "--image-topic: expected a bag as frames, got f\n"
+    assert (
+        said(capsys, [*TRACK, "--settings=input.image_topic=/down"])
+        == "--settings input.image_topic: expected a bag as frames, got f\n"
+    )
 
 
 @pytest.mark.parametrize("source", ["9" * 20, "9" * 5000, "7", "²", "no-such-file.mp4"])
@@ -123,4 +134,6 @@ def test_an_audit_names_its_options(tmp_path, capsys):
     write_geotiff(tmp_path / "m.tif", np.full((500, 500), 9, np.uint8), affine, 32633)
     audit = ["map", "audit", str(tmp_path / "m.tif"), f"--out={tmp_path / 'o'}"]
     assert said(capsys, [*audit, "--height-agl=-1"]).startswith("--height-agl: expected metres above 0")
-    assert said(capsys, [*audit, "--sigma-m=-1"]).startswith("--sigma-m: expected a number above 0")
+    assert said(capsys, [*audit, "--settings=audit.prior_sigma_m=-1"]).startswith(
+        "--settings audit.prior_sigma_m: expected a number above 0"
+    )

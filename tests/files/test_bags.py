@@ -283,10 +283,19 @@ def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
 
 def test_an_odometrys_topic_needs_a_bag(tmp_path, capsys):
     for command in ("track", "check", "compare"):
-        given = ["--map", "m.tif", "--frames", "f", "--telemetry", "t.csv", "--odometry-topic", "/vio"]
+        given = [
+            "--map",
+            "m.tif",
+            "--frames",
+            "f",
+            "--telemetry",
+            "t.csv",
+            "--settings",
+            "input.odometry_topic=/vio",
+        ]
         out = [] if command == "check" else ["--out", str(tmp_path / "out")]
         assert main([command, *given, *out]) == 2
-        assert "--odometry-topic: expected a bag as telemetry, got t.csv" in capsys.readouterr().err
+        assert "--settings input.odometry_topic: expected a bag as telemetry, got t.csv" in capsys.readouterr().err
 
 
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):

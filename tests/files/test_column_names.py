@@ -13,6 +13,7 @@ from scenematch.files.column_names import likely
 from scenematch.files.settings import changed, nested, options_from_mapping
 from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.settings import TrackSettings, load_settings
 
 OTHERS = "time_us,Image Name,altitude_agl [m],Yaw,Latitude,Longitude,battery\n0,0.png,120.5,-90,48.5,16.5,99\n"
@@ -125,18 +126,20 @@ def test_a_run_reads_them_by_its_settings(tmp_path):
     for k in range(2):
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.png")
     table = database_export(tmp_path / "export.csv")
-    files = FlightFiles(map="none.tif", frames=tmp_path / "frames", telemetry=table, hfov_deg=60.0)
+    files = FlightFiles.from_flat(map="none.tif", frames=tmp_path / "frames", telemetry=table, hfov_deg=60.0)
     flight = files.open_flight({"timestamp_utc": "time", "frame": "image", "height_agl_m": "agl"})
     assert [row.timestamp_ns for row in flight.rows] == [1_777_636_800_000_000_000, 1_777_636_800_500_000_000]
     assert [row.height_agl_m for row in flight.rows] == [120.5, 121.5]
     assert flight.remarks == []
     with pytest.raises(OptionError, match="telemetry_columns: expected a table as telemetry, got None"):
-        FlightFiles(map="none.tif", frames=tmp_path / "frames", hfov_deg=60.0).open_flight({"frame": "image"})
+        FlightFiles.from_flat(map="none.tif", frames=tmp_path / "frames", hfov_deg=60.0).open_flight(
+            {"frame": "image"}
+        )
 
 
 def test_runs_of_one_flight_name_the_same(tmp_path, monkeypatch):
-    monkeypatch.setattr(FlightFiles, "open_map", lambda self, progress: None)
-    files = FlightFiles(map="none.tif", frames=tmp_path, hfov_deg=60.0)
+    monkeypatch.setattr(MapInput, "open", lambda self, progress: None)
+    files = FlightFiles.from_flat(map="none.tif", frames=tmp_path, hfov_deg=60.0)
     runs = [TrackSettings(), TrackSettings(telemetry_columns={"frame": "image"})]
     with pytest.raises(OptionError, match="telemetry_columns: expected the same of all runs"):
         open_inputs(files, runs)

@@ -554,7 +554,8 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
     rows = read_telemetry(table)
     lines = [f"{row.timestamp_ns - 500_000_000},{row.frame}" for row in rows]
     stamps.write_text("\n".join(["timestamp_ns,frame", *lines]) + "\n", encoding="utf-8")
-    stated = ["--frame-stamps", str(stamps), "--log-offset-s", "0.5", "--map-sigma-m", "2"]
+    said = (f"frame_stamps={stamps}", "log_offset_s=0.5", "map_sigma_m=2")
+    stated = [word for text in said for word in ("--settings", f"input.{text}")]
     assert follow("stated", "--telemetry", log, "--truth", log, *stated) == 0
     page, summary = (tmp_path / "stated" / name for name in ("report.html", "summary.json"))
     before = page.read_bytes(), summary.read_bytes()
@@ -563,5 +564,8 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
     assert run(["evaluate", str(tmp_path / "stated")]) == 0
     assert (page.read_bytes(), summary.read_bytes()) == before
     capfd.readouterr()
-    assert follow("no", "--telemetry", table, "--log-offset-s", "1") == 2
-    assert "--frame-stamps, --log-offset-s: expected a log as telemetry, got" in capfd.readouterr().err
+    assert follow("no", "--telemetry", table, "--settings", "input.log_offset_s=1") == 2
+    assert (
+        "--settings input.frame_stamps, --settings input.log_offset_s: expected a log as telemetry, got"
+        in capfd.readouterr().err
+    )

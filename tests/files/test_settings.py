@@ -44,14 +44,14 @@ def test_every_field_that_a_file_can_hold_is_explained():
 def test_values_arrive(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
-        'method = "auto"\n[ncc]\nmargin = 2\n[ncc.rule]\nmin_sigmas = 6.5\n[sift]\nmax_turn_deg = "none"\n',
+        'method = "sift"\n[ncc]\nmargin = 2\n[ncc.rule]\nmin_sigmas = 6.5\n[sift]\nmax_turn_deg = "none"\n',
         encoding="utf-8",
     )
     found = read_settings(path, TrackSettings)
-    assert (found.method, found.ncc.margin, found.ncc.rule.min_sigmas) == ("auto", 2.0, 6.5)
+    assert (found.method, found.ncc.margin, found.ncc.rule.min_sigmas) == ("sift", 2.0, 6.5)
     assert found.sift.max_turn_deg is None
     assert changed(found) == {
-        "method": "auto",
+        "method": "sift",
         "ncc.margin": 2.0,
         "ncc.rule.min_sigmas": 6.5,
         "sift.max_turn_deg": None,

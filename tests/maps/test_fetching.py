@@ -21,6 +21,7 @@ from scenematch.fetch import pictures
 from scenematch.fetch.heights import files_for
 from scenematch.fetch.urls import shown
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.simulation import write_flight
 from scenematch.runs.single_image import locate_image
 from scenematch.simulator import plan_flight
@@ -229,8 +230,8 @@ def test_a_frame_is_located_over_a_fetched_map_as_over_the_map_itself(tmp_path, 
     site, fixes = OrthoMap.open(tmp_path / "map.tif"), {}
     for name in ("map", "wms", "tiles"):
         fix = locate_image(
-            tmp_path / "frames" / row["frame"], tmp_path / f"{name}.tif", tmp_path / "camera.yaml",
-            surface=tmp_path / "dsm.tif", method="ncc", near=f"{around},20",
+            tmp_path / "frames" / row["frame"], MapInput(tmp_path / f"{name}.tif", surface=tmp_path / "dsm.tif"),
+            tmp_path / "camera.yaml", method="ncc", start=f"{around},20",
             height_agl_m=float(row["height_agl_m"]), heading_deg=float(row["heading_deg"]),
         )  # fmt: skip
         assert isinstance(fix, Fix), (name, fix)
@@ -463,7 +464,7 @@ def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
     out = tmp_path / "map.tif"
     given = [
         "map", "fetch", f"--around={middle}", "--radius-m=50", f"--source={server.url}/wms", f"--out={out}",
-        "--pause-ms=0", "--json",
+        "--settings=fetch.pause_ms=0", "--json",
     ]  # fmt: skip
     assert run([*given, "--dry-run"]) == 0
     planned = json.loads(capsys.readouterr().out)
@@ -477,8 +478,8 @@ def test_the_command_says_what_it_does(server, middle, tmp_path, capsys):
     assert run(given) == 2
     found = json.loads(capsys.readouterr().out)
     assert (found["argument"], "exists" in found["error"]) == ("--out", True)
-    assert run([*given, "--force", "--max-tiles=1", "--radius-m=150"]) == 2
-    assert "--max-tiles: expected at most 1 tiles" in capsys.readouterr().err
+    assert run([*given, "--force", "--settings=fetch.max_tiles=1", "--radius-m=150"]) == 2
+    assert "--settings fetch.max_tiles: expected at most 1 tiles" in capsys.readouterr().err
 
 
 def test_around_photographs_the_map_holds_what_they_saw_as_fine_as_their_height_needs(server, tmp_path):

@@ -159,19 +159,14 @@ def test_the_method_without_weights_says_which_it_takes(ground, camera):
         SceneMatcher(ground.site, camera, "learned", "cpu")
 
 
-def test_weights_belong_to_the_learned_method(tmp_path):
-    with pytest.raises(OptionError, match="weights: expected them with method learned, got method 'ncc'"):
-        load_settings(None, weights=["w.pth"])
-    with pytest.raises(OptionError, match="weights: expected them with a run by learned, got ncc"):
-        parse_runs(["ncc"], weights=["w.pth"])
-    assert parse_runs(["ncc", "learned"], weights=["w.pth"])["learned"].learned.weights == (
-        str(Path("w.pth").resolve()),
-    )
+def test_weights_are_a_setting(tmp_path):
+    runs = parse_runs(["ncc", "learned"], settings=["learned.weights=w.pth"])
+    assert runs["learned"].learned.weights == (str(Path("w.pth").resolve()),)
     with pytest.raises(OptionError, match="expected ncc or sift with `profile` paper, got 'learned'"):
         TrackSettings(method="learned", profile="paper")
     path = tmp_path / "s.toml"
     path.write_text('method = "learned"\n[learned]\nweights = ["a.pth", "b.pth"]\n')
-    assert load_settings(path).learned.weights == ("a.pth", "b.pth")
+    assert load_settings(path).learned.weights == tuple(str(Path(name).resolve()) for name in ("a.pth", "b.pth"))
 
 
 def test_settings_of_the_learned_method_are_checked():

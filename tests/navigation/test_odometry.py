@@ -332,6 +332,6 @@ def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
 
 def test_it_is_asked_for_by_a_setting_and_not_with_the_papers_recipe():
     assert not TrackSettings().navigator.odometry
-    assert load_settings(None, odometry=True).navigator.odometry
+    assert load_settings("navigator.odometry=true").navigator.odometry
     with pytest.raises(OptionError, match=r"^odometry: expected with `profile` engine"):
-        load_settings(None, odometry=True, profile="paper")
+        load_settings("navigator.odometry=true", profile="paper", method="ncc")

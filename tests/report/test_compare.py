@@ -99,12 +99,27 @@ def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_pat
     monkeypatch.setattr("scenematch.runs.comparison.compare", lambda files, *_, **__: compared.append(files) or {})
     monkeypatch.setattr("scenematch.cli.tables.print_comparison", lambda *_: None)
     log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
-    options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}", f"--frame-stamps={stamps}"]
-    assert run(command(flight, tmp_path, *options, "--log-offset-s=-1.5", "--image-topic=/down")) == 0
+    options = [
+        f"--frames={tmp_path / 'flight.bag'}",
+        f"--telemetry={log}",
+        f"--settings=input.frame_stamps={stamps}",
+    ]
+    assert (
+        run(
+            command(
+                flight,
+                tmp_path,
+                *options,
+                "--settings=input.log_offset_s=-1.5",
+                "--settings=input.image_topic=/down",
+            )
+        )
+        == 0
+    )
     assert (compared[0].clock(), compared[0].image_topic) == (LogClock(stamps, -1.5), "/down")
     assert run(command(flight, tmp_path)) == 0
     assert (compared[1].has_clock, compared[1].image_topic) == (False, None)
-    assert run(command(flight, tmp_path, "--log-offset-s=2")) == 2  # telemetry.csv is no log
+    assert run(command(flight, tmp_path, "--settings=input.log_offset_s=2")) == 2  # telemetry.csv is no log
 
 
 def test_the_usual_runs_are_table_one():
@@ -140,7 +155,7 @@ def test_what_the_command_line_gives_holds_for_every_run(tmp_path):
 @pytest.mark.slow
 def test_a_chart_without_truth_and_without_a_single_fix(flight, tmp_path):
     out = tmp_path / "late"
-    assert run(command(flight, out, "--run=ncc", "--budget-ms=0.001")) == 0
+    assert run(command(flight, out, "--run=ncc", "--settings=budget_ms=0.001")) == 0
     rows = read_track(out / "ncc" / "track.csv")
     draw_comparison(tmp_path / "none.png", {"ncc": rows}, None)
     chart = picture(tmp_path / "none.png")

@@ -42,19 +42,14 @@ def moved(finished, tmp_path):
 def test_a_page_loses_frames_that_were_moved_only_where_it_may(moved, capsys):
     before = (moved / PAGE).read_text(encoding="utf-8")
     assert 'id="slider"' in before
-    assert run(["report", str(moved)]) == 2
+    assert run(["evaluate", str(moved)]) == 2
     said = capsys.readouterr().err
-    assert re.search(r"RUN.*: .*report\.html shows frames, which are lost .* add --force to do so; .*frames", said)
+    assert re.search(r"DIR.*: .*report\.html shows frames, which are lost .* add --force to do so; .*frames", said)
     assert (moved / PAGE).read_text(encoding="utf-8") == before
-    assert run(["report", str(moved), "--force"]) == 0
+    assert run(["evaluate", str(moved), "--force"]) == 0
     assert "report.html loses the frames that it showed: " in capsys.readouterr().err
     assert 'id="slider"' not in (moved / PAGE).read_text(encoding="utf-8")
-    assert run(["report", str(moved)]) == 0  # there is nothing more to lose
-
-
-def test_evaluate_says_what_its_page_loses(moved, capsys):
-    assert run(["evaluate", str(moved)]) == 0
-    assert "report.html loses the frames that it showed: " in capsys.readouterr().err
+    assert run(["evaluate", str(moved)]) == 0  # there is nothing more to lose
 
 
 def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(finished, tmp_path):
@@ -63,8 +58,8 @@ def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(finished, tmp
     blank = [line if k == 0 else "," + line.partition(",")[2] for k, line in enumerate(rows)]
     (other / "track.csv").write_text("\n".join(blank) + "\n", encoding="utf-8")
     third, alike, mixed = shutil.copytree(other, tmp_path / "c"), tmp_path / "alike.html", tmp_path / "mixed.html"
-    assert run(["report", str(finished / "out"), str(third), f"--out={mixed}"]) == 0
-    assert run(["report", str(other), str(third), f"--out={alike}"]) == 0
+    assert run(["evaluate", str(finished / "out"), str(third), f"--out={mixed}"]) == 0
+    assert run(["evaluate", str(other), str(third), f"--out={alike}"]) == 0
     assert "Stated sigma (m)" in alike.read_text(encoding="utf-8")
     assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
 
@@ -75,5 +70,5 @@ def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_dra
     other = shutil.copytree(finished / "out", tmp_path / "other")
     monkeypatch.setattr("scenematch.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
     page = tmp_path / "nofolder" / "x.html"
-    assert run(["report", str(finished / "out"), str(other), f"--out={page}"]) == 2
+    assert run(["evaluate", str(finished / "out"), str(other), f"--out={page}"]) == 2
     assert f"--out: expected a file in a folder that exists, got {page}" in capsys.readouterr().err

@@ -192,7 +192,7 @@ def matcher(sim_site, sim_flight):
 @pytest.mark.usefixtures("bare_runs")
 def test_the_closed_loop_is_recorded_frame_by_frame(tmp_path, capsys):
     recording, out = tmp_path / "loop.rrd", tmp_path / "out"
-    command = ["simulate", "--closed-loop", "--minutes", "0.1", "--method", "ncc", "--device", "cpu"]
+    command = ["simulate", "--closed-loop", "--minutes", "0.1", "--method", "ncc"]
     assert run([*command, "--out", str(out), "--rerun", str(recording)]) == 0
     track, rows = read_track(out / "track.csv"), rows_of(recording)
     assert sorted(rows["frame"]) == list(range(len(track)))
@@ -294,12 +294,12 @@ def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path,
     )
     code, (line,) = refusal(capsys, "--rerun", "view.rec")
     assert (code, line) == (2, "scenematch: --rerun: expected a file that ends in .rrd, got view.rec")
-    for address in ("here", "here:port", ":9876", "here:70000"):
-        code, (line,) = refusal(capsys, "--rerun-connect", address)
-        assert (code, line) == (2, f"scenematch: --rerun-connect: expected HOST:PORT, got {address!r}")
+    for address in ("here:port", ":9876", "here:70000"):
+        code, (line,) = refusal(capsys, "--rerun", address)
+        assert (code, line) == (2, f"scenematch: --rerun: expected HOST:PORT, got {address!r}")
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
-        code, (line,) = refusal(capsys, "--rerun-connect", f"127.0.0.1:{taken.getsockname()[1]}")
+        code, (line,) = refusal(capsys, "--rerun", f"127.0.0.1:{taken.getsockname()[1]}")
     assert code == 1
     assert "no viewer listens" in line
     assert "rerun --bind 127.0.0.1" in line

@@ -49,7 +49,7 @@ def thinned(source, target):
 def followed(flight, out, method="ncc", **given):
     """A run over a shared flight, begun at its true place."""
     first = read_truth(flight / "truth.csv")[0]
-    files = FlightFiles(
+    files = FlightFiles.from_flat(
         map=flight / "map.tif",
         camera=flight / "camera.yaml",
         telemetry=thinned(flight / "telemetry.csv", out.with_name(f"{out.name}-telemetry") / "telemetry.csv"),

@@ -299,7 +299,7 @@ def test_without_the_frames_the_page_says_so(flown, again):
     record = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     record["settings"]["frames"] = str(again / "gone")
     (again / "summary.json").write_text(json.dumps(record), encoding="utf-8")
-    evaluate(again, None)
+    evaluate(again, None, force=True)
     assert data_of(again / "report.html")["frames"] == []
     assert "No frames are shown" in (again / "report.html").read_text(encoding="utf-8")
 

@@ -22,4 +22,4 @@ def test_a_mount_is_written_where_there_is_a_calibration_or_can_be():
 @pytest.mark.parametrize("text", [LINE + IN_CALIBRATION, "--mount nadir-tail"])
 def test_beside_a_gimbal_its_angles_are_corrected(text):
     assert cure(text, gimbal=True).startswith("beside a gimbal's angles no mount is set: correct the angles")
-    assert cure("--angles radians", gimbal=True, cause="radians") == "--angles radians"
+    assert cure("--correct angles=radians", gimbal=True, cause="radians") == "--correct angles=radians"

@@ -16,9 +16,10 @@ from scenematch.cli.app import run
 from scenematch.files.corrections import Corrections
 from scenematch.files.flight import camera_info
 from scenematch.files.geotiff import write_geotiff
+from scenematch.runs.cameras import CameraInput
 from scenematch.runs.checks import check_pictures
 from scenematch.runs.evaluation import recorded_files
-from scenematch.runs.inputs import open_map
+from scenematch.runs.map_input import MapInput
 from scenematch.runs.record import RunRecord
 from tests.support.photos import gimbal, photograph
 from tests.support.videos import write_video
@@ -41,50 +42,50 @@ def shot(tmp_path):
 
 
 def test_a_picture_is_placed_by_edges_in_the_units_of_its_crs(shot):
-    site = open_map(shot, bounds=f"{WEST},{NORTH - 30},{WEST + 40},{NORTH}", crs=UTM)
+    site = MapInput(shot, map_bounds=f"{WEST},{NORTH - 30},{WEST + 40},{NORTH}", map_crs=UTM).open()
     assert (site.width_px, site.height_px) == (80, 60)
     assert site.gsd_m_per_px == pytest.approx(0.5, rel=1e-3)
     west, south, east, north = site.bounds_deg
-    again = open_map(shot, bounds=f"{west},{south},{east},{north}")  # degrees, which need no CRS
+    again = MapInput(shot, map_bounds=f"{west},{south},{east},{north}").open()  # degrees, which need no CRS
     middles = [(each.frame.lat_deg, each.frame.lon_deg) for each in (site, again)]
     assert middles[0] == pytest.approx(middles[1], abs=5e-6)  # a copy on a metric grid is up to a pixel wider
 
 
 def test_edges_in_degrees_stay_degrees_with_a_projected_crs(shot):
-    site = open_map(shot, bounds="16.0,48.0,16.001,48.0005018", crs="EPSG:3857")
+    site = MapInput(shot, map_bounds="16.0,48.0,16.001,48.0005018", map_crs="EPSG:3857").open()
     assert site.bounds_deg == pytest.approx((16.0, 48.0, 16.001, 48.0005018), abs=1e-7)
 
 
 def test_a_geotiff_that_names_no_crs_is_given_one(tmp_path):
     path = tmp_path / "map.tif"
     write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
-    named = open_map(path)
+    named = MapInput(path).open()
     from rasterio import open as open_raster
     from rasterio.crs import CRS
 
     with open_raster(path, "r+") as dataset:
         dataset.crs = CRS()
     with pytest.raises(MapError, match=r"names no CRS; give `map_crs`, such as EPSG:32636"):
-        open_map(path)
-    assert open_map(path, crs=UTM).bounds_deg == pytest.approx(named.bounds_deg, abs=1e-9)
+        MapInput(path).open()
+    assert MapInput(path, map_crs=UTM).open().bounds_deg == pytest.approx(named.bounds_deg, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"bounds": "16,48,17"}, "map_bounds: expected W,S,E,N in degrees or in `map_crs`, got '16,48,17'"),
-        ({"bounds": "17,48,16,49"}, "map_bounds: expected west before east and south before north"),
-        ({"bounds": "16,48,17,49", "crs": UTM}, "map_bounds: the corners are no rectangle in crs"),
-        ({"bounds": "16,48,17,49", "crs": "EPSG:5"}, "map_crs: expected"),
+        ({"map_bounds": "16,48,17"}, "map_bounds: expected W,S,E,N in degrees or in `map_crs`, got '16,48,17'"),
+        ({"map_bounds": "17,48,16,49"}, "map_bounds: expected west before east and south before north"),
+        ({"map_bounds": "16,48,17,49", "map_crs": UTM}, "map_bounds: the corners are no rectangle in crs"),
+        ({"map_bounds": "16,48,17,49", "map_crs": "EPSG:5"}, "map_crs: expected"),
         (
-            {"bounds": "598000,5341970,598040,5342000"},
+            {"map_bounds": "598000,5341970,598040,5342000"},
             "map_bounds: expected west < east and south < north in degrees",
         ),
     ],
 )
 def test_edges_that_place_no_picture_are_wrong_usage(shot, options, words):
     with pytest.raises(OptionError) as caught:
-        open_map(shot, **options)
+        MapInput(shot, **options).open()
     assert str(caught.value).startswith(words)
 
 
@@ -92,9 +93,9 @@ def test_a_map_with_a_place_of_its_own_refuses_another(tmp_path):
     path = tmp_path / "map.tif"
     write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
     with pytest.raises(OptionError, match="map_bounds: expected none for a file with a georeference of its own"):
-        open_map(path, bounds="16,48,17,49")
+        MapInput(path, map_bounds="16,48,17,49").open()
     with pytest.raises(OptionError, match="map_crs: expected none, since"):
-        open_map(path, crs="EPSG:32634")
+        MapInput(path, map_crs="EPSG:32634").open()
 
 
 def test_the_command_line_names_its_options(shot, capsys):
@@ -128,7 +129,9 @@ def test_the_camera_is_that_of_the_photographs_or_of_a_field_of_view(photos):
     assert own.focal_px == pytest.approx(400.0 * 24.0 / np.hypot(36.0, 24.0))
     assert np.allclose(own.mount, mount_rotation())
     given = load(
-        FlightFiles(map="m.tif", frames=photos, hfov_deg=90.0, mount="nadir-tail", camera_pitch_deg=-70.0)
+        FlightFiles.from_flat(
+            map="m.tif", frames=photos, hfov_deg=90.0, mount="nadir-tail", camera_pitch_deg=-70.0
+        )
     )
     assert given.focal_px == pytest.approx(160.0)
     assert np.allclose(given.mount, mount_rotation("nadir-tail", -70.0))
@@ -137,7 +140,7 @@ def test_the_camera_is_that_of_the_photographs_or_of_a_field_of_view(photos):
 def test_a_mount_counts_more_than_the_calibrations(photos, tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(camera_info(Camera.from_fov(320, 240, 60.0)))
-    camera = load(FlightFiles(map="m.tif", frames=photos, camera=path, mount="forward-45"))
+    camera = load(FlightFiles.from_flat(map="m.tif", frames=photos, camera=path, mount="forward-45"))
     assert camera.focal_px == pytest.approx(160.0 / np.tan(np.radians(30.0)))
     assert np.allclose(camera.mount, mount_rotation("forward-45"))
 
@@ -146,9 +149,9 @@ def test_where_a_gimbal_says_where_the_camera_looks_a_mount_is_refused(tmp_path)
     photograph(tmp_path / "a.jpg", xmp=gimbal(), tags={FOCAL_35MM: 24})
     load(FlightFiles(map="m.tif", frames=tmp_path))
     with pytest.raises(CalibrationError, match="mount: expected nadir, since the telemetry has the angles"):
-        load(FlightFiles(map="m.tif", frames=tmp_path, mount="nadir-tail"))
+        load(FlightFiles.from_flat(map="m.tif", frames=tmp_path, mount="nadir-tail"))
     photograph(tmp_path / "a.jpg", xmp=gimbal("+0.0", "+0.0", "+0.0"), tags={FOCAL_35MM: 24})
-    load(FlightFiles(map="m.tif", frames=tmp_path, mount="nadir-tail"))
+    load(FlightFiles.from_flat(map="m.tif", frames=tmp_path, mount="nadir-tail"))
 
 
 @pytest.mark.parametrize(
@@ -163,7 +166,7 @@ def test_where_a_gimbal_says_where_the_camera_looks_a_mount_is_refused(tmp_path)
 )
 def test_what_says_nothing_of_a_camera_is_wrong_usage(options, words):
     with pytest.raises(OptionError, match=words):
-        FlightFiles(**{"map": "m.tif", "frames": "f"} | options)
+        FlightFiles.from_flat(**{"map": "m.tif", "frames": "f"} | options)
 
 
 def test_pictures_without_exif_need_a_camera(tmp_path):
@@ -171,7 +174,7 @@ def test_pictures_without_exif_need_a_camera(tmp_path):
     with pytest.raises(CalibrationError, match=r"1\.png: expected a focal length .* give `hfov_deg` or `camera`"):
         load(FlightFiles(map="m.tif", frames=tmp_path))
     with pytest.raises(OptionError, match="mount: expected one of"):
-        BridgeFiles(map="m.tif", camera="c.yaml", camera_source="0", mount="side")
+        BridgeFiles(map=MapInput("m.tif"), camera_source="0", camera=CameraInput("c.yaml", mount="side"))
 
 
 @pytest.mark.parametrize(
@@ -187,43 +190,45 @@ def test_a_bridge_refuses_a_camera_without_a_calibration_and_a_video_as_one(tmp_
     video = tmp_path / "DJI_0001.mp4"
     video.touch()
     with pytest.raises(OptionError, match=words):
-        BridgeFiles(map="m.tif", camera_source=str(video), **options)
+        BridgeFiles(map=MapInput("m.tif"), camera_source=str(video), camera=CameraInput(**options))
 
 
 def test_a_live_camera_by_its_field_of_view_has_the_size_of_its_first_picture(tmp_path):
     picture, messages = tmp_path / "1.jpg", []
     Image.fromarray(noise()).save(picture)
     source = f"exec:{shlex.join(['cat', str(picture)])}"
-    files = BridgeFiles(map="m.tif", camera_source=source, hfov_deg=90.0, mount="nadir-tail")
+    files = BridgeFiles(
+        map=MapInput("m.tif"), camera_source=source, camera=CameraInput(hfov_deg=90.0, mount="nadir-tail")
+    )
     camera = files.load_camera(SimpleNamespace(message=messages.append))
     assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (80, 60, pytest.approx(40.0))
     assert np.array_equal(camera.mount, mount_rotation("nadir-tail"))
     assert messages[-1] == "camera: 80 x 60, 90 degrees wide"
-    silent = BridgeFiles(map="m.tif", camera_source="exec:true", hfov_deg=90.0)
+    silent = BridgeFiles(map=MapInput("m.tif"), camera_source="exec:true", camera=CameraInput(hfov_deg=90.0))
     with pytest.raises(TelemetryError, match="camera_source: expected pictures, got none"):
         silent.load_camera()
 
 
 def test_a_live_camera_that_gives_no_picture_is_not_waited_for_without_end(monkeypatch):
     monkeypatch.setattr("scenematch.bridges.pictures._FIRST_PICTURE_S", 0.1)
-    files = BridgeFiles(map="m.tif", camera_source="exec:sleep 60", hfov_deg=90.0)
+    files = BridgeFiles(map=MapInput("m.tif"), camera_source="exec:sleep 60", camera=CameraInput(hfov_deg=90.0))
     with pytest.raises(TelemetryError, match=r"camera_source: expected a picture within 0\.1 s, got none"):
         files.load_camera()
 
 
 def test_the_delay_of_a_camera_needs_to_know_its_lens(capsys):
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
-    command = ["bridge", "camera-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
+    command = ["bridge", "mavlink", "--measure-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
     assert run(command) == 2
     assert "--camera: expected a calibration, or --hfov-deg" in capsys.readouterr().err
 
 
 def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_path):
     Image.fromarray(noise()).save(tmp_path / "1.png")
-    wide = BridgeFiles(map="m.tif", frames=tmp_path, hfov_deg=90.0).load_camera()
+    wide = BridgeFiles(map=MapInput("m.tif"), frames=tmp_path, camera=CameraInput(hfov_deg=90.0)).load_camera()
     assert (wide.width_px, wide.height_px, wide.matrix[0, 0]) == (80, 60, pytest.approx(40.0))
     with pytest.raises(CalibrationError, match=r"1\.png: expected a focal length"):
-        BridgeFiles(map="m.tif", frames=tmp_path).load_camera()
+        BridgeFiles(map=MapInput("m.tif"), frames=tmp_path).load_camera()
 
 
 def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
@@ -231,7 +236,7 @@ def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
     write_video(path, [40 * k for k in range(3)], codec="mp4v")
     cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: 80.0]\n\n"
     (tmp_path / "DJI_0001.SRT").write_text("".join(cue.format(n=k + 1, ms=40 * k) for k in range(3)))
-    files = FlightFiles(map="m.tif", frames=path, hfov_deg=70.0)
+    files = FlightFiles.from_flat(map="m.tif", frames=path, hfov_deg=70.0)
     assert files.telemetry == tmp_path / "DJI_0001.SRT"
     assert [row.height_agl_m for row in files.open_flight().rows] == [80.0] * 3
     assert load(files).width_px == 64
@@ -246,14 +251,16 @@ def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     (tmp_path / "DJI_0002.SRT").write_text("".join(cues))
     late = Corrections(offset_s=0.04)  # by one frame, which only all of the rows can say
     named = {"map": "m.tif", "frames": path, "hfov_deg": 70.0}
-    whole, part = FlightFiles(**named), FlightFiles(**named, every=3, corrections=late)
+    whole, part = FlightFiles.from_flat(**named), FlightFiles.from_flat(**named, every=3, corrections=late)
     assert len(whole.open_flight()) == 8
     flight = part.open_flight()
     assert (flight.names, flight.heights, flight.unused) == (["0", "3", "6"], {"take-off": 3}, 0)
     assert [item.frame.timestamp_ns for item in flight] == [0, 120_000_000, 240_000_000]
     assert [item.frame.height_agl_m for item in flight] == pytest.approx([80.0, 84.0, 105.0])
     assert [item.frame.image.mean() for item in flight] == pytest.approx([0.0, 90.0, 180.0], abs=3.0)
-    unstamped = FlightFiles(map="m.tif", frames=path.rename(tmp_path / "bare.avi"), hfov_deg=70.0, every=3)
+    unstamped = FlightFiles.from_flat(
+        map="m.tif", frames=path.rename(tmp_path / "bare.avi"), hfov_deg=70.0, every=3
+    )
     assert [item.name for item in unstamped.open_flight()] == ["0", "3", "6"]
 
 
@@ -265,7 +272,9 @@ def test_one_frame_in_none_is_refused(every):
 
 
 def test_a_record_gives_the_same_files(photos):
-    files = FlightFiles(map="/m.tif", frames=photos, hfov_deg=70.0, mount="nadir-left", camera_pitch_deg=-80.0)
+    files = FlightFiles.from_flat(
+        map="/m.tif", frames=photos, hfov_deg=70.0, mount="nadir-left", camera_pitch_deg=-80.0
+    )
     record = RunRecord(
         map="/m.tif", surface=None, frames=str(photos), truth=None, hfov_deg=70.0, mount="nadir-left",
         camera_pitch_deg=-80.0, method="ncc", profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0},
@@ -273,7 +282,7 @@ def test_a_record_gives_the_same_files(photos):
     )  # fmt: skip
     assert recorded_files(record) == files
     some = replace(record, frames="/f.bag", camera="/f.bag", hfov_deg=None, odometry_topic="/vio", every=3)
-    files = FlightFiles(
+    files = FlightFiles.from_flat(
         map="/m.tif", frames="/f.bag", odometry_topic="/vio", every=3, mount="nadir-left", camera_pitch_deg=-80.0
     )
     assert recorded_files(some) == files
@@ -296,7 +305,9 @@ def calibration(tmp_path):
 
 
 def test_a_calibration_is_scaled_on_request_and_said(photos, calibration):
-    files = FlightFiles(map="m.tif", frames=photos, camera=calibration, scale_calibration=True, mount="nadir-tail")
+    files = FlightFiles.from_flat(
+        map="m.tif", frames=photos, camera=calibration, scale_calibration=True, mount="nadir-tail"
+    )
     messages = []
     progress = SimpleNamespace(message=messages.append)
     camera = files.load_camera(files.open_flight(), progress)
@@ -320,14 +331,14 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
     write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
     arguments = ["locate", str(photos / "0.jpg"), "--map", str(path), "--camera", str(calibration)]
     assert run(arguments) == 1
-    assert "made smaller or larger as a whole, add --scale-calibration" in capsys.readouterr().err
+    assert "made smaller or larger as a whole, add --settings input.scale_calibration" in capsys.readouterr().err
 
 
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
     with pytest.raises(OptionError, match="scale_calibration: expected with `camera`"):
-        FlightFiles(map="m.tif", frames=photos, scale_calibration=True)
+        FlightFiles.from_flat(map="m.tif", frames=photos, scale_calibration=True)
     calibration.write_text(calibration.read_text().replace("480", "360"), encoding="utf-8")
-    files = FlightFiles(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
+    files = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
     with pytest.raises(CalibrationError, match="a part may have been cut off"):
         load(files)
     unscaled = FlightFiles(map="m.tif", frames=photos, camera=calibration)
@@ -337,7 +348,7 @@ def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
 
 
 def test_a_record_gives_the_scaled_calibration_too(photos, calibration):
-    files = FlightFiles(map="/m.tif", frames=photos, camera=calibration, scale_calibration=True)
+    files = FlightFiles.from_flat(map="/m.tif", frames=photos, camera=calibration, scale_calibration=True)
     record = RunRecord(
         map="/m.tif", surface=None, camera=str(calibration), frames=str(photos), truth=None, method="ncc",
         scale_calibration=True, profile="engine", origin={"lat_deg": 48.0, "lon_deg": 16.0}, ground_m=0.0,

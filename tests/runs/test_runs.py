@@ -13,8 +13,10 @@ from engine.errors import BackendError, MissingExtraError, require
 from scenematch import (
     BridgeFiles,
     BridgeSettings,
+    CameraInput,
     FlightFiles,
     LiveViewTarget,
+    MapInput,
     MavlinkSettings,
     Progress,
     TrackSettings,
@@ -78,7 +80,7 @@ def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_p
 def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     progress, names = Recorded(), ["000000.jpg", "000002.jpg"]
     paths = {name: flight / file for name, file in FOLDER_LAYOUT.items()}
-    files = FlightFiles(**paths, every=2)
+    files = FlightFiles.from_flat(**paths, every=2)
     track(files, tmp_path / "out", progress=progress)
     assert [row.frame for row in read_track(tmp_path / "out" / "track.csv")] == names
     assert progress.messages == ["one frame in 2 is used, 2 of all"]
@@ -110,7 +112,7 @@ def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(fligh
 
 def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     progress = Recorded()
-    files = FlightFiles(
+    files = FlightFiles.from_flat(
         map=flight / "map.tif",
         camera=flight / "camera.yaml",
         frames=flight / "frames",
@@ -120,9 +122,9 @@ def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     track(files, tmp_path / "out", report=False, progress=progress)
     (flight / "frames" / "spare.jpg").unlink()
     counted = [(done, FRAMES) for done in range(FRAMES + 1)]
-    assert progress.updates["ncc, engine profile"] == counted
+    assert progress.updates["auto, engine profile"] == counted
     assert progress.updates["checking pictures"] == counted
-    assert progress.finished[-1] == "ncc, engine profile"
+    assert progress.finished[-1] == "auto, engine profile"
     assert progress.messages == ["frames without a row in the telemetry, left out: 1"]
 
 
@@ -136,10 +138,10 @@ def test_a_task_that_is_interrupted_is_finished():
 
 def test_a_folder_gives_what_it_has(flight, tmp_path):
     files = FlightFiles.in_folder(flight)
-    assert (files.surface, files.truth) == (flight / "dsm.tif", flight / "truth.csv")
+    assert (files.map.surface, files.truth) == (flight / "dsm.tif", flight / "truth.csv")
     bare = FlightFiles.in_folder(tmp_path)
-    assert (bare.surface, bare.telemetry, bare.truth) == (None, None, None)
-    assert bare.map == tmp_path / "map.tif"
+    assert (bare.map.surface, bare.telemetry, bare.truth) == (None, None, None)
+    assert bare.map.map == tmp_path / "map.tif"
 
 
 def refused(call, *arguments, **named):
@@ -210,7 +212,7 @@ def serial_link():
 
 
 def bridge():
-    files = BridgeFiles(map="m.tif", camera="c.yaml", frames="f")
+    files = BridgeFiles(map=MapInput("m.tif"), camera=CameraInput("c.yaml"), frames="f")
     run_mavlink_bridge(files, MavlinkSettings(connect="udpout:127.0.0.1:1"), BridgeSettings())
 
 
@@ -257,15 +259,15 @@ def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, 
     last[names.index("heading_deg")] = ""
     telemetry = tmp_path / "telemetry.csv"
     telemetry.write_text("\n".join([*lines[:-1], ",".join(last)]), encoding="utf-8")
-    findings = [Finding("radians", "the heading is in radians", "--angles radians")] if is_wrong else []
+    findings = [Finding("radians", "the heading is in radians", "--correct angles=radians")] if is_wrong else []
     found = Diagnosis(findings, 16, 16, ("attitude",), (Contradiction("heading", 6 * is_wrong, 16),))
     monkeypatch.setattr("scenematch.runs.tracking.diagnose_flight", lambda *_, **__: found)
     given = {name: flight / file for name, file in FOLDER_LAYOUT.items() if name != "telemetry"}
-    files = FlightFiles(**given, telemetry=telemetry)
+    files = FlightFiles.from_flat(**given, telemetry=telemetry)
     summary = track(files, tmp_path / "out", TrackSettings(method="ncc"), report=False)
     assert summary["fixes"] == FRAMES - 1
     said = summary["settings"]["diagnosis"]
     assert (said is not None) == is_wrong
     if said:
-        assert said["radians"] == "the heading is in radians; try --angles radians"
+        assert said["radians"] == "the heading is in radians; try --correct angles=radians"
         assert said["pictures"].endswith("; 6 of 16 (38%) contradict the heading")

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from engine.camera import Camera
 from engine.errors import OptionError
 from engine.navigation.live import Counts
 from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
@@ -181,7 +180,7 @@ def test_a_ros_bridge_reports_as_the_other_does(manager, tmp_path, monkeypatch):
     types = get_typestore(Stores.ROS1_NOETIC).types
     maker, shown, published = MessageFactory(types.__getitem__, True), Shown(), []
     flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=1))
-    black = np.zeros((Camera.load(flight.camera).height_px, Camera.load(flight.camera).width_px), np.uint8)
+    black = np.zeros((flight.camera.load(None).height_px, flight.camera.load(None).width_px), np.uint8)
 
     def spin(handlers, every_second, seconds):
         handlers["/down"][1](maker.image(10**9, "", black))
@@ -225,7 +224,7 @@ def test_the_unit_grants_what_real_time_asks_for(unit):
     for cure in (_FIFO_CURE, _MEMORY_CURE):
         name, value = re.search(r"(Limit\w+)=(\w+)", cure).groups()
         assert unit[name] == value
-    assert "--realtime" in unit["ExecStart"]
+    assert "bridge.realtime=true" in unit["ExecStart"]
 
 
 def test_the_unit_hears_the_worker_of_a_supervisor_and_has_a_watchdog(unit):
@@ -249,7 +248,9 @@ def test_the_units_command_is_one_of_the_command_line(unit):
     program, *words = unit["ExecStart"].split()
     assert program.endswith("/scenematch")
     assert run([*words, "--help"]) == 0
-    asked = [word.replace("/srv/scenematch", "/nowhere") for word in words if word != "--realtime"]
+    asked = [
+        word.replace("/srv/scenematch", "/nowhere").replace("realtime=true", "realtime=false") for word in words
+    ]
     assert run(asked) == 1  # every option is known: what is wrong is the map, which is not there
 
 

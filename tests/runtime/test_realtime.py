@@ -16,7 +16,7 @@ from engine.errors import BackendError, OptionError
 from engine.navigation.live import Live, LiveOptions
 from engine.runtime import realtime as module
 from engine.runtime.realtime import LoadWatch, Realtime, check_realtime, limited_share, set_realtime, start_thread
-from scenematch.runs.arguments import parse_realtime
+from scenematch.runs.mavlink_bridge import BridgeSettings
 from tests.support.paths import ROOT
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="real time is Linux's")
@@ -138,14 +138,13 @@ def test_numbers_out_of_range_are_refused(wrong):
         Realtime(**wrong)
 
 
-def test_a_line_of_options_is_read():
-    assert parse_realtime(False, None, None) is None
-    assert parse_realtime(True, None, None) == Realtime()
-    assert parse_realtime(True, -5, "0") == Realtime(nice=-5, cores=(0,))
-    with pytest.raises(OptionError, match=r"^cores: expected numbers"):
-        parse_realtime(True, None, "a")
+def test_the_settings_of_a_bridge_say_how_it_is_scheduled():
+    assert BridgeSettings().scheduling() is None
+    assert BridgeSettings(nice=None, cores=()).scheduling() is None
     with pytest.raises(OptionError, match=r"^nice: expected with `realtime` only"):
-        parse_realtime(False, -5, None)
+        BridgeSettings(nice=-5)
+    with pytest.raises(OptionError, match=r"^cores: expected with `realtime` only"):
+        BridgeSettings(cores=(0,))
 
 
 @pytest.mark.parametrize(("busy", "said"), [(0.5, 0), (0.99, 1)])

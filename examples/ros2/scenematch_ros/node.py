@@ -1,9 +1,9 @@
-"""The node: what `scenematch bridge ros --ros 2` takes as options, this takes as ROS parameters."""
+"""The node: what `scenematch bridge ros` takes as options, this takes as ROS parameters."""
 
 import sys
 
 from engine import EngineError, OptionError, set_threads
-from scenematch import BridgeSettings, Progress, RosSettings, run_ros_bridge
+from scenematch import BridgeSettings, CameraInput, MapInput, Progress, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import RosTopics
 from scenematch.bridges.ros2 import Node
 
@@ -30,13 +30,9 @@ def settings_of(node):
         raise OptionError("map: expected a file, got nothing; -p map:=site.tif gives it")
     map_sigma_m, hfov_deg = node.parameter("map_sigma_m", 0.0), node.parameter("hfov_deg", 0.0)
     ros = RosSettings(
-        map=text["map"],
-        surface=text["surface"],
-        camera=text["camera"],
-        hfov_deg=hfov_deg or None,
-        mount=text["mount"],
+        map=MapInput(text["map"], surface=text["surface"], map_sigma_m=map_sigma_m or None),
+        camera=CameraInput(text["camera"], hfov_deg=hfov_deg or None, mount=text["mount"]),
         origin=text["origin"],
-        map_sigma_m=map_sigma_m or None,
         firmware=node.parameter("firmware", "none"),
         topics=RosTopics(**topics),
         version=2,

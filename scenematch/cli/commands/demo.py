@@ -8,19 +8,19 @@ from typing import Annotated
 import typer
 
 from scenematch.cli import console, tables
-from scenematch.cli.options import DeviceOption, ForceOption, JsonOption, ThreadsOption, use_threads
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, use_threads
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Report folder.")] = Path("demo-report"),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Report folder.", rich_help_panel=OUTPUT)
+    ] = Path("demo-report"),
     frames: Annotated[
         int | None, typer.Option("--frames", min=2, metavar="N", help="Fly only the first N frames.")
     ] = None,
     seed: Annotated[
         int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
     ] = 1,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -31,8 +31,8 @@ def demo(
     """
     from scenematch.runs.demo import run_demo
 
-    use_threads(threads)
-    results = run_demo(out, frames=frames, seed=seed, device=device, force=force, progress=console.PROGRESS)
+    use_threads()
+    results = run_demo(out, frames=frames, seed=seed, force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(results)
     else:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import platform
 import re
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import JsonOption
+from scenematch.cli.options import OUTPUT, JsonOption
 
 _DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
@@ -20,8 +20,34 @@ _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra == ["']([^"']+)["']""")
 
 
-def doctor(as_json: JsonOption = False) -> None:
-    """Versions, devices, what is missing."""
+_HEAD = """\
+# Settings of scenematch: every one with its default. Take the # off a key to change it; what stays commented
+# follows the defaults. Use the file with --settings FILE, or a single one with --settings NAME=VALUE, such as
+# input.every=5; options of a command count more.
+
+"""
+
+
+def doctor(
+    settings: Annotated[
+        bool, typer.Option("--settings", help="Print a settings file with every setting.", rich_help_panel=OUTPUT)
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Versions, devices, what is missing.
+
+    With --settings the file that the other commands take with --settings: all settings with units and defaults.
+    """
+    if settings:
+        from scenematch.runs.settings import documented_settings
+
+        text = _HEAD + documented_settings()
+        if as_json:
+            console.print_json({"settings": text})
+        else:
+            print(text, end="")
+        console.next_step("track --settings FILE --map MAP --frames FRAMES --out out", as_json=as_json)
+        return
     facts, healthy = examine()
     console.facts(facts, as_json, title="scenematch doctor")
     console.next_step("demo" if healthy else "doctor", as_json=as_json, hint="" if healthy else _INSTALL)

@@ -7,32 +7,52 @@ from typing import Annotated
 
 import typer
 
+from engine.errors import OptionError
 from scenematch.cli import console, tables
-from scenematch.cli.options import JsonOption, flight_options
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, after_track
 
 
 def evaluate(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="DIR", help="Output folders of track.")],
     truth: Annotated[
         Path | None,
         typer.Option("--truth", metavar="FILE", help="truth.csv, log or photographs; else track's."),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="Page on several runs; comparison.html unless given.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Score a finished track against truth.
+    """Score finished tracks and draw their report again.
 
-    Prints the errors and rewrites the folder's summary.json and report.
+    Of one run, prints the errors and rewrites the folder's summary.json and report.html. Of several,
+    draws one page: all tracks on one map and one time axis, and a table.
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
     from scenematch.runs.evaluation import recorded_files
     from scenematch.runs.record import read_record
-    from scenematch.runs.results import SUMMARY
+    from scenematch.runs.reporting import report
+    from scenematch.runs.results import PAGE, SUMMARY
 
-    summary = evaluate_track(directory, truth, progress=console.PROGRESS)
-    tables.print_summary(summary, as_json, title=f"track in {directory}", out=directory)
-    page = f"open {directory / 'report.html'}"
-    following = f"export {console.quoted(directory)} --format tum"
-    if not summary["fixes"]:
-        record = read_record(directory / SUMMARY)
-        following = f"check {flight_options(recorded_files(record), start=record.start)}"
-    console.next_step(following, as_json=as_json, hint=page)
+    if len(runs) == 1 and out is None:
+        summary = evaluate_track(runs[0], truth, force=force, progress=console.PROGRESS)
+        tables.print_summary(summary, as_json, title=f"track in {runs[0]}", out=runs[0])
+        record = read_record(runs[0] / SUMMARY)
+        following = after_track(recorded_files(record), runs[0], summary["fixes"], start=record.start)
+        console.next_step(following, as_json=as_json, hint=f"open {runs[0] / PAGE}")
+        return
+    if truth is not None:
+        raise OptionError("truth: expected with one run only")
+    page = report(runs, out, force=force, progress=console.PROGRESS)
+    if as_json:
+        console.print_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]})
+    else:
+        console.say(f"written to {page}")
+    console.next_step(f"export {console.quoted(runs[0])} --format geojson", as_json=as_json, hint=f"open {page}")

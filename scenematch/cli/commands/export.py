@@ -8,20 +8,23 @@ from typing import Annotated
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import JsonOption
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption
 
 
 def export(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
     kind: Annotated[str, typer.Option("--format", metavar="gpx|geojson|tum", help="What is written.")],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Without it track.FORMAT in the folder.")
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="Without it track.FORMAT in the folder.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     truth: Annotated[
         Path | None,
         typer.Option("--truth", metavar="FILE", help="Write this at the fixes' moments instead, to compare with."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """A finished track as GPX, GeoJSON, TUM.
@@ -35,4 +38,4 @@ def export(
     if kind == "tum" and truth is None:
         console.next_step(f"export {console.quoted(directory)} --format tum --truth TRUTH", as_json=as_json)
     else:
-        console.next_step(f"report {console.quoted(directory)} OTHER_RUN", as_json=as_json)
+        console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN", as_json=as_json)

@@ -10,40 +10,26 @@ import typer
 
 from scenematch.cli import console
 from scenematch.cli.options import (
-    CameraPitchOption,
+    CameraOptions,
     DeviceOption,
-    HfovOption,
     JsonOption,
-    MapBoundsOption,
-    MapCrsOption,
-    MapOption,
-    MapSigmaOption,
+    MapOptions,
     MethodOption,
-    MountOption,
-    OptionalCameraOption,
-    ScaleCalibrationOption,
-    SurfaceOption,
-    ThreadsOption,
-    WeightsOption,
-    use_threads,
+    SettingsOption,
+    StartOption,
+    read_settings,
+    with_options,
 )
 
 if TYPE_CHECKING:
     from engine.values import Fix, NoFix
 
 
+@with_options
 def locate(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
-    map_path: MapOption,
-    camera: OptionalCameraOption = None,
-    hfov_deg: HfovOption = None,
-    mount: MountOption = None,
-    camera_pitch_deg: CameraPitchOption = None,
-    scale_calibration: ScaleCalibrationOption = False,
-    surface: SurfaceOption = None,
-    map_sigma_m: MapSigmaOption = None,
-    map_bounds: MapBoundsOption = None,
-    map_crs: MapCrsOption = None,
+    site: MapOptions,
+    lens: CameraOptions,
     height_agl_m: Annotated[
         float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground.")
     ] = None,
@@ -54,14 +40,10 @@ def locate(
         float | None, typer.Option("--roll", metavar="DEG", help="Degrees, right side down.")
     ] = None,
     pitch_deg: Annotated[float | None, typer.Option("--pitch", metavar="DEG", help="Degrees, nose up.")] = None,
-    near: Annotated[
-        str | None,
-        typer.Option("--near", metavar="LAT,LON[,SIGMA_M]", help="Search here; without it the whole map."),
-    ] = None,
-    method: MethodOption = "auto",
-    weights: WeightsOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 1,
+    start: StartOption = None,
+    method: MethodOption = None,
+    device: DeviceOption = None,
+    settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find one picture on the map.
@@ -71,21 +53,29 @@ def locate(
     from engine.values import Fix
     from scenematch.runs.single_image import locate_image
 
-    use_threads(threads)
+    given = read_settings(settings)
+    how = given.track(method=method, device=device, start=start)
     result = locate_image(
-        image, map_path, camera, surface=surface, map_sigma_m=map_sigma_m, map_bounds=map_bounds, map_crs=map_crs,
-        hfov_deg=hfov_deg, mount=mount, camera_pitch_deg=camera_pitch_deg,
-        scale_calibration=scale_calibration, height_agl_m=height_agl_m,
-        heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, near=near, method=method,
-        weights=weights or (), device=device, progress=console.PROGRESS,
-    )  # fmt: skip
+        image,
+        site.map_input(given),
+        lens.camera_input(given),
+        height_agl_m=height_agl_m,
+        heading_deg=heading_deg,
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        start=how.start,
+        method=how.method,
+        device=how.device,
+        options=how.matcher_options(),
+        progress=console.PROGRESS,
+    )
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms
     console.facts(facts, as_json, title=str(image))
     if isinstance(result, Fix):
-        console.next_step(f"track {console.options(map=map_path)} --frames FRAMES --out out", as_json=as_json)
+        console.next_step(f"track {console.options(map=site.map)} --frames FRAMES --out out", as_json=as_json)
     else:
-        console.next_step(f"map info {console.quoted(map_path)}", as_json=as_json)
+        console.next_step(f"map info {console.quoted(site.map)}", as_json=as_json)
     raise typer.Exit(0 if isinstance(result, Fix) else 1)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -9,40 +10,56 @@ import typer
 
 from scenematch.cli import console, tables
 from scenematch.cli.options import (
+    EXPERT,
+    MAP,
+    OUTPUT,
     ForceOption,
     JsonOption,
-    MapBoundsOption,
-    MapCrsOption,
-    MapSigmaOption,
     OutOption,
+    SettingsOption,
     SurfaceOption,
-    ThreadsOption,
-    use_threads,
+    read_settings,
+    table,
+    with_options,
 )
+
+MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")]
 
 
 def info(
-    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
+    map_path: MapArgument,
     surface: SurfaceOption = None,
-    map_bounds: MapBoundsOption = None,
-    map_crs: MapCrsOption = None,
+    map_bounds: Annotated[
+        str | None,
+        typer.Option(
+            "--map-bounds",
+            metavar="W,S,E,N",
+            help="Edges of a bare picture, in degrees or in --map-crs.",
+            rich_help_panel=MAP,
+        ),
+    ] = None,
+    map_crs: Annotated[
+        str | None,
+        typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.", rich_help_panel=MAP),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Size, ground sample distance, CRS, bounds."""
-    from scenematch.runs.inputs import open_map
+    """Size, ground sample distance, CRS, bounds.
 
-    site = open_map(map_path, surface, bounds=map_bounds, crs=map_crs, progress=console.PROGRESS)
-    console.facts(site.info(), as_json, title=str(map_path))
+    Other commands take bounds and CRS as --settings input.map_bounds=W,S,E,N and input.map_crs=EPSG:N.
+    """
+    from scenematch.runs.map_input import MapInput
+
+    source = MapInput(map_path, surface=surface, map_bounds=map_bounds, map_crs=map_crs)
+    console.facts(source.open(console.PROGRESS).info(), as_json, title=str(map_path))
     place = f"{console.quoted(map_path)} --camera CAMERA --height-agl METRES"
     console.next_step(f"map audit {place} --out audit", as_json=as_json)
 
 
 def audit(
-    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")],
+    map_path: MapArgument,
     out: OutOption,
     surface: SurfaceOption = None,
-    map_bounds: MapBoundsOption = None,
-    map_crs: MapCrsOption = None,
     camera: Annotated[
         Path | None,
         typer.Option("--camera", metavar="FILE", help="Calibration; without it 300 x 300 px with 60 degrees."),
@@ -66,10 +83,7 @@ def audit(
         Path | None,
         typer.Option("--other", metavar="FILE", help="The same ground at another date; finds what is stale."),
     ] = None,
-    prior_sigma_m: Annotated[
-        float, typer.Option("--sigma-m", metavar="M", help="Uncertainty of the position before a match.")
-    ] = 10.0,
-    threads: ThreadsOption = 1,
+    settings: SettingsOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -80,13 +94,19 @@ def audit(
     place, along the route, or both.
     """
     from scenematch.runs.map_audit import AuditFiles, audit_map
+    from scenematch.runs.map_input import MapInput
 
-    use_threads(threads)
+    given = read_settings(settings)
     files = AuditFiles(
-        map=map_path, surface=surface, camera=camera, route=route, other=other, height_agl_m=height_agl_m,
-        around=around, corridor_m=corridor_m, map_bounds=map_bounds, map_crs=map_crs,
-    )  # fmt: skip
-    result = audit_map(files, out, prior_sigma_m=prior_sigma_m, force=force, progress=console.PROGRESS)
+        map=MapInput(map_path, surface=surface, **table(given, "input").of(MapInput)),
+        camera=camera,
+        route=route,
+        other=other,
+        height_agl_m=height_agl_m,
+        around=around,
+        corridor_m=corridor_m,
+    )
+    result = audit_map(files, out, table(given, "audit"), force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(result.summary)
     else:
@@ -96,66 +116,51 @@ def audit(
     console.next_step(f"track {files_given} --frames FRAMES --out out", as_json=as_json)
 
 
-def fetch(
+@dataclass(frozen=True, kw_only=True)
+class WantedMap:
+    """What is fetched."""
+
     around: Annotated[
         str, typer.Option("--around", metavar="LAT,LON|DIR", help="The middle; or photographs with positions.")
-    ],
+    ]
     source: Annotated[
         str,
         typer.Option(
             "--source", metavar="URL", help="Tiles as https://host/{z}/{x}/{y}.png, or a WMS or WMTS: your choice."
         ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.")],
+    ]
     radius_m: Annotated[
         float | None,
         typer.Option("--radius-m", metavar="M", help="To each edge, at least; else what the photographs saw."),
-    ] = None,
+    ] = None
     gsd_m_per_px: Annotated[
         float | None,
         typer.Option(
             "--gsd-m-per-px", metavar="M", help="Tiles are so fine or finer; 0.5, or as photographs need."
         ),
-    ] = None,
+    ] = None
     layer: Annotated[
         str | None, typer.Option("--layer", metavar="NAME", help="Of a WMS or WMTS that has several.")
-    ] = None,
-    crs: Annotated[
-        str | None, typer.Option("--crs", metavar="EPSG:N", help="Of a WMS or WMTS; else UTM or Web Mercator.")
-    ] = None,
-    image_format: Annotated[
-        str | None,
-        typer.Option("--image-format", metavar="TYPE", help="Of a WMS or WMTS; else image/png if offered."),
-    ] = None,
-    tile_px: Annotated[int, typer.Option("--tile-px", metavar="N", help="Side of a template's tiles.")] = 256,
-    map_sigma_m: MapSigmaOption = None,
-    attribution: Annotated[
-        str | None, typer.Option("--attribution", metavar="TEXT", help="Whom to credit; kept in the file.")
-    ] = None,
-    licence: Annotated[
-        str | None, typer.Option("--licence", metavar="TEXT", help="What you may do with it; kept in the file.")
-    ] = None,
+    ] = None
     surface: Annotated[
         str | None,
         typer.Option(
             "--surface", metavar="FILE|URL", help="Heights to cut out as well; {lat} and {lon} as N48 and E016."
         ),
-    ] = None,
-    surface_datum: Annotated[
-        str | None,
-        typer.Option("--surface-datum", metavar="EPSG:N", help="Of its heights, where the file does not say."),
-    ] = None,
-    surface_slope_sigma_deg: Annotated[
-        float | None,
-        typer.Option("--surface-slope-sigma-deg", metavar="DEG", help="Accuracy of its slope over one frame."),
-    ] = None,
-    max_tiles: Annotated[
-        int, typer.Option("--max-tiles", min=1, metavar="N", help="More are refused before any is asked for.")
-    ] = 2000,
-    pause_ms: Annotated[float, typer.Option("--pause-ms", metavar="MS", help="Between two requests.")] = 100.0,
-    timeout_s: Annotated[float, typer.Option("--timeout-s", metavar="S", help="Without a byte.")] = 30.0,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be fetched.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
+    ] = None
+
+
+@with_options
+def fetch(
+    what: WantedMap,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.", rich_help_panel=OUTPUT)
+    ],
+    settings: SettingsOption = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what would be fetched.", rich_help_panel=EXPERT)
+    ] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fetch a map from a server that you name.
@@ -163,21 +168,16 @@ def fetch(
     One request at a time. What was fetched stays beside the file until it is complete: the same command goes on
     after an interruption. The server's terms decide what you may fetch, keep and use.
     """
-    from scenematch.runs.map_fetch import FetchSettings, fetch_map
+    from scenematch.runs.map_fetch import fetch_map
 
-    settings = FetchSettings(
-        around=around, radius_m=radius_m, source=source, gsd_m_per_px=gsd_m_per_px, layer=layer, crs=crs,
-        image_format=image_format, tile_px=tile_px, map_sigma_m=map_sigma_m, attribution=attribution,
-        licence=licence, surface=surface, surface_datum=surface_datum,
-        surface_slope_sigma_deg=surface_slope_sigma_deg, max_tiles=max_tiles, pause_ms=pause_ms,
-        timeout_s=timeout_s, dry_run=dry_run, force=force,
-    )  # fmt: skip
-    facts = fetch_map(settings, out, console.PROGRESS)
-    console.facts(facts, as_json, title=f"map around {around}")
+    given = asdict(what) | {"dry_run": dry_run, "force": force}
+    wanted = table(read_settings(settings), "fetch", **given)
+    facts = fetch_map(wanted, out, console.PROGRESS)
+    console.facts(facts, as_json, title=f"map around {what.around}")
     if dry_run:
-        given = console.options(around=around, radius_m=radius_m)
+        place = console.options(around=what.around, radius_m=what.radius_m)
         console.next_step(
-            f"map fetch {given} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
+            f"map fetch {place} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
         )
     else:
         console.next_step(f"map info {console.quoted(out)}", as_json=as_json)
