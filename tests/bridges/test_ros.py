@@ -937,6 +937,8 @@ def test_discovery_stays_here_unless_it_is_set(rclpy_with, monkeypatch, given, b
 @pytest.mark.parametrize("ends", [ShutdownError, KeyboardInterrupt])
 def test_a_run_that_is_ended_has_its_counts(rclpy_with, monkeypatch, tmp_path, ends):
     """By Ctrl-C, by SIGTERM, which is made the same, or by a context that was shut down."""
+    from scenematch.runs.cameras import CameraInput
+    from scenematch.runs.map_input import MapInput
     from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
     from scenematch.runs.simulation import write_flight
     from scenematch.simulator import plan_flight
@@ -946,7 +948,8 @@ def test_a_run_that_is_ended_has_its_counts(rclpy_with, monkeypatch, tmp_path, e
     write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
     before = signal.getsignal(signal.SIGTERM)
     try:
-        settings = RosSettings(map=tmp_path / "map.tif", camera=tmp_path / "camera.yaml", version=2)
+        camera = CameraInput(tmp_path / "camera.yaml")
+        settings = RosSettings(map=MapInput(tmp_path / "map.tif"), camera=camera, version=2)
         assert run_ros_bridge(settings).line() == "0 pictures; published 0; not published: nothing"
         assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
     finally:
