@@ -56,10 +56,6 @@ PICTURES = ("rectified", "window", "window/found", "window/fix", "surface", "sur
 """Image entities that a frame may lack; they are cleared where it does."""
 PLACES = ("world/ellipse", "world/window", "world/seen")
 """World entities that a frame may lack, in metres east, north and up of the map's origin."""
-ALWAYS = ("frame", "state", "plots/latency_ms", "log")
-"""Entities of every frame."""
-FIXED = ("world/fixes", "plots/sigma_m")
-"""Entities of every frame that has a fix."""
 
 STATE_RGB = {
     NavigatorState.SEARCHING: (150, 150, 150),

@@ -104,7 +104,7 @@ def test_it_changes_no_result(flown, method):
 def test_each_frame_is_there_once_with_its_stamp(runs):
     track = read_track(runs / "ncc-on" / "track.csv")
     rows = rows_of(runs / "ncc.rrd")
-    for entity in live_view.ALWAYS:
+    for entity in ("frame", "state", "plots/latency_ms", "log"):
         assert sorted(rows[entity]) == list(range(FRAMES)), entity
         assert all(len(at) == 1 for at in rows[entity].values()), entity
     for frame, row in enumerate(track):
@@ -116,7 +116,7 @@ def test_a_fixed_frame_has_all_that_is_promised_and_a_refused_one_does_not_show_
     rows = rows_of(runs / "ncc.rrd")
     assert [row.fixed for row in track] == [frame != DARK for frame in range(FRAMES)]
     for frame, row in enumerate(track):
-        for entity in live_view.FIXED:
+        for entity in ("world/fixes", "plots/sigma_m"):
             assert (frame in rows[entity]) == row.fixed, entity
         for entity in (*live_view.PICTURES, *live_view.PLACES):
             (logged,) = rows[entity][frame]
