@@ -122,7 +122,7 @@ def test_the_node_of_ros_2_takes_the_parameters_of_its_file():
     module = ros2_node_module()
     node = Parameters(map="site.tif", method="ncc", image_topic="down/image_raw", deadline_ms=200.0)
     ros, matching = module.settings_of(node)
-    assert (ros.map, ros.version, ros.topics.image, matching.method, matching.deadline_ms) == (
+    assert (str(ros.map.map), ros.version, ros.topics.image, matching.method, matching.deadline_ms) == (
         "site.tif", 2, "down/image_raw", "ncc", 200.0)  # fmt: skip
     stated = yaml.safe_load((ROS2 / "config/node.yaml").read_text())["/**"]["ros__parameters"]
     assert {**node.asked, "threads": 1} == stated  # names, types and defaults; threads is asked for by main
