@@ -10,12 +10,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2, norm
 
-from bench.accuracy.pose_scenes import GROUNDS, WRONG
-from bench.accuracy.poses import CHI2_3_SIGMA, accepted, coverage
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.kernels.pose_fit import biweight_factors
 from engine.matching.pose import AttitudePrior, PoseStart, PoseStats, solve_pose
 from engine.options import PoseOptions
+from tests.support.poses import CHI2_3_SIGMA, GROUNDS, WRONG, accepted, coverage
 
 K = np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]])
 SIZE = 300
@@ -342,7 +341,6 @@ def test_the_precision_of_a_prior_is_its_covariance_inverted():
 @pytest.mark.parametrize("sets", [30, pytest.param(170, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", WRONG)
 def test_wrong_matches_never_give_a_pose(kind, sets):
-    """A slice of the 100,000 sets that ``python -m bench.accuracy.poses`` draws."""
     assert accepted(kind, sets, seed=13) == 0
 
 
