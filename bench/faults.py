@@ -21,7 +21,7 @@ import numpy as np
 
 from bench import DOCS
 from bench.inputs.faults import Fault, FlightInputs, faults, load
-from bench.pages.text import table
+from bench.pages.text import rewrite, table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.runtime.threads import set_threads
 from scenematch.check import diagnose
@@ -185,10 +185,7 @@ def main() -> None:
             print(_row(found), flush=True)
     print(f"{len(cells)} cells in {time.monotonic() - begin:.0f} s")
     if wanted.docs is not None:
-        page = wanted.docs / "wrong-inputs.md"
-        before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-        text = "\n".join([BEGIN, "", *lines_of(cells), END])
-        page.write_text(before + text + rest.split(END)[1], encoding="utf-8")
+        rewrite(wanted.docs / "wrong-inputs.md", BEGIN, END, lines_of(cells))
 
 
 if __name__ == "__main__":

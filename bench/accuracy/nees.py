@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
-from bench.pages.text import paragraph, table
+from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.options import AssumedErrors, NccOptions, SiftOptions
 from engine.runtime.threads import set_threads
@@ -266,7 +266,7 @@ def _cells(r: Row) -> list[str]:
     return [r.flight, r.method, fixes, f"{r.rms_m:.2f} m", nees, f"{100 * r.inside:.0f} %", *height]
 
 
-def section(rows: list[Row]) -> str:
+def section(rows: list[Row]) -> list[str]:
     """What stands between the markers of the page."""
     columns = ["flight", "method", "fixes", "RMS", "NEES", "in the 95 % ellipse", "height RMS", "height NEES"]
     sentence = (
@@ -275,8 +275,7 @@ def section(rows: list[Row]) -> str:
         f"ellipses hold {100 * COVERAGE[0]:.0f} % or more, "
         f"{sum(COVERAGE[0] <= r.inside <= COVERAGE[1] for r in rows)} of them at most {100 * COVERAGE[1]:.0f} %."
     )
-    lines = [BEGIN, "", *table(columns, [_cells(r) for r in rows]), *paragraph(sentence), END]
-    return "\n".join(lines)
+    return [*table(columns, [_cells(r) for r in rows]), *paragraph(sentence)]
 
 
 def chart(rows: list[Row]) -> Figure:
@@ -309,9 +308,7 @@ def main() -> None:
     rows = measure(options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())])
     if options.flights is not None:
         return
-    page = options.docs / "integrity-measured.md"
-    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    page.write_text(before + section(rows) + rest.split(END)[1], encoding="utf-8")
+    rewrite(options.docs / "integrity-measured.md", BEGIN, END, section(rows))
     chart(rows).savefig(options.docs / "img" / "integrity-nees.png", dpi=130, facecolor="white")
 
 

@@ -18,8 +18,8 @@ from typing import Any
 import cv2
 
 from bench import DOCS
-from bench.accuracy.simulated import RATE_HZ, START_SIGMA_M, matchers
-from bench.pages.text import machine, table
+from bench.accuracy.simulated import PAGE, RATE_HZ, START_SIGMA_M, matchers
+from bench.pages.text import machine, rewrite, table
 from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.runtime.threads import set_threads
 from scenematch.files.track import track_row
@@ -111,11 +111,7 @@ def lines(runs: list[Run]) -> list[str]:
 
 def write(docs: Path, runs: list[Run]) -> None:
     """Put the table between the page's markers."""
-    page = docs / "simulator-measured.md"
-    head, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    tail = rest.split(END)[1]
-    body = [BEGIN, "", *lines(runs), f"Measured with {machine()}.", "", END]
-    page.write_text(head + "\n".join(body) + tail, encoding="utf-8")
+    rewrite(docs / PAGE, BEGIN, END, [*lines(runs), f"Measured with {machine()}.", ""])
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS
-from bench.pages.text import machine, table
+from bench.pages.text import machine, rewrite, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import LocalFrame
 from engine.options import ACCEPT_ALL
@@ -47,6 +47,7 @@ RATE_HZ = 0.28
 """Every fourth frame of the paper's flight."""
 START_SIGMA_M = 15.0
 WAYS = (("ncc", "engine"), ("sift", "engine"), ("ncc", "paper"), ("sift", "paper"))
+PAGE = "simulator-measured.md"
 BEGIN, END = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulated -->"
 SHEET_SEED, CELL_PX = 41, 170
 PLACES = ((0.0, 0.0, 20.0), (95.0, -110.0, 100.0), (-80.0, 120.0, 250.0))  # east, north and heading of its rows
@@ -131,14 +132,10 @@ def lines(runs: list[Run], ways: tuple[tuple[str, str], ...]) -> list[str]:
 
 def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
     """Put the tables between the page's markers."""
-    page = docs / "simulator-measured.md"
-    head, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    tail = rest.split(END)[1]
-    body = [BEGIN, "", *lines(runs, WAYS)]
+    body = lines(runs, WAYS)
     if more:
         body += ["The engine on what is harder, two towns each:", "", *lines(more, WAYS[:2])]
-    body += [f"Measured with {machine()}.", "", END]
-    page.write_text(head + "\n".join(body) + tail, encoding="utf-8")
+    rewrite(docs / PAGE, BEGIN, END, [*body, f"Measured with {machine()}.", ""])
 
 
 def draw_sheet(path: Path) -> None:

@@ -10,7 +10,6 @@ import socket
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from bench import DOCS
 from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_port, place_off_m
 from bench.live.bridge_minutes import minutes_real
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
-from bench.pages.text import machine, paragraph, table
+from bench.pages.text import machine, paragraph, rewrite, table
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 from scenematch.bridges.links import Connection
@@ -305,14 +304,6 @@ def section(flown: dict[str, Any], real: dict[str, Any]) -> list[str]:
     ]
 
 
-def write_section(page: Path, lines: list[str]) -> None:
-    """Put the tables where the page has room for them."""
-    text = page.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    page.write_text("\n".join([before + BEGIN, "", *lines[:-1], "", END + after]), encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="of the hour at speed")
@@ -329,7 +320,7 @@ def main() -> None:
         real = minutes_real(told.real_minutes, told.method)
         print("\n".join(table(["real time", ""], real_rows(real))))
         if told.write:
-            write_section(PAGE, section(flown, real))
+            rewrite(PAGE, BEGIN, END, section(flown, real))
 
 
 if __name__ == "__main__":
