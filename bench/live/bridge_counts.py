@@ -34,10 +34,9 @@ class Growth:
 
     seen: list[tuple[int, int, int, int]] = field(default_factory=list)
 
-    def look(self, messages: int, *, collect: bool = True) -> None:
-        """Look, after a collection, which holds Python's lock for so long that a frame of real time is late."""
-        if collect:
-            gc.collect()
+    def look(self, messages: int) -> None:
+        """Look, after a collection."""
+        gc.collect()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         kib = pages * resource.getpagesize() // 1024
         self.seen.append((messages, kib, len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))))
