@@ -57,6 +57,11 @@ class Recorded:
     truth: list[Truth]
     ground: Ground
 
+    def true_place_m(self, stamp_ns: int | None) -> NDArray[np.float64] | None:
+        """(2,) true east and north at a moment; None where they are not known."""
+        true = None if stamp_ns is None else interpolate_truth(self.truth, stamp_ns)
+        return None if true is None else self.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2]
+
 
 def recorded(
     name: str, step: int, *, map_name: str = "map.tif", with_surface: bool = True, **accuracy: float | None

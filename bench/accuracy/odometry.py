@@ -39,7 +39,6 @@ from engine.matching.covariance import map_sigma_of
 from engine.navigation.motion import GroundMotion
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.runtime.threads import set_threads
-from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import Ground
 from scenematch.simulator import plan_flight
 
@@ -64,14 +63,6 @@ def flight_of(name: str) -> Recorded:
 
 def without_velocity(frame: Frame) -> Frame:
     return replace(frame, east_velocity_mps=None, north_velocity_mps=None)
-
-
-def true_en_m(flight: Recorded, frame: Frame) -> Array | None:
-    """True place (2,) of a frame, about the map's origin."""
-    true = None if frame.timestamp_ns is None else interpolate_truth(flight.truth, frame.timestamp_ns)
-    if true is None:
-        return None
-    return np.array([float(v) for v in flight.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2]])
 
 
 # --------------------------------------------------------------------------------------- flights with gaps
@@ -131,7 +122,7 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
     navigator = Navigator(gappy, start, options=NavigatorOptions(odometry=velocity == PICTURES))
     gaps, way_m, before, ended_ns, middle_m = Gaps(), 0.0, None, None, np.zeros(2)
     for index, frame in enumerate(frames):
-        result, place, stamp_ns = navigator.update(frame), true_en_m(flight, frame), frame.timestamp_ns or 0
+        result, place, stamp_ns = navigator.update(frame), flight.true_place_m(frame.timestamp_ns), frame.timestamp_ns or 0
         withheld = gappy.withholds(frame)
         if isinstance(result, Fix) and flight.name in MIDDLE:
             seen = moved_to_middle(result, flight.site, flight.camera)
@@ -248,7 +239,7 @@ def velocities(flight: Recorded, stride: int) -> dict[str, Steps]:
     }
     found, before = {name: Steps() for name in ways}, None
     for frame, _ in flight.frames[::stride]:
-        frame, place = without_velocity(frame), true_en_m(flight, frame)
+        frame, place = without_velocity(frame), flight.true_place_m(frame.timestamp_ns)
         for name, way in ways.items():
             begin = time.perf_counter()
             motion = way(frame)
