@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
-from bench.accuracy.flights import STEPS, Recorded, recorded
 from bench.accuracy.confidence import fitted
+from bench.accuracy.flights import STEPS, Recorded, recorded
 from bench.inputs.farmland import farmland
 from bench.inputs.scenes import mosaic
 from bench.pages.integrity import auc
