@@ -21,7 +21,6 @@ from bench.pages import sift
 from bench.pages.text import machine, table
 from bench.speed import stages
 from engine.runtime.threads import set_threads
-from scenematch.report.figures import plain_log_ticks
 
 STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
@@ -48,8 +47,6 @@ def main() -> None:
     rows = [_row(entry) for entry in run["benchmarks"]]
     flown = [] if options.quick else stages.in_own_process()
     charts = sift.charts(rows)
-    if any(row["task"] == "peak" for row in rows):
-        charts["ncc-ratio.png"] = _ratio_chart(rows)
     if flown:
         charts["frame-stages.png"] = _stages_chart(_before(), flown)
     (options.docs / "img").mkdir(parents=True, exist_ok=True)
@@ -173,8 +170,6 @@ def _peak_section(rows: list[dict[str, Any]]) -> list[str]:
         "scores every place at full resolution; `ncc()` prepares nothing and returns the whole surface. On the",
         "smallest windows the fixed cost of a call exceeds OpenCV's whole work.",
         "",
-        "![ratio to OpenCV](img/ncc-ratio.png)",
-        "",
         *table(columns, cells),
     ]
 
@@ -224,31 +219,6 @@ def _hypotheses_section(rows: list[dict[str, Any]]) -> list[str]:
         "",
         *table(["who", "threads", "median ms", "ratio", "error m", "peak MB"], cells),
     ]
-
-
-def _ratio_chart(rows: list[dict[str, Any]]) -> Figure:
-    figure = Figure(figsize=(9, 4.5), layout="constrained")
-    ax = figure.add_subplot()
-    chosen = [r for r in rows if r["task"] == "peak" and r["threads"] == 1]
-    sizes = list(dict.fromkeys(f"{r['template_px']}\nin {r['window_px']}" for r in chosen))
-    names = [n for n in dict.fromkeys(r["peer"] for r in chosen) if n != "OpenCV"]
-    for index, name in enumerate(names):
-        own = {
-            f"{r['template_px']}\nin {r['window_px']}": _baseline(rows, r) / r["median_ms"]
-            for r in chosen
-            if r["peer"] == name
-        }
-        at = np.arange(len(sizes)) + (index - (len(names) - 1) / 2) * 0.16
-        ax.bar(at, [own.get(size, np.nan) for size in sizes], 0.15, label=name)
-    ax.axhline(1.0, color="black", linewidth=1)
-    ax.set_yscale("log")
-    plain_log_ticks(ax.yaxis)
-    ax.set_xticks(range(len(sizes)), sizes)
-    ax.set_ylabel("times as fast as OpenCV")
-    ax.set_xlabel("template in window, pixels a side, one thread")
-    ax.grid(axis="y", alpha=0.3)
-    figure.legend(loc="outside upper left", ncols=len(names), frameon=False, fontsize=8)
-    return figure
 
 
 if __name__ == "__main__":
