@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,7 @@ class Run:
     method: str
     profile: str
     summary: dict[str, Any]
+    with_attitude: bool = True
 
 
 def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str, Any]]:
@@ -72,9 +73,13 @@ def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) 
         yield method, profile, matcher
 
 
-def fly(plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap) -> Iterator[Run]:
+def fly(
+    plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap, *, with_attitude: bool = True
+) -> Iterator[Run]:
     """The same frames by every matcher, each from the true start."""
     truth, frames = plan.truth_rows(), list(plan.iter_frames())
+    if not with_attitude:
+        frames = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
     start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
     for method, profile, matcher in ready:
         navigator = Navigator(matcher, start, options=ACCEPT_ALL if profile == "paper" else None)
@@ -85,7 +90,8 @@ def fly(plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: Ort
             spent_ms = (time.perf_counter() - begin) * 1e3
             rows.append(track_row(str(index), result, latency_ms=spent_ms, deadline_met=None))
         ground = Ground(site.ground_m, plan.town.datum_amsl_m)
-        yield Run(day, plan.seed, method, profile, summarise(rows, truth, frame=site.frame, ground=ground))
+        summary = summarise(rows, truth, frame=site.frame, ground=ground)
+        yield Run(day, plan.seed, method, profile, summary, with_attitude)
 
 
 def flights(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:

@@ -92,8 +92,8 @@ def _time_ms(rows: list[Row], peer: str, size: tuple[int, int], batch: int, thre
     return float("nan")
 
 
-def _ratio(rows: list[Row], peer: str, size: tuple[int, int], batch: int = 1, threads: int = 1) -> float:
-    return _time_ms(rows, BASELINE, size, batch, threads) / _time_ms(rows, peer, size, batch, threads)
+def _ratio(rows: list[Row], peer: str, size: tuple[int, int]) -> float:
+    return _time_ms(rows, BASELINE, size, 1, 1) / _time_ms(rows, peer, size, 1, 1)
 
 
 def _figures(rows: list[Row], peer: str, size: tuple[int, int]) -> Row:
