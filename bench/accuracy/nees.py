@@ -4,7 +4,7 @@
 
 Frames are matched one by one, each with a prior that is 4 m off per axis and says 8 m. What maps and truths are
 known to be off is stated (:data:`RECORDED`) and not fitted to the NEES; the simulated worlds are exact. Writes the
-table into docs/integrity-measured.md and its chart beside it.
+table into docs/integrity-measured.md.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
@@ -278,26 +277,8 @@ def section(rows: list[Row]) -> list[str]:
     return [*table(columns, [_cells(r) for r in rows]), *paragraph(sentence)]
 
 
-def chart(rows: list[Row]) -> Figure:
-    """NEES with its interval, and coverage, a dot a row."""
-    figure = Figure(figsize=(9.0, 0.5 + 0.23 * len(rows)), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
-    places = np.arange(len(rows))[::-1]
-    colours = dict(zip(METHODS, ("#0072b2", "#009e73", "#d55e00", "#333333", "#cc79a7"), strict=True))
-    for place, r in zip(places, rows, strict=True):
-        left.errorbar(r.nees, place, xerr=r.spread, fmt="o", color=colours[r.method], capsize=2, markersize=4)
-        right.plot(100 * r.inside, place, "o", color=colours[r.method], markersize=4)
-    left.axvspan(*BAND, color="#dddddd", zorder=0)
-    right.axvspan(100 * COVERAGE[0], 100 * COVERAGE[1], color="#dddddd", zorder=0)
-    left.set_yticks(places, [f"{r.flight}: {r.method}" for r in rows], fontsize=7)
-    left.set_xlabel("mean NEES of two dimensions: 2 is consistent, less cautious")
-    left.set_xlim(0.0, 5.0)
-    right.set_xlabel("in the 95 % ellipse, %")
-    return figure
-
-
 def main() -> None:
-    """Measure, and write the section and its chart."""
+    """Measure, and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--docs", type=Path, default=DOCS)
     parser.add_argument(
@@ -309,7 +290,6 @@ def main() -> None:
     if options.flights is not None:
         return
     rewrite(options.docs / "integrity-measured.md", BEGIN, END, section(rows))
-    chart(rows).savefig(options.docs / "img" / "integrity-nees.png", dpi=130, facecolor="white")
 
 
 if __name__ == "__main__":

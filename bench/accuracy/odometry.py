@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from bench import SHARED
@@ -32,7 +31,6 @@ from engine import (
     Prior,
     Reason,
     SceneMatcher,
-    features,
 )
 from engine.matching.align import to_gray
 from engine.matching.covariance import map_sigma_of
@@ -174,14 +172,6 @@ def _count(
 Follower = Callable[[Frame], GroundMotion | NoMotion]
 
 
-def sift_points(earlier: NDArray[np.uint8], later: NDArray[np.uint8], _: Array) -> tuple[Array, Array]:
-    """The engine's own features of both pictures, matched."""
-    pictures = [torch.from_numpy(gray)[None, None].float() / 255.0 for gray in (earlier, later)]
-    first, second = (features.sift(picture, max_keypoints=300) for picture in pictures)
-    pairs = features.match(first, second).pairs().numpy()
-    return first.xy_px[0].numpy()[pairs[:, 0]].astype(float), second.xy_px[0].numpy()[pairs[:, 1]].astype(float)
-
-
 class Affine:
     """The peer: OpenCV's corners, Lucas-Kanade and estimateAffinePartial2D, with the telemetry's attitude."""
 
@@ -231,12 +221,8 @@ class Steps:
 
 def velocities(flight: Recorded, stride: int) -> dict[str, Steps]:
     """Each way to a velocity over the same frames, in turns."""
-    ours, by_features = VisualOdometry(flight.camera), VisualOdometry(flight.camera, tracker=sift_points)
-    ways: dict[str, Follower] = {
-        "scenematch": ours.update,
-        "engine's SIFT in the same": by_features.update,
-        "OpenCV, affine": Affine(flight.camera),
-    }
+    ours, peer = VisualOdometry(flight.camera), Affine(flight.camera)
+    ways: dict[str, Follower] = {"scenematch": ours.update, "OpenCV, affine": peer}
     found, before = {name: Steps() for name in ways}, None
     for frame, _ in flight.frames[::stride]:
         frame, place = without_velocity(frame), flight.true_place_m(frame.timestamp_ns)

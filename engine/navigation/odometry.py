@@ -12,7 +12,6 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -29,8 +28,6 @@ from engine.values import Attitude, Frame, check_positive
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
-Tracker = Callable[[Gray, Gray, Array], tuple[Array, Array]]
-"""Two pictures (H, W) and the homography (3, 3) that is expected between them, to points (N, 2) px of each."""
 
 _SMALL_PX = 160  # width at which a first shift is looked for
 _MAX_SIDE_PX = 640  # larger pictures are made smaller first
@@ -101,14 +98,10 @@ class VisualOdometry:
     Args:
         camera: that took them, its lens included.
         options: settings; the defaults serve.
-        tracker: finds the same points in two pictures; None is :func:`track_corners`.
     """
 
-    def __init__(
-        self, camera: Camera, options: OdometryOptions | None = None, tracker: Tracker | None = None
-    ) -> None:
+    def __init__(self, camera: Camera, options: OdometryOptions | None = None) -> None:
         self._camera, self._options = camera, options or OdometryOptions()
-        self._tracker = tracker or self._track_corners
         self._last: _Picture | None = None
         self._velocity_mps: Array | None = None  # (3,) that is expected of the next step
 
@@ -159,7 +152,7 @@ class VisualOdometry:
         expected = view.homography(moved_m)
         if self._velocity_mps is None:
             expected = _shifted(last.gray, now.gray, expected)
-        points = self._tracker(last.gray, now.gray, expected)
+        points = self._track_corners(last.gray, now.gray, expected)
         agreed = self._agreed(*points)
         if isinstance(agreed, NoMotion):
             return agreed
