@@ -1,6 +1,6 @@
 """Does the covariance mean what it says? NEES and coverage of single fixes, by flight and method.
 
-    python -m bench.accuracy.nees [--docs DIR] [--flights NAME ...]
+    python -m bench.accuracy.nees [--docs DIR] [--flights NAME ... [--map-alone]]
 
 Frames are matched one by one, each with a prior that is 4 m off per axis and says 8 m. What maps and truths are
 known to be off is stated (:data:`RECORDED`) and not fitted to the NEES; the simulated worlds are exact. Writes the
@@ -92,11 +92,10 @@ class Flight:
 
 @dataclass(frozen=True)
 class Sample:
-    """One match: the error (3,) and covariance (3, 3) of its fix, and whether that was refined."""
+    """One match: the error (3,) and covariance (3, 3) of its fix."""
 
     error_m: Array
     covariance_m2: Array
-    is_refined: bool
 
     @property
     def squared_sigmas(self) -> float:
@@ -119,11 +118,11 @@ def town(seed: int, light: str = "noon") -> Flight:
     return Flight(f"town {seed}, {light}", site, plan.camera, frames, np.column_stack([places, ups]), Known(EXACT))
 
 
-def shared(name: str) -> Flight:
+def shared(name: str, *, with_surface: bool = True) -> Flight:
     """Every few frames of a shared flight."""
     known = RECORDED[name]
     accuracy = {"georeference_sigma_m": known.map_m, "slope_sigma_deg": known.slope_deg}
-    return flight_of(recorded(name, EVERY[name], **accuracy), known)
+    return flight_of(recorded(name, EVERY[name], with_surface=with_surface, **accuracy), known)
 
 
 def flight_of(flown: Recorded, known: Known) -> Flight:
@@ -167,7 +166,7 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
         up = np.nan if fix.up_m is None else fix.up_m
         covariance = fix.covariance_m2 + flight.known.truth_m**2 * np.diag([1.0, 1.0, 0.0])
         error_m = np.array([fix.east_m, fix.north_m, up]) - true
-        out.append(Sample(error_m, covariance, fix.stage == "refined"))
+        out.append(Sample(error_m, covariance))
     return out
 
 
@@ -242,11 +241,11 @@ def _stretches(run: list[Sample | None], count: int) -> list[list[Sample]]:
     return [[s for s in part if s is not None and not s.wrong] for part in picked]
 
 
-def measure(names: list[str]) -> list[Row]:
+def measure(names: list[str], *, with_surface: bool = True) -> list[Row]:
     """All rows; towns are grouped."""
     rows = []
     for name in names:
-        flights = [town(*which) for which in TOWNS[name]] if name in TOWNS else [shared(name)]
+        flights = [town(*which) for which in TOWNS[name]] if name in TOWNS else [shared(name, with_surface=with_surface)]
         # Of nust neither roll nor pitch is known, and there is no surface model to refine on.
         methods = ("NCC, peak", "SIFT") if name in MIDDLE else METHODS
         for method in methods:
@@ -284,10 +283,12 @@ def main() -> None:
     parser.add_argument(
         "--flights", nargs="*", default=None, choices=[*TOWNS, *RECORDED], help="print, write nothing"
     )
+    parser.add_argument("--map-alone", action="store_true", help="withhold the surface models of these flights")
     options = parser.parse_args()
     set_threads(1)
-    rows = measure(options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())])
-    if options.flights is not None:
+    names = options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())]
+    rows = measure(names, with_surface=not options.map_alone)
+    if options.flights is not None or options.map_alone:
         return
     rewrite(options.docs / "integrity-measured.md", BEGIN, END, section(rows))
 

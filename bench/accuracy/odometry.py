@@ -1,6 +1,6 @@
 """Visual odometry between fixes: velocities are withheld, and every second 5 s of a flight is not matched.
 
-    python -m bench.accuracy.odometry [FLIGHT ...] [--only gaps|velocities] [--quick]
+    python -m bench.accuracy.odometry [FLIGHT ...] [--quick]
 
 Prints the two tables of docs/odometry.md. Without names it flies those that nothing was fitted to, gazebo-a1 and
 nust; gazebo-a2 and "built-in" are what the covariance was fitted to.
@@ -295,7 +295,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("flights", nargs="*", default=REPORTED)
     parser.add_argument("--quick", action="store_true", help="the first 20 s of each flight")
-    parser.add_argument("--only", choices=["gaps", "velocities"], help="one of the two tables")
     options = parser.parse_args()
     set_threads(1)
     there = [name for name in options.flights if name == BUILT_IN or (SHARED / name).is_dir()]
@@ -304,12 +303,12 @@ def main() -> None:
         flights = [replace(flight, frames=flight.frames[:100]) for flight in flights]
     print("| flight | velocity | drift m per 100 m | median m | worst m | states m | NEES | known | fixed | wrong "
           "| first fix after s | worst s |\n|---" + "|---" * 11 + "|")  # fmt: skip
-    for flight in flights if options.only != "velocities" else ():
+    for flight in flights:
         for row in gap_rows(flight):
             print(row, flush=True)
     print("\n| flight | s apart | by | RMS m/s | drift m per 100 m | NEES | refused | p50 ms | p95 ms |\n|---"
           + "|---" * 8 + "|")  # fmt: skip
-    for flight in flights if options.only != "gaps" else ():
+    for flight in flights:
         for row in velocity_rows(flight, (1, 5)):
             print(row, flush=True)
 

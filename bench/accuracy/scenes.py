@@ -1,10 +1,10 @@
 """What the field is like, simulated and drawn anew: snow, a city on a map that is 5 m off, an oblique camera.
 
-    python -m bench.accuracy.scenes [--scenes snow ...] [--methods ncc sift auto] [--seeds N] [--quick] [--sheet]
+    python -m bench.accuracy.scenes [--scenes snow ...] [--methods ncc sift auto] [--seeds N] [--quick]
                                     [--docs DIR]
 
 Every frame is matched by itself about a prior that is drawn (sigma 15 m), and the flight is followed from its true
-start. Writes docs/field-simulated.md; ``--sheet`` draws its picture instead.
+start. Writes docs/field-simulated.md.
 """
 
 from __future__ import annotations
@@ -227,14 +227,10 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", type=int, default=2, help="how many towns of each scene")
     parser.add_argument("--quick", action="store_true", help="eight frames of each town")
-    parser.add_argument("--sheet", action="store_true", help="draw frames and map of every scene, match nothing")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its picture")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
-    if options.sheet:
-        page.draw([SCENES[name](FIRST_SEED + index, 9) for index, name in enumerate(options.scenes)], options.docs)
-        return
     results: dict[tuple[str, str, str], list[Result]] = {}
     for name in options.scenes:
         for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):

@@ -1,4 +1,4 @@
-"""docs/field-simulated.md: the tables and the picture of :mod:`bench.accuracy.scenes`."""
+"""docs/field-simulated.md: the tables of :mod:`bench.accuracy.scenes`."""
 
 from __future__ import annotations
 
@@ -6,17 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from bench.pages.field import COLUMNS, outcome
 from bench.pages.text import machine, paragraph, table
-from engine.values import Window
 
 if TYPE_CHECKING:
     from bench.accuracy.field import Figures
-    from bench.accuracy.scenes import Scene
 
 TITLES = {
     "snow": "Snow on the map of summer: the paper's flight and camera in winter",
@@ -37,8 +31,6 @@ FIGURES = (
     "on the map, which leaves out the map's own error of 5 m; **outside** are outside the ellipse of three of "
     "their own sigmas about the true position, **wrong** are more than 10 m from it."
 )
-CELL_PX = 260
-PICTURE = "field-simulated.png"
 
 
 @dataclass(frozen=True)
@@ -55,8 +47,6 @@ class Row:
 def write(docs: Path, rows: list[Row]) -> None:
     """Write the page below ``docs``."""
     lines = ["# The field, simulated", "", *paragraph(INTRO.format(machine=machine())), *paragraph(FIGURES)]
-    lines += [f"![frames and maps of the scenes](img/{PICTURE})", ""]
-    lines += ["A scene a row, in the order of the tables: three frames, and its map on the right.", ""]
     for scene in dict.fromkeys(row.scene for row in rows):
         lines += paragraph(f"**{TITLES[scene]}.**")
         own = [_cells(row) for row in rows if row.scene == scene]
@@ -68,26 +58,3 @@ def _cells(row: Row) -> list[str]:
     fixed, *cells = outcome(row.true, row.on_map)
     share = f"{fixed}, {100.0 * row.true.fixed / row.true.frames:.0f} %"
     return [NAMES[row.true.method], row.how, str(row.true.frames), share, *cells]
-
-
-def draw(scenes: list[Scene], docs: Path) -> None:
-    """A row for each scene: three of its frames, and its map."""
-    cells = [[*(frame.image for frame in scene.frames[::3][:3]), _map(scene)] for scene in scenes]
-    rows = [np.hstack([_cell(image) for image in row]) for row in cells]
-    (docs / "img").mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(docs / "img" / PICTURE), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
-
-
-def _map(scene: Scene) -> NDArray[np.uint8]:
-    site = scene.site
-    return site.gray(Window(0, 0, site.width_px, site.height_px))
-
-
-def _cell(image: object) -> NDArray[np.uint8]:
-    picture = np.asarray(image, np.uint8)
-    picture = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
-    side = min(picture.shape[:2])
-    top, left = ((n - side) // 2 for n in picture.shape[:2])
-    square = picture[top : top + side, left : left + side]
-    small = cv2.resize(square, (CELL_PX - 4, CELL_PX - 4), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.copyMakeBorder(small, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=(255,) * 3), np.uint8)
