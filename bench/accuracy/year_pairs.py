@@ -1,7 +1,7 @@
 """Pictures of one year matched on the map of another: how many are answered, and how many answers are wrong.
 
     python -m bench.accuracy.year_pairs [--half report|fit] [--set naip-cities|naip] [--methods NCC,SIFT]
-                                        [--matches N] [--seed N] [--json FILE]
+                                        [--matches N] [--seed N]
 
 Every second match has no answer on its map. Nothing may be fitted on the half "report".
 """
