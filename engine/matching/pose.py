@@ -4,7 +4,7 @@
 an a-contrario test bounds the expected number of poses with as many inliers by chance.
 
 Convention:
-    ``cam_from_map``: x_cam = R X_map + t, camera axes x right, y down, z forward; map axes in metres, z up.
+    ``cam_from_map``: x_cam = R (X - C), camera axes x right, y down, z forward; map axes in metres, z up.
     Pixels are those of a pinhole camera, distortion already taken out.
 
 References:
