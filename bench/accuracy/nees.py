@@ -245,7 +245,7 @@ def measure(names: list[str], *, with_surface: bool = True) -> list[Row]:
     """All rows; towns are grouped."""
     rows = []
     for name in names:
-        flights = [town(*which) for which in TOWNS[name]] if name in TOWNS else [shared(name, with_surface=with_surface)]
+        flights = [town(*which) for which in TOWNS.get(name, ())] or [shared(name, with_surface=with_surface)]
         # Of nust neither roll nor pitch is known, and there is no surface model to refine on.
         methods = ("NCC, peak", "SIFT") if name in MIDDLE else METHODS
         for method in methods:

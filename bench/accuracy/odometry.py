@@ -120,7 +120,8 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
     navigator = Navigator(gappy, start, options=NavigatorOptions(odometry=velocity == PICTURES))
     gaps, way_m, before, ended_ns, middle_m = Gaps(), 0.0, None, None, np.zeros(2)
     for index, frame in enumerate(frames):
-        result, place, stamp_ns = navigator.update(frame), flight.true_place_m(frame.timestamp_ns), frame.timestamp_ns or 0
+        result, stamp_ns = navigator.update(frame), frame.timestamp_ns or 0
+        place = flight.true_place_m(stamp_ns)
         withheld = gappy.withholds(frame)
         if isinstance(result, Fix) and flight.name in MIDDLE:
             seen = moved_to_middle(result, flight.site, flight.camera)

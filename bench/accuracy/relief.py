@@ -28,7 +28,9 @@ DAYS = ("noon", "evening")
 BEGIN, END = "<!-- bench.accuracy.relief -->", "<!-- end of bench.accuracy.relief -->"
 
 
-def flights(seeds: tuple[int, ...], reliefs_m: tuple[float, ...], frames: int | None) -> Iterator[tuple[float, Run]]:
+def flights(
+    seeds: tuple[int, ...], reliefs_m: tuple[float, ...], frames: int | None
+) -> Iterator[tuple[float, Run]]:
     """All flights with the height of their hills; every hilly town has its river, its map is of noon."""
     for seed in seeds:
         for relief_m in reliefs_m:

@@ -191,7 +191,8 @@ def measure() -> list[list[str]]:
         rows.append([f"the same on the map of another town ({count}); fitted on", *cells])
     for name, (title, step) in RECORDED.items():
         flight = flown(name, step)
-        rows.append([f"{title} ({len(flight.frames)})", *per_score(lambda score, f=flight: outcome(fly(f, score)))])
+        cells = per_score(lambda score, f=flight: outcome(fly(f, score)))
+        rows.append([f"{title} ({len(flight.frames)})", *cells])
     years = {int(year): farmland(year) for year in vintages()}
     pairs = list(permutations(years, 2))
     fitted = [pair for pair in pairs if not (pair[0] % 2 or pair[1] % 2)]

@@ -36,7 +36,8 @@ class Growth:
     def look(self, messages: int) -> None:
         """Look, after a collection."""
         gc.collect()
-        self.seen.append((messages, rss_mb() * 1e6 / 1024, len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))))
+        files, threads = (len(os.listdir(f"/proc/self/{kind}")) for kind in ("fd", "task"))
+        self.seen.append((messages, rss_mb() * 1e6 / 1024, files, threads))
 
     def rows(self) -> list[list[str]]:
         """After the first tenth, in which tables and caches fill."""

@@ -175,7 +175,8 @@ class Standin:
         self._port, self._on_fix, self._settle, self._delay_ms = port, on_fix, settle, delay_ms
         self._random, self._silent_until_ns = random.Random(1), 0
         self.socket = self._dial()
-        self.origin: tuple[int, int, int] | None = (round(place.lat_deg * 1e7), round(place.lon_deg * 1e7), 500_000)
+        lat_1e7, lon_1e7 = round(place.lat_deg * 1e7), round(place.lon_deg * 1e7)
+        self.origin: tuple[int, int, int] | None = (lat_1e7, lon_1e7, 500_000)
         self._boot(agenda.clock() - 120 * S)
         agenda.every(TICK_NS, self._burst, agenda.clock())
 

@@ -43,7 +43,8 @@ PEERS = (
 
 def write(docs: Path, rows: list[Figures]) -> None:
     """Write the page below ``docs``."""
-    lines = ["# The field", "", *paragraph(INTRO.format(machine=machine())), *paragraph(FIGURES), *paragraph(PEERS)]
+    lines = ["# The field", "", *paragraph(INTRO.format(machine=machine()))]
+    lines += [*paragraph(FIGURES), *paragraph(PEERS)]
     for flight in dict.fromkeys(row.flight for row in rows):
         own = [_cells(row) for row in rows if row.flight == flight]
         lines += [f"## {TITLES[flight]}", "", *table(COLUMNS, own)]
