@@ -187,6 +187,11 @@ _CELLS = (
     ",", "\n", "\r", "[", "{", "null", "true", str(2**63), str(-(2**63)), str(2**63 - 1), "1e-320", "-->",
 )  # fmt: skip
 
+_STRANGE: tuple[Any, ...] = (
+    None, True, -1, 10**400, 1e308, float("nan"), "", "LineString", [], {}, [[]], {"type": "Feature"}, [1],
+    [1, 2, 3],
+)  # fmt: skip
+
 
 def damaged(rng: random.Random, data: bytes) -> bytes:
     """Bytes turned, cut, repeated, moved, or put in."""
@@ -228,24 +233,6 @@ def garbled(rng: random.Random, data: bytes) -> bytes:
 def rebuilt(rng: random.Random, data: bytes) -> bytes:
     """JSON of which one value is another, of any kind and depth."""
     content = json.loads(data)
-    strange: Any = rng.choice(
-        (
-            None,
-            True,
-            -1,
-            10**400,
-            1e308,
-            float("nan"),
-            "",
-            "LineString",
-            [],
-            {},
-            [[]],
-            {"type": "Feature"},
-            [1],
-            [1, 2, 3],
-        )
-    )
     if rng.random() < 0.1:
         return (b"[" * 100_000) if rng.random() < 0.5 else b'{"type":"Feature","geometry":' * 5000
     places: list[tuple[Any, Any]] = []
@@ -258,7 +245,7 @@ def rebuilt(rng: random.Random, data: bytes) -> bytes:
 
     walk(content)
     node, key = rng.choice(places)
-    node[key] = strange
+    node[key] = rng.choice(_STRANGE)
     return json.dumps(content).encode()
 
 
