@@ -18,15 +18,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench import DOCS
 from bench.inputs.faults import Fault, FlightInputs, faults, load
-from bench.pages.text import table
+from bench.pages.text import rewrite, table
 from engine import Fix, Navigator, Prior, SceneMatcher
+from engine.navigation.telemetry_errors import Calibration
 from engine.runtime.threads import set_threads
 from scenematch.check import diagnose
 from scenematch.files.truth import interpolate_truth
 
+Array = NDArray[np.float64]
 BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
 START_SIGMA_M = 15.0
@@ -58,16 +61,46 @@ class Cell:
     named: str = ""
 
 
-def fly(inputs: FlightInputs, stamps_ns: list[int], flight: str, fault: str, method: str) -> Cell:
-    """One flight; ``stamps_ns`` are the true ones of its frames."""
+@dataclass(frozen=True)
+class Flown:
+    """A flight by one method.
+
+    Attributes:
+        error_m, chi_square: of each fix whose true place is known.
+        history: the calibration after each frame.
+    """
+
+    error_m: Array
+    chi_square: Array
+    history: list[Calibration]
+
+    @property
+    def rms_m(self) -> float | None:
+        """None without a fix."""
+        return float(np.sqrt(np.mean(self.error_m**2))) if len(self.error_m) else None
+
+    @property
+    def nees(self) -> float | None:
+        """Per axis; None without a fix."""
+        return float(self.chi_square.mean() / 2) if len(self.error_m) else None
+
+
+def start_of(inputs: FlightInputs, stamp_ns: int) -> Prior:
+    """The true place at a moment."""
+    first = interpolate_truth(inputs.truth, stamp_ns)
+    assert first is not None
+    return Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
+
+
+def fly(inputs: FlightInputs, stamps_ns: list[int], method: str) -> Flown:
+    """Follow a flight from its true place; ``stamps_ns`` are the true ones of its frames."""
     site = inputs.site()
     matcher = SceneMatcher(site, inputs.camera, method, "cpu")
-    first = interpolate_truth(inputs.truth, stamps_ns[0])
-    assert first is not None
-    navigator = Navigator(matcher, Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M))
-    off_m, chi = [], []
+    navigator = Navigator(matcher, start_of(inputs, stamps_ns[0]))
+    off_m, chi, history = [], [], []
     for frame, stamp_ns in zip(inputs.frames, stamps_ns, strict=True):
         result = navigator.update(frame)
+        history.append(navigator.calibration)
         there = interpolate_truth(inputs.truth, stamp_ns)
         if not isinstance(result, Fix) or there is None:
             continue
@@ -75,32 +108,29 @@ def fly(inputs: FlightInputs, stamps_ns: list[int], flight: str, fault: str, met
         off = np.array([result.east_m - east, result.north_m - north])
         off_m.append(math.hypot(*off))
         chi.append(float(off @ np.linalg.solve(result.covariance_m2[:2, :2], off)))
-    error, chi_square = np.array(off_m), np.array(chi)
-    false = int(((error > FALSE_M) & (chi_square > FALSE_SIGMAS**2)).sum())
-    if not off_m:
-        return Cell(flight, fault, method, len(inputs.frames), 0, 0, None, None, None)
-    rms_m = float(np.sqrt(np.mean(error**2)))
-    return Cell(
-        flight, fault, method, len(inputs.frames), len(error), false, rms_m, float(chi_square.mean() / 2),
-        float(error.max()),
-    )  # fmt: skip
+    return Flown(np.array(off_m), np.array(chi), history)
+
+
+def stamps_of(inputs: FlightInputs) -> list[int]:
+    """Of its frames."""
+    return [frame.timestamp_ns or 0 for frame in inputs.frames]
 
 
 def cell(inputs: FlightInputs, fault: Fault, flight: str, method: str) -> Cell:
     """A flight with a fault; its true stamps go with its pictures."""
     spoiled = fault.spoil(inputs)
-    stamps = [frame.timestamp_ns or 0 for frame in inputs.frames]
-    if len(spoiled.frames) != len(stamps):
-        stamps = [frame.timestamp_ns or 0 for frame in spoiled.frames]
-    return fly(spoiled, stamps, flight, fault.name, method)
+    stamps = stamps_of(inputs if len(inputs.frames) == len(spoiled.frames) else spoiled)
+    flown = fly(spoiled, stamps, method)
+    false = int(((flown.error_m > FALSE_M) & (flown.chi_square > FALSE_SIGMAS**2)).sum())
+    largest_m = float(flown.error_m.max()) if len(flown.error_m) else None
+    counts = len(stamps), len(flown.error_m), false
+    return Cell(flight, fault.name, method, *counts, flown.rms_m, flown.nees, largest_m)
 
 
 def diagnosed(inputs: FlightInputs, fault: Fault) -> tuple[str, str]:
     """Whether a diagnosis names it, and what it says."""
     spoiled = fault.spoil(inputs)
-    first = interpolate_truth(inputs.truth, inputs.frames[0].timestamp_ns or 0)
-    assert first is not None
-    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
+    start = start_of(inputs, inputs.frames[0].timestamp_ns or 0)
     found = diagnose(
         spoiled.frames, spoiled.frames.__getitem__, spoiled.site(), spoiled.camera, start=start
     ).findings
@@ -185,10 +215,7 @@ def main() -> None:
             print(_row(found), flush=True)
     print(f"{len(cells)} cells in {time.monotonic() - begin:.0f} s")
     if wanted.docs is not None:
-        page = wanted.docs / "wrong-inputs.md"
-        before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-        text = "\n".join([BEGIN, "", *lines_of(cells), END])
-        page.write_text(before + text + rest.split(END)[1], encoding="utf-8")
+        rewrite(wanted.docs / "wrong-inputs.md", BEGIN, END, lines_of(cells))
 
 
 if __name__ == "__main__":

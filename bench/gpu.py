@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from bench.inputs.scenes import flight, pair
 from bench.pages.text import table
 from engine import Fix, SceneMatcher
-from engine.kernels.peak_tensors import match as match_on_device
-from engine.ncc_fft import Search, match_template, match_templates, prepare
+from engine.ncc_fft import match_template, match_templates, prepare
 from engine.runtime.device import resolve, synchronise
 from engine.values import Peak
 
@@ -86,65 +84,8 @@ def directions(names: list[str]) -> tuple[int, int]:
     return sum("Memcpy HtoD" in name for name in names), sum("Memcpy DtoH" in name for name in names)
 
 
-Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
-
-
-def captured(work: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
-    """What replays the work on a GPU, and where its result is then."""
-    aside = torch.cuda.Stream()
-    aside.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(aside):
-        for _ in range(3):  # plans, compiled kernels and constants are made outside the capture
-            work()
-    torch.cuda.current_stream().wait_stream(aside)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        output = work()
-    return graph.replay, output
-
-
-class Replayed:
-    """A function of tensors on a GPU as one CUDA graph, or the function itself where that cannot be captured.
-
-    The first replay must give what the function gave, bit for bit.
-
-    Args:
-        function: of tensors of fixed shapes to one tensor; it neither copies to the host nor waits.
-        inputs: an example.
-        capture: how it is captured.
-    """
-
-    def __init__(
-        self, function: Callable[..., Tensor], inputs: tuple[Tensor, ...], capture: Capture = captured
-    ) -> None:
-        self._function = function
-        self._inputs = tuple(tensor.clone() for tensor in inputs)
-        self._replay: Callable[[], None] | None = None
-        expected = function(*inputs).clone()
-        try:
-            replay, self._output = capture(lambda: function(*self._inputs))
-            self._output.zero_()
-            replay()
-        except RuntimeError:  # of CUDA, about what cannot be captured
-            return
-        if torch.equal(self._output, expected):
-            self._replay = replay
-
-    @property
-    def is_captured(self) -> bool:
-        return self._replay is not None
-
-    def __call__(self, *inputs: Tensor) -> Tensor:
-        if self._replay is None:
-            return self._function(*inputs)
-        for own, given in zip(self._inputs, inputs, strict=True):
-            own.copy_(given)
-        self._replay()
-        return self._output
-
-
 def matches(size: tuple[int, int], device: torch.device, rounds: int, batch: int) -> list[Row]:
-    """NCC of one window with one template, the same as a CUDA graph, and a batch of it."""
+    """NCC of one window with one template, and a batch of it."""
     picture, cut = (torch.from_numpy(part) for part in pair(*size))
     expected = match_template(prepare(picture), cut, exclusion_px=EXCLUSION_PX, exhaustive=True)
     search, pinned = prepare(picture.to(device)), cut.pin_memory() if device.type == "cuda" else cut
@@ -159,24 +100,9 @@ def matches(size: tuple[int, int], device: torch.device, rounds: int, batch: int
         return match_templates([search] * batch, list(there), exclusion_px=EXCLUSION_PX)
 
     rows.append(Row(name, timed(one, device, rounds), 1, apart([one()], expected), copies(one, device)))
-    if device.type == "cuda":
-        rows.append(_by_graph(name, search, pinned, device, rounds))
     times = timed(many, device, max(1, rounds // 10))
     rows.append(Row(name, times, batch, apart(many(), expected), copies(many, device)))
     return rows
-
-
-def _by_graph(name: str, search: Search, template: Tensor, device: torch.device, rounds: int) -> Row:
-    inputs = (search.image[None], search.sums[None], template.to(device)[None])
-    graph = Replayed(lambda *tensors: match_on_device(*tensors, EXCLUSION_PX), inputs)
-    eager = match_on_device(*inputs, EXCLUSION_PX).cpu()
-
-    def one() -> Tensor:
-        return graph(*inputs[:2], template.to(device, non_blocking=True)[None]).cpu()
-
-    off = float((one() - eager).abs().max())
-    task = f"{name}, CUDA graph" if graph.is_captured else f"{name}, not captured"
-    return Row(task, timed(one, device, rounds), 1, f"{off:.0e} (eager)", copies(one, device))
 
 
 def apart(found: list[Peak], expected: Peak) -> str:

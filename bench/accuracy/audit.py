@@ -21,16 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
+from bench.accuracy.confidence import fitted
 from bench.accuracy.flights import STEPS, Recorded, recorded
-from bench.accuracy.scores import vintages
+from bench.inputs.farmland import farmland
 from bench.inputs.scenes import mosaic
+from bench.pages.integrity import auc
 from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.matching.align import view_of
 from engine.runtime.threads import set_threads
-from engine.values import Attitude, Truth, Window
+from engine.values import Attitude, Window
 from scenematch.check.availability import Audit, audit_site, regressors
-from scenematch.files.truth import interpolate_truth
 from scenematch.simulator import build_town
 
 Array = NDArray[np.float64]
@@ -43,8 +44,8 @@ START_SIGMA_M = 15.0
 CAMERA = Camera.from_fov(300, 300, 60.0)
 HEIGHTS_M = (40.0, 60.0, 120.0)
 PRIOR_SIGMA_M = 10.0  # as AuditOptions
-FIT_TOWNS, FIT_YEARS = (11, 12, 13), (2010, 2015)
-TOWNS, YEARS = (31, 32, 33), (2012, 2016, 2018, 2020)
+FIT_TOWNS, FIT_YEARS = (11, 12, 13), ("2010", "2015")
+TOWNS, YEARS = (31, 32, 33), ("2012", "2016", "2018", "2020")
 UTM = "EPSG:32614"
 GRID = np.array([[0.5, 0.0, 600_000.0], [0.0, -0.5, 4_500_000.0]])
 
@@ -120,8 +121,7 @@ def half(gray: Gray, *, east: bool) -> Gray:
 def fitted_on() -> Iterator[Ground]:
     yield from map(town, FIT_TOWNS)
     yield from map(patchwork, FIT_TOWNS)
-    years = vintages(SHARED / "naip")
-    yield from (arrays(half(years[year], east=False)) for year in FIT_YEARS)
+    yield from (arrays(half(farmland(year), east=False)) for year in FIT_YEARS)
 
 
 def reported_on() -> Iterator[tuple[str, Callable[[], list[Ground]]]]:
@@ -130,7 +130,7 @@ def reported_on() -> Iterator[tuple[str, Callable[[], list[Ground]]]]:
     yield "their patchwork with water, forest and repeated fields", lambda: list(map(patchwork, TOWNS))
     if not SHARED.is_dir():
         return
-    years = {year: half(gray, east=True) for year, gray in vintages(SHARED / "naip").items()}
+    years = {year: half(farmland(year), east=True) for year in YEARS}
     yield "the other half of the farmland, four other years", lambda: [arrays(years[year]) for year in YEARS]
     pairs = list(pairwise(YEARS))
     yield "the same, each year's frames on the map before", lambda: [arrays(years[a], years[b]) for a, b in pairs]
@@ -220,27 +220,14 @@ def all_trials(grounds: list[Ground], count: int, seed: int) -> list[Trial]:
 # ---------------------------------------------------------------------------------------------------- figures
 
 
-def auc(predicted: Array, right: NDArray[np.bool_]) -> float:
-    """Probability that a place with a fix was held in higher esteem than one without; NaN where all are alike."""
-    good, bad = predicted[right], predicted[~right]
-    if not (good.size and bad.size):
-        return float("nan")
-    return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
-
-
 def auc_of(found: list[Trial]) -> float:
     return auc(np.array([t.predicted for t in found]), np.array([t.right for t in found], bool))
 
 
-def fit(found: list[Trial]) -> Array:
-    """Weights of the logistic rule, by Newton's method with a weak ridge."""
+def fit(found: list[Trial]) -> tuple[float, ...]:
+    """Weights of the logistic rule."""
     x = np.column_stack([np.ones(len(found)), np.array([t.features for t in found])])
-    y, weights = np.array([t.right for t in found], np.float64), np.zeros(x.shape[1])
-    for _ in range(30):
-        p = 1.0 / (1.0 + np.exp(-x @ weights))
-        hessian = (x * (p * (1 - p))[:, None]).T @ x + 0.1 * np.eye(x.shape[1])
-        weights = weights + np.linalg.solve(hessian, x.T @ (y - p) - 0.1 * weights)
-    return weights
+    return fitted(x, np.array([t.right for t in found], bool))
 
 
 def places_rows(count: int) -> list[list[str]]:
@@ -268,7 +255,7 @@ def other_rows(count: int) -> list[list[str]]:
     """Farmland four years on, by an audit of one year and by one that sees the year between as well."""
     if not SHARED.is_dir():
         return []
-    years = {year: half(gray, east=True) for year, gray in vintages(SHARED / "naip").items()}
+    years = {year: half(farmland(year), east=True) for year in YEARS}
     grounds, shown = [], []
     for first, between, last in zip(YEARS, YEARS[1:], YEARS[2:], strict=False):
         grounds.append(arrays(years[first], years[last]))
@@ -290,7 +277,7 @@ def flight_rows(quick: bool) -> list[list[str]]:
         start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
         navigator = Navigator(SceneMatcher(flight.site, flight.camera, "ncc", "cpu"), start)
         right = np.array([is_right(navigator.update(frame, prior), flight) for frame, prior in flight.frames])
-        predicted = np.array([held(found, flight.site, frame, flight.truth) for frame, _ in flight.frames])
+        predicted = np.array([held(found, flight, frame) for frame, _ in flight.frames])
         known = np.isfinite(predicted)
         inside = auc(predicted[known], right[known])
         rows.append([
@@ -303,19 +290,16 @@ def flight_rows(quick: bool) -> list[list[str]]:
 
 def is_right(result: Fix | NoFix, flight: Recorded) -> bool:
     """Whether there is a fix, and that near the truth."""
-    if not isinstance(result, Fix) or result.timestamp_ns is None:
+    place_m = flight.true_place_m(result.timestamp_ns)
+    if not isinstance(result, Fix) or place_m is None:
         return False
-    row = interpolate_truth(flight.truth, result.timestamp_ns)
-    if row is None:
-        return False
-    east, north = flight.site.frame.enu_from_geodetic(row.lat_deg, row.lon_deg)
-    return math.hypot(result.east_m - east, result.north_m - north) <= WRONG_M
+    return math.hypot(result.east_m - place_m[0], result.north_m - place_m[1]) <= WRONG_M
 
 
-def held(found: Audit, site: OrthoMap, frame: Frame, truth: list[Truth]) -> float:
+def held(found: Audit, flight: Recorded, frame: Frame) -> float:
     """What the audit says of where a frame was taken; NaN where nobody knows where that was."""
-    row = None if frame.timestamp_ns is None else interpolate_truth(truth, frame.timestamp_ns)
-    return float("nan") if row is None else float(found.at(site.pixel_from_geodetic(row.lat_deg, row.lon_deg)))
+    place_m = flight.true_place_m(frame.timestamp_ns)
+    return float("nan") if place_m is None else float(found.at(flight.site.pixel_from_enu(place_m)))
 
 
 def time_rows() -> list[list[str]]:

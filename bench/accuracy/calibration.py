@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.faults import Flown, fly, shown, stamps_of, start_of
 from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
-from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.navigation.telemetry_errors import Calibration
 from engine.runtime.threads import set_threads
 from scenematch.check import Finding, diagnose
@@ -27,7 +27,6 @@ from scenematch.files.truth import interpolate_truth
 
 Array = NDArray[np.float64]
 Measured = tuple[float, float]  # a value and its standard deviation
-START_SIGMA_M = 15.0
 CLOSE = 0.2  # of the error, within which it counts as recovered
 
 
@@ -109,58 +108,20 @@ ERRORS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Flown:
-    """What came of a flight: fixes, their RMS and NEES, and the calibration after each frame."""
-
-    fixed: int
-    rms_m: float
-    nees: float
-    time_s: Array
-    history: list[Calibration]
-
-
-def fly(inputs: FlightInputs, true: FlightInputs, method: str) -> Flown:
-    """Follow a flight from its true place; ``true`` has the true stamps of the same frames."""
-    site = inputs.site()
-    first = interpolate_truth(true.truth, true.frames[0].timestamp_ns or 0)
-    assert first is not None
-    navigator = Navigator(
-        SceneMatcher(site, inputs.camera, method, "cpu"),
-        Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M),
-    )
-    square, chi, history = [], [], []
-    for frame, there in zip(inputs.frames, true.frames, strict=True):
-        result = navigator.update(frame)
-        history.append(navigator.calibration)
-        place = interpolate_truth(true.truth, there.timestamp_ns or 0)
-        if isinstance(result, Fix) and place is not None:
-            east, north = site.frame.enu_from_geodetic(place.lat_deg, place.lon_deg)[:2]
-            off = np.array([result.east_m - east, result.north_m - north])
-            square.append(off @ off)
-            chi.append(float(off @ np.linalg.solve(result.covariance_m2[:2, :2], off)) / 2)
-    stamps = np.array([frame.timestamp_ns or 0 for frame in true.frames]) * 1e-9
-    return Flown(
-        len(square), float(np.sqrt(np.mean(square or [np.nan]))), float(np.mean(chi or [np.nan])),
-        stamps - stamps[0], history,
-    )  # fmt: skip
-
-
-def converged_s(flown: Flown, error: Error, truth: float) -> float | None:
+def converged_s(flown: Flown, true: FlightInputs, error: Error, truth: float) -> float | None:
     """Since when the value was within three sigmas and a fifth of the error, to the end."""
     since: float | None = None
-    for time_s, found in zip(flown.time_s, flown.history, strict=True):
+    for stamp_ns, found in zip(stamps_of(true), flown.history, strict=True):
         value = error.measured(found)
         good = value is not None and abs(value[0] - truth) <= min(3.0 * value[1], CLOSE * abs(error.size))
+        time_s = (stamp_ns - stamps_of(true)[0]) * 1e-9
         since = (time_s if since is None else since) if good else None
     return since
 
 
 def named(inputs: FlightInputs, true: FlightInputs) -> list[Finding]:
     """What ``check`` finds."""
-    first = interpolate_truth(true.truth, true.frames[0].timestamp_ns or 0)
-    assert first is not None
-    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
+    start = start_of(true, true.frames[0].timestamp_ns or 0)
     return diagnose(inputs.frames, inputs.frames.__getitem__, inputs.site(), inputs.camera, start=start).findings
 
 
@@ -173,27 +134,31 @@ def cured(inputs: FlightInputs, error: Error, found: Finding) -> FlightInputs:
     return error.cure(value)(inputs)
 
 
+def figures(flown: Flown) -> str:
+    """Fixes, RMS and NEES."""
+    return f"{len(flown.error_m)}, RMS {shown(flown.rms_m)} m, NEES {shown(flown.nees)}"
+
+
 def row(error: Error, true: FlightInputs, method: str, right: Flown, found: list[Finding]) -> str:
     """A line of the table."""
     inputs = error.spoil(true)
-    before = fly(inputs, true, method)
+    before = fly(inputs, stamps_of(true), method)
     truth = error.size + error.own(true)
-    value, since = error.measured(before.history[-1]), converged_s(before, error, truth)
+    value, since = error.measured(before.history[-1]), converged_s(before, true, error, truth)
     learnt = "-" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
     soon = "-" if since is None else f"{since:.1f} s"
     rightly = [one for one in found if one.cause in error.causes and one.value is not None]
     if rightly:
         one = rightly[0]
-        after = fly(cured(inputs, error, one), true, method)
+        after = fly(cured(inputs, error, one), stamps_of(true), method)
         said = f"{one.cause} {one.value:.3g} ± {one.sigma or 0.0:.2g}"
-        rest = f"{after.fixed}, {after.rms_m:.2f} m, NEES {after.nees:.2f}"
+        rest = figures(after)
     else:
         said, rest = ", ".join(one.cause for one in found) or "silent", "-"
-    count = len(true.frames)
     return (
         f"{error.name:18s} {method:5s} learnt {learnt:16s} of {truth:.3g}  within {soon:7s} "
-        f"check: {said:24s} as given {before.fixed} of {count}, {before.rms_m:.2f} m, NEES {before.nees:.2f}; "
-        f"cured {rest}; right {right.fixed}, {right.rms_m:.2f} m"
+        f"check: {said:24s} as given {figures(before)} of {len(true.frames)}; "
+        f"cured {rest}; right {figures(right)}"
     )
 
 
@@ -209,8 +174,8 @@ def main() -> None:
     set_threads(1)
     for folder in wanted.folders:
         true = load(folder, wanted.map, wanted.step, wanted.count)
-        right = {method: fly(true, true, method) for method in wanted.methods}
-        print(f"{folder.name}, {len(true.frames)} frames, {right['ncc'].time_s[-1]:.0f} s", flush=True)
+        right = {method: fly(true, stamps_of(true), method) for method in wanted.methods}
+        print(f"{folder.name}, {len(true.frames)} frames", flush=True)
         for error in ERRORS:
             found = named(error.spoil(true), true)
             for method in wanted.methods:

@@ -1,10 +1,9 @@
-"""All shared real flights by every method, beside the paper's recipe and the plain classical one.
+"""All shared real flights by every method, beside the paper's recipe.
 
     python -m bench.accuracy.field [--methods ncc sift ...] [--sets brighton ...] [--step N] [--weights FILE]
-                                   [--docs DIR] [--save-before]
+                                   [--docs DIR]
 
-Each flight goes through :func:`scenematch.track`, as a user would run it. Writes docs/field.md; ``--save-before``
-writes the figures that the page then compares with.
+Each flight goes through :func:`scenematch.track`, as a user would run it. Writes docs/field.md.
 """
 
 from __future__ import annotations
@@ -22,16 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
-from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
-from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
+from engine import Fix, Navigator, SceneMatcher
 from engine.options import ACCEPT_ALL, LearnedOptions
 from engine.runtime.threads import set_threads
-from engine.values import Window
 from scenematch import FlightFiles, TrackSettings, track
 from scenematch.files.track import TrackRow, read_track, track_row
-from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightInputs, open_inputs
@@ -40,13 +36,9 @@ Array = NDArray[np.float64]
 
 REAL = ("brighton", "seneca", "caliterra", "nust")
 DRAWN = {"gazebo-a1": 8, "gazebo-a2": 8, "gazebo-a1-evening": 8}
-RECIPE_STEPS = {"nust": 4, "caliterra": 2, "gazebo-a1": 24, "gazebo-a2": 24, "gazebo-a1-evening": 24}
-METHODS = ("ncc", "sift", "auto", "learned", "paper-ncc", "paper-sift", "classical")
+METHODS = ("ncc", "sift", "auto", "learned", "paper-ncc", "paper-sift")
 VIDEO = "flight.mp4"
 START_SIGMA_M = 15.0
-SHIFT_M, MIN_SHIFT_M, DIRECTIONS = 200.0, 60.0, 8
-SHIFTED_WINDOWS = 2
-BEFORE = Path(__file__).parents[1] / "pages" / "field_before.json"
 
 
 @dataclass(frozen=True)
@@ -75,25 +67,6 @@ class Figures:
     wrong: int
     outside: int | None
     p50_ms: float
-
-
-@dataclass(frozen=True)
-class Votes:
-    """The votes of the classical recipe over the frames of one flight.
-
-    Attributes:
-        flight: name.
-        right: for the true place.
-        rival: the most for a place of the same window that is more than 10 m from the truth.
-        shifted: the most in a window that is moved to where the frame was not taken.
-        shift_m: how far those windows were moved.
-    """
-
-    flight: str
-    right: list[int]
-    rival: list[int]
-    shifted: list[int]
-    shift_m: list[float]
 
 
 def inputs_of(name: str, step: int) -> tuple[FlightFiles, FlightInputs]:
@@ -181,87 +154,10 @@ def figures(
     )
 
 
-# ------------------------------------------------------------------------- the plain classical recipe
-
-
-def vote(name: str, step: int, seed: int = 1) -> tuple[Figures, Votes]:
-    """The recipe on each frame by itself, in a window about the telemetry's position, else about a drawn one."""
-    _, inputs = inputs_of(name, step)
-    site, rng = inputs.site, np.random.default_rng(seed)
-    recipe = ClassicalRecipe(site, inputs.camera)
-    recipe.prepare()
-    errors, spent = [], []
-    votes = Votes(name, [], [], [], [])
-    for item in inputs.flight:
-        truth = interpolate_truth(inputs.truth or [], item.frame.timestamp_ns or 0)
-        if truth is None:
-            continue
-        true = site.pixel_from_enu(site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg))
-        centre = _expected(site, item.prior, true, rng)
-        begin = time.perf_counter()
-        found = _vote_once(recipe, item.frame, centre, true, votes)
-        # The windows of another place are not part of it.
-        spent.append((time.perf_counter() - begin) * 1e3 - found[1])
-        errors.append(found[0])
-    return figures((name, "classical", step), np.array(errors), None, spent), votes
-
-
-def _expected(site: OrthoMap, prior: Prior | None, true: Array, rng: np.random.Generator) -> Array:
-    if prior is None or prior.lat_deg is None:
-        return np.asarray(true + rng.normal(0.0, START_SIGMA_M / site.gsd_m_per_px, 2))
-    return np.asarray(site.pixel_from_enu(site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)))
-
-
-def _vote_once(
-    recipe: ClassicalRecipe, frame: Frame, centre: Array, true: Array, votes: Votes
-) -> tuple[float, float]:
-    """Error in metres, NaN where there is no answer, and the time of what is not the recipe's own."""
-    gsd = recipe.site.gsd_m_per_px
-    projected = recipe.rectified(frame)
-    if projected is None or frame.height_agl_m is None:
-        return np.nan, 0.0
-    features, view = projected
-    half, tolerance = 3.0 * START_SIGMA_M / gsd, TOLERANCE_SHARE * frame.height_agl_m / gsd
-    election = recipe.elect(features, centre, half, tolerance)
-    begin = time.perf_counter()
-    votes.right.append(election.at(true))
-    votes.rival.append(election.away_from(true, max(WRONG_M / gsd, 3.0 * tolerance)))
-    for shift in _shifts(recipe.site, centre + view.center_px)[:SHIFTED_WINDOWS]:
-        votes.shifted.append(recipe.elect(features, centre + shift, half, tolerance).votes)
-        votes.shift_m.append(float(np.hypot(*shift)) * gsd)
-    spent_ms = (time.perf_counter() - begin) * 1e3
-    if election.nadir_px is None:
-        return np.nan, spent_ms
-    return float(np.hypot(*(election.nadir_px - true))) * gsd, spent_ms
-
-
-def _shifts(site: OrthoMap, aim_px: Array) -> list[Array]:
-    """Shifts (2,) in pixels, the longest first, that leave the frame's middle on the map.
-
-    60 to 200 m along an axis: the 45 m about the shifted place do not hold the true one, if that is within 15 m.
-    """
-    angles = np.arange(DIRECTIONS) * 2.0 * np.pi / DIRECTIONS
-    size, found = np.array([site.width_px, site.height_px]), []
-    for angle in angles:
-        for metres in np.arange(SHIFT_M, MIN_SHIFT_M - 1.0, -20.0):
-            shift = metres / site.gsd_m_per_px * np.array([np.cos(angle), np.sin(angle)])
-            place = aim_px + shift
-            if np.abs(shift).max() * site.gsd_m_per_px < MIN_SHIFT_M:
-                break  # its square would hold the place
-            if (place >= 0).all() and (place < size).all() and bool(site.valid(_pixel(place))):
-                found.append(shift)
-                break
-    return sorted(found, key=lambda shift: -round(float(np.hypot(*shift))))
-
-
-def _pixel(xy_px: Array) -> Window:
-    return Window(int(xy_px[0]), int(xy_px[1]), 1, 1)
-
-
 # ------------------------------------------------------------------------------------------- the page
 
 
-def measure(options: argparse.Namespace) -> Iterator[Figures | Votes]:
+def measure(options: argparse.Namespace) -> Iterator[Figures]:
     """Every set by every method, as it is measured."""
     for name in options.sets:
         if not (SHARED / name).is_dir():
@@ -270,10 +166,7 @@ def measure(options: argparse.Namespace) -> Iterator[Figures | Votes]:
             if method == "learned" and not options.weights:
                 continue
             step = options.step or DRAWN.get(name, 1)
-            if method == "classical":
-                yield from vote(name, options.step or RECIPE_STEPS.get(name, 1))
-            else:
-                yield fly(name, method, step, options.weights)
+            yield fly(name, method, step, options.weights)
 
 
 def main() -> None:
@@ -284,18 +177,14 @@ def main() -> None:
     parser.add_argument("--step", type=int, help="every how many frames one is taken, of every set")
     parser.add_argument("--weights", type=Path, nargs="+", default=(), help="of the learned method, else left out")
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
-    parser.add_argument("--save-before", action="store_true", help="keep the figures as those before")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
-    results: dict[type, list[Figures | Votes]] = {Figures: [], Votes: []}
-    for result in measure(options):
-        results[type(result)].append(result)
-        print(json.dumps(asdict(result)), flush=True)
-    if options.save_before:
-        BEFORE.write_text(json.dumps([asdict(row) for row in results[Figures]], indent=1) + "\n", encoding="utf-8")
-    before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else []
-    field.write(options.docs, results[Figures], results[Votes], before)
+    rows = []
+    for row in measure(options):
+        rows.append(row)
+        print(json.dumps(asdict(row)), flush=True)
+    field.write(options.docs, rows)
 
 
 if __name__ == "__main__":

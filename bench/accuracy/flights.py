@@ -57,15 +57,18 @@ class Recorded:
     truth: list[Truth]
     ground: Ground
 
+    def true_place_m(self, stamp_ns: int | None) -> NDArray[np.float64] | None:
+        """(2,) true east and north at a moment; None where they are not known."""
+        true = None if stamp_ns is None else interpolate_truth(self.truth, stamp_ns)
+        return None if true is None else self.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2]
 
-def recorded(
-    name: str, step: int, *, map_name: str = "map.tif", with_surface: bool = True, **accuracy: float | None
-) -> Recorded:
+
+def recorded(name: str, step: int, *, with_surface: bool = True, **accuracy: float | None) -> Recorded:
     """Every ``step``-th frame of a shared flight; the accuracy of its map as :meth:`OrthoMap.open` takes it."""
     folder = SHARED / name
     camera, surface = Camera.load(folder / "camera.yaml"), folder / "dsm.tif"
     has_surface = with_surface and surface.exists()
-    site = OrthoMap.open(folder / map_name, surface=surface if has_surface else None, **accuracy)
+    site = OrthoMap.open(folder / "map.tif", surface=surface if has_surface else None, **accuracy)
     flown = open_flight(folder / FRAMES.get(name, "frames"), folder / "telemetry.csv", camera)
     frames = [(item.frame, item.prior) for index, item in enumerate(flown) if index % step == 0]
     ground = Ground(site.ground_m, ground_amsl_m(flown.rows))
@@ -155,13 +158,8 @@ def _engine(flight: Recorded, options: SiftOptions) -> SceneMatcher:
 
 
 def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
-    """Name, what becomes of each frame's telemetry (a number multiplies the height), and the options.
-
-    ``height_factor`` says how wrong the height may be; without such a setting the defaults fly.
-    """
-    factor = {"height_factor": 2.0} if "height_factor" in SiftOptions.__dataclass_fields__ else {}
-    wrong = SiftOptions(**factor)
-    options_text = f"`height_factor={factor['height_factor']:g}`" if factor else "default options"
+    """Name, what becomes of each frame's telemetry (a number multiplies the height), and the options."""
+    factor = f"`height_factor={SiftOptions().height_factor:g}`"
     unknown = {"heading_deg": None, "height_agl_m": None}
     return [
         ("as recorded", {}, SiftOptions()),
@@ -169,8 +167,8 @@ def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
         ("roll and pitch unknown", {"roll_deg": None, "pitch_deg": None}, SiftOptions()),
         ("heading unknown", {"heading_deg": None}, SiftOptions()),
         ("height unknown", {"height_agl_m": None}, SiftOptions()),
-        (f"height given as half, {options_text}", {"height_agl_m": 0.5}, wrong),
-        (f"height given as double, {options_text}", {"height_agl_m": 2.0}, wrong),
+        (f"height given as half, {factor}", {"height_agl_m": 0.5}, SiftOptions()),
+        (f"height given as double, {factor}", {"height_agl_m": 2.0}, SiftOptions()),
         ("heading and height unknown", unknown, SiftOptions()),
         ("nothing known but the start", {**unknown, "roll_deg": None, "pitch_deg": None}, SiftOptions()),
     ]

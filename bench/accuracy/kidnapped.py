@@ -22,10 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import SHARED
+from bench.accuracy.flights import recorded
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher, set_threads
 from engine.options import NccOptions
-from scenematch.files.flight import open_flight
-from scenematch.files.truth import interpolate_truth, read_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import Motion, SensorNoise, build_town, plan_flight
 from scenematch.simulator.vehicle import simulate_telemetry
@@ -93,20 +92,13 @@ def wander(site: OrthoMap, starts: int, rng: np.random.Generator) -> Motion:
     return Motion(time_s, position, velocity, roll, pitch, heading)
 
 
-def recorded(name: str, starts: int) -> Flight:
+def shared(name: str, starts: int) -> Flight:
     """Runs from evenly spaced starts of a shared flight."""
-    folder = SHARED / name
-    site = OrthoMap.open(folder / "map.tif", surface=folder / "dsm.tif")
-    camera, truth = Camera.load(folder / "camera.yaml"), read_truth(folder / "truth.csv")
-    frames = []
-    for item in open_flight(folder / "frames", folder / "telemetry.csv", camera):
-        stamp = item.frame.timestamp_ns
-        true = None if stamp is None else interpolate_truth(truth, stamp)
-        if true is not None:
-            place = site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2]
-            frames.append((blind(item.frame), place))
+    flown = recorded(name, 1)
+    places = [(blind(frame), flown.true_place_m(frame.timestamp_ns)) for frame, _ in flown.frames]
+    frames = [(frame, place) for frame, place in places if place is not None]
     first = np.linspace(0, len(frames) - FRAMES, starts).astype(int)
-    return Flight(name, site, camera, [frames[k : k + FRAMES] for k in first])
+    return Flight(name, flown.site, flown.camera, [frames[k : k + FRAMES] for k in first])
 
 
 def blind(frame: Frame) -> Frame:
@@ -166,7 +158,7 @@ def is_wrong(fix: Fix, place: Array) -> bool:
 def rows(seeds: list[int], starts: int, names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
     """Every flight by every method, over its own map and over another."""
     flights = [simulated(seed, starts, light) for seed in seeds for light in ("noon", "evening")]
-    flights += [recorded(name, starts) for name in names if (SHARED / name).is_dir()]
+    flights += [shared(name, starts) for name in names if (SHARED / name).is_dir()]
     other = town_site(max(seeds) + 1)
     for flight in flights:
         elsewhere = replace(flight, name=f"{flight.name} over another town", site=other)

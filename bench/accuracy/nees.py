@@ -1,10 +1,10 @@
 """Does the covariance mean what it says? NEES and coverage of single fixes, by flight and method.
 
-    python -m bench.accuracy.nees [--docs DIR] [--flights NAME ...]
+    python -m bench.accuracy.nees [--docs DIR] [--flights NAME ... [--map-alone]]
 
 Frames are matched one by one, each with a prior that is 4 m off per axis and says 8 m. What maps and truths are
 known to be off is stated (:data:`RECORDED`) and not fitted to the NEES; the simulated worlds are exact. Writes the
-table into docs/integrity-measured.md and its chart beside it.
+table into docs/integrity-measured.md.
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bench import DOCS, SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
-from bench.pages.text import paragraph, table
+from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.options import AssumedErrors, NccOptions, SiftOptions
 from engine.runtime.threads import set_threads
@@ -93,11 +92,10 @@ class Flight:
 
 @dataclass(frozen=True)
 class Sample:
-    """One match: the error (3,) and covariance (3, 3) of its fix, and whether that was refined."""
+    """One match: the error (3,) and covariance (3, 3) of its fix."""
 
     error_m: Array
     covariance_m2: Array
-    is_refined: bool
 
     @property
     def squared_sigmas(self) -> float:
@@ -120,11 +118,11 @@ def town(seed: int, light: str = "noon") -> Flight:
     return Flight(f"town {seed}, {light}", site, plan.camera, frames, np.column_stack([places, ups]), Known(EXACT))
 
 
-def shared(name: str) -> Flight:
+def shared(name: str, *, with_surface: bool = True) -> Flight:
     """Every few frames of a shared flight."""
     known = RECORDED[name]
     accuracy = {"georeference_sigma_m": known.map_m, "slope_sigma_deg": known.slope_deg}
-    return flight_of(recorded(name, EVERY[name], **accuracy), known)
+    return flight_of(recorded(name, EVERY[name], with_surface=with_surface, **accuracy), known)
 
 
 def flight_of(flown: Recorded, known: Known) -> Flight:
@@ -168,7 +166,7 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
         up = np.nan if fix.up_m is None else fix.up_m
         covariance = fix.covariance_m2 + flight.known.truth_m**2 * np.diag([1.0, 1.0, 0.0])
         error_m = np.array([fix.east_m, fix.north_m, up]) - true
-        out.append(Sample(error_m, covariance, fix.stage == "refined"))
+        out.append(Sample(error_m, covariance))
     return out
 
 
@@ -243,11 +241,11 @@ def _stretches(run: list[Sample | None], count: int) -> list[list[Sample]]:
     return [[s for s in part if s is not None and not s.wrong] for part in picked]
 
 
-def measure(names: list[str]) -> list[Row]:
+def measure(names: list[str], *, with_surface: bool = True) -> list[Row]:
     """All rows; towns are grouped."""
     rows = []
     for name in names:
-        flights = [town(*which) for which in TOWNS[name]] if name in TOWNS else [shared(name)]
+        flights = [town(*which) for which in TOWNS.get(name, ())] or [shared(name, with_surface=with_surface)]
         # Of nust neither roll nor pitch is known, and there is no surface model to refine on.
         methods = ("NCC, peak", "SIFT") if name in MIDDLE else METHODS
         for method in methods:
@@ -266,7 +264,7 @@ def _cells(r: Row) -> list[str]:
     return [r.flight, r.method, fixes, f"{r.rms_m:.2f} m", nees, f"{100 * r.inside:.0f} %", *height]
 
 
-def section(rows: list[Row]) -> str:
+def section(rows: list[Row]) -> list[str]:
     """What stands between the markers of the page."""
     columns = ["flight", "method", "fixes", "RMS", "NEES", "in the 95 % ellipse", "height RMS", "height NEES"]
     sentence = (
@@ -275,44 +273,24 @@ def section(rows: list[Row]) -> str:
         f"ellipses hold {100 * COVERAGE[0]:.0f} % or more, "
         f"{sum(COVERAGE[0] <= r.inside <= COVERAGE[1] for r in rows)} of them at most {100 * COVERAGE[1]:.0f} %."
     )
-    lines = [BEGIN, "", *table(columns, [_cells(r) for r in rows]), *paragraph(sentence), END]
-    return "\n".join(lines)
-
-
-def chart(rows: list[Row]) -> Figure:
-    """NEES with its interval, and coverage, a dot a row."""
-    figure = Figure(figsize=(9.0, 0.5 + 0.23 * len(rows)), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
-    places = np.arange(len(rows))[::-1]
-    colours = dict(zip(METHODS, ("#0072b2", "#009e73", "#d55e00", "#333333", "#cc79a7"), strict=True))
-    for place, r in zip(places, rows, strict=True):
-        left.errorbar(r.nees, place, xerr=r.spread, fmt="o", color=colours[r.method], capsize=2, markersize=4)
-        right.plot(100 * r.inside, place, "o", color=colours[r.method], markersize=4)
-    left.axvspan(*BAND, color="#dddddd", zorder=0)
-    right.axvspan(100 * COVERAGE[0], 100 * COVERAGE[1], color="#dddddd", zorder=0)
-    left.set_yticks(places, [f"{r.flight}: {r.method}" for r in rows], fontsize=7)
-    left.set_xlabel("mean NEES of two dimensions: 2 is consistent, less cautious")
-    left.set_xlim(0.0, 5.0)
-    right.set_xlabel("in the 95 % ellipse, %")
-    return figure
+    return [*table(columns, [_cells(r) for r in rows]), *paragraph(sentence)]
 
 
 def main() -> None:
-    """Measure, and write the section and its chart."""
+    """Measure, and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--docs", type=Path, default=DOCS)
     parser.add_argument(
         "--flights", nargs="*", default=None, choices=[*TOWNS, *RECORDED], help="print, write nothing"
     )
+    parser.add_argument("--map-alone", action="store_true", help="withhold the surface models of these flights")
     options = parser.parse_args()
     set_threads(1)
-    rows = measure(options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())])
-    if options.flights is not None:
+    names = options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())]
+    rows = measure(names, with_surface=not options.map_alone)
+    if options.flights is not None or options.map_alone:
         return
-    page = options.docs / "integrity-measured.md"
-    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    page.write_text(before + section(rows) + rest.split(END)[1], encoding="utf-8")
-    chart(rows).savefig(options.docs / "img" / "integrity-nees.png", dpi=130, facecolor="white")
+    rewrite(options.docs / "integrity-measured.md", BEGIN, END, section(rows))
 
 
 if __name__ == "__main__":

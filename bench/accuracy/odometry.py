@@ -1,6 +1,6 @@
 """Visual odometry between fixes: velocities are withheld, and every second 5 s of a flight is not matched.
 
-    python -m bench.accuracy.odometry [FLIGHT ...] [--only gaps|velocities] [--quick]
+    python -m bench.accuracy.odometry [FLIGHT ...] [--quick]
 
 Prints the two tables of docs/odometry.md. Without names it flies those that nothing was fitted to, gazebo-a1 and
 nust; gazebo-a2 and "built-in" are what the covariance was fitted to.
@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from bench import SHARED
@@ -32,14 +31,12 @@ from engine import (
     Prior,
     Reason,
     SceneMatcher,
-    features,
 )
 from engine.matching.align import to_gray
 from engine.matching.covariance import map_sigma_of
 from engine.navigation.motion import GroundMotion
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.runtime.threads import set_threads
-from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import Ground
 from scenematch.simulator import plan_flight
 
@@ -64,14 +61,6 @@ def flight_of(name: str) -> Recorded:
 
 def without_velocity(frame: Frame) -> Frame:
     return replace(frame, east_velocity_mps=None, north_velocity_mps=None)
-
-
-def true_en_m(flight: Recorded, frame: Frame) -> Array | None:
-    """True place (2,) of a frame, about the map's origin."""
-    true = None if frame.timestamp_ns is None else interpolate_truth(flight.truth, frame.timestamp_ns)
-    if true is None:
-        return None
-    return np.array([float(v) for v in flight.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2]])
 
 
 # --------------------------------------------------------------------------------------- flights with gaps
@@ -131,7 +120,8 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
     navigator = Navigator(gappy, start, options=NavigatorOptions(odometry=velocity == PICTURES))
     gaps, way_m, before, ended_ns, middle_m = Gaps(), 0.0, None, None, np.zeros(2)
     for index, frame in enumerate(frames):
-        result, place, stamp_ns = navigator.update(frame), true_en_m(flight, frame), frame.timestamp_ns or 0
+        result, stamp_ns = navigator.update(frame), frame.timestamp_ns or 0
+        place = flight.true_place_m(stamp_ns)
         withheld = gappy.withholds(frame)
         if isinstance(result, Fix) and flight.name in MIDDLE:
             seen = moved_to_middle(result, flight.site, flight.camera)
@@ -183,14 +173,6 @@ def _count(
 Follower = Callable[[Frame], GroundMotion | NoMotion]
 
 
-def sift_points(earlier: NDArray[np.uint8], later: NDArray[np.uint8], _: Array) -> tuple[Array, Array]:
-    """The engine's own features of both pictures, matched."""
-    pictures = [torch.from_numpy(gray)[None, None].float() / 255.0 for gray in (earlier, later)]
-    first, second = (features.sift(picture, max_keypoints=300) for picture in pictures)
-    pairs = features.match(first, second).pairs().numpy()
-    return first.xy_px[0].numpy()[pairs[:, 0]].astype(float), second.xy_px[0].numpy()[pairs[:, 1]].astype(float)
-
-
 class Affine:
     """The peer: OpenCV's corners, Lucas-Kanade and estimateAffinePartial2D, with the telemetry's attitude."""
 
@@ -240,15 +222,11 @@ class Steps:
 
 def velocities(flight: Recorded, stride: int) -> dict[str, Steps]:
     """Each way to a velocity over the same frames, in turns."""
-    ours, by_features = VisualOdometry(flight.camera), VisualOdometry(flight.camera, tracker=sift_points)
-    ways: dict[str, Follower] = {
-        "scenematch": ours.update,
-        "engine's SIFT in the same": by_features.update,
-        "OpenCV, affine": Affine(flight.camera),
-    }
+    ours, peer = VisualOdometry(flight.camera), Affine(flight.camera)
+    ways: dict[str, Follower] = {"scenematch": ours.update, "OpenCV, affine": peer}
     found, before = {name: Steps() for name in ways}, None
     for frame, _ in flight.frames[::stride]:
-        frame, place = without_velocity(frame), true_en_m(flight, frame)
+        frame, place = without_velocity(frame), flight.true_place_m(frame.timestamp_ns)
         for name, way in ways.items():
             begin = time.perf_counter()
             motion = way(frame)
@@ -318,7 +296,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("flights", nargs="*", default=REPORTED)
     parser.add_argument("--quick", action="store_true", help="the first 20 s of each flight")
-    parser.add_argument("--only", choices=["gaps", "velocities"], help="one of the two tables")
     options = parser.parse_args()
     set_threads(1)
     there = [name for name in options.flights if name == BUILT_IN or (SHARED / name).is_dir()]
@@ -327,12 +304,12 @@ def main() -> None:
         flights = [replace(flight, frames=flight.frames[:100]) for flight in flights]
     print("| flight | velocity | drift m per 100 m | median m | worst m | states m | NEES | known | fixed | wrong "
           "| first fix after s | worst s |\n|---" + "|---" * 11 + "|")  # fmt: skip
-    for flight in flights if options.only != "velocities" else ():
+    for flight in flights:
         for row in gap_rows(flight):
             print(row, flush=True)
     print("\n| flight | s apart | by | RMS m/s | drift m per 100 m | NEES | refused | p50 ms | p95 ms |\n|---"
           + "|---" * 8 + "|")  # fmt: skip
-    for flight in flights if options.only != "gaps" else ():
+    for flight in flights:
         for row in velocity_rows(flight, (1, 5)):
             print(row, flush=True)
 

@@ -11,71 +11,36 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 
 from bench import DOCS
-from bench.accuracy.simulated import RATE_HZ, START_SIGMA_M, matchers
-from bench.pages.text import machine, table
-from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
+from bench.accuracy.simulated import PAGE, RATE_HZ, WAYS, Run, fly, matchers
+from bench.pages.text import machine, rewrite, table
 from engine.runtime.threads import set_threads
-from scenematch.files.track import track_row
-from scenematch.report.metrics import Ground, summarise
-from scenematch.simulator import FlightPlan, plan_flight
+from scenematch.simulator import plan_flight
 
 SEEDS = (1, 2, 31, 32, 71)
 """The ground below was worked out on the towns 21 to 26."""
 RELIEFS_M = (0.0, 15.0, 30.0, 60.0)
 DAYS = ("noon", "evening")
-WAYS = (("ncc", "engine"), ("sift", "engine"))
 BEGIN, END = "<!-- bench.accuracy.relief -->", "<!-- end of bench.accuracy.relief -->"
 
 
-@dataclass(frozen=True)
-class Run:
-    """A flight over one town by one method, with attitude or without."""
-
-    relief_m: float
-    day: str
-    with_attitude: bool
-    method: str
-    seed: int
-    summary: dict[str, Any]
-
-
-def fly(plan: FlightPlan, frames: list[Frame], matcher: SceneMatcher, site: OrthoMap) -> dict[str, Any]:
-    """The figures of merit of a flight from the true start."""
-    truth = plan.truth_rows()
-    start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
-    navigator = Navigator(matcher, start)
-    rows = [
-        track_row(str(index), navigator.update(frame), latency_ms=0.0, deadline_met=None)
-        for index, frame in enumerate(frames)
-    ]
-    ground = Ground(site.ground_m, plan.town.datum_amsl_m + site.ground_m)
-    return summarise(rows, truth, frame=site.frame, ground=ground)
-
-
-def flights(seeds: tuple[int, ...], reliefs_m: tuple[float, ...], frames: int | None) -> Iterator[Run]:
-    """All flights; every hilly town has its river, and its map, which is of noon, is prepared once."""
+def flights(
+    seeds: tuple[int, ...], reliefs_m: tuple[float, ...], frames: int | None
+) -> Iterator[tuple[float, Run]]:
+    """All flights with the height of their hills; every hilly town has its river, its map is of noon."""
     for seed in seeds:
         for relief_m in reliefs_m:
-            ready: list[tuple[str, str, Any]] = []
-            for day in DAYS:
-                plan = plan_flight(
-                    seed, frames=frames, rate_hz=RATE_HZ, condition=day, relief_m=relief_m, river=relief_m > 0.0
-                )
-                if not ready:
-                    site = plan.town.site()
-                    ready = list(matchers(site, plan.camera, WAYS))
-                with_attitude = list(plan.iter_frames())
-                no_attitude = [replace(frame, roll_deg=None, pitch_deg=None) for frame in with_attitude]
-                for method, _, matcher in ready:
-                    yield Run(relief_m, day, True, method, seed, fly(plan, with_attitude, matcher, site))
-                    yield Run(relief_m, day, False, method, seed, fly(plan, no_attitude, matcher, site))
+            world = {"relief_m": relief_m, "river": relief_m > 0.0}
+            plans = [plan_flight(seed, frames=frames, rate_hz=RATE_HZ, condition=day, **world) for day in DAYS]
+            site = plans[0].town.site()
+            ready = list(matchers(site, plans[0].camera, WAYS[:2]))
+            for day, plan in zip(DAYS, plans, strict=True):
+                for known in (True, False):
+                    yield from ((relief_m, run) for run in fly(plan, day, ready, site, with_attitude=known))
 
 
 def pooled(runs: list[Run]) -> list[str]:
@@ -92,30 +57,17 @@ def pooled(runs: list[Run]) -> list[str]:
     return [f"{rms_m:.2f}", f"{worst_m:.1f}", f"{100.0 * fixes / frames:.1f} %", str(false), f"{nees:.2f}"]
 
 
-def lines(runs: list[Run]) -> list[str]:
+def lines(runs: list[tuple[float, Run]]) -> list[str]:
     """The table, a row for each height of the hills, day, method and with or without attitude."""
+    same: dict[tuple[float, str, str, bool], list[Run]] = {}
+    for relief_m, run in runs:
+        same.setdefault((relief_m, run.day, run.method, run.with_attitude), []).append(run)
     rows = []
-    keys = dict.fromkeys((run.relief_m, run.day, run.method, run.with_attitude) for run in runs)
-    for relief_m, day, method, with_attitude in sorted(
-        keys, key=lambda k: (k[0], DAYS.index(k[1]), k[2], not k[3])
-    ):
-        same = [
-            r
-            for r in runs
-            if (r.relief_m, r.day, r.method, r.with_attitude) == (relief_m, day, method, with_attitude)
-        ]
-        who = method.upper() + ("" if with_attitude else ", attitude withheld")
-        rows.append([f"{relief_m:g} m", day, who, *pooled(same)])
+    for key in sorted(same, key=lambda k: (k[0], DAYS.index(k[1]), k[2], not k[3])):
+        relief_m, day, method, known = key
+        who = method.upper() + ("" if known else ", attitude withheld")
+        rows.append([f"{relief_m:g} m", day, who, *pooled(same[key])])
     return table(["hills", "frames' day", "by", "RMS m", "worst m", "availability", "false", "NEES"], rows)
-
-
-def write(docs: Path, runs: list[Run]) -> None:
-    """Put the table between the page's markers."""
-    page = docs / "simulator-measured.md"
-    head, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    tail = rest.split(END)[1]
-    body = [BEGIN, "", *lines(runs), f"Measured with {machine()}.", "", END]
-    page.write_text(head + "\n".join(body) + tail, encoding="utf-8")
 
 
 def main() -> None:
@@ -127,14 +79,11 @@ def main() -> None:
     set_threads(1)
     cv2.setNumThreads(1)
     seeds, reliefs_m, frames = (SEEDS[:1], RELIEFS_M[-1:], 5) if options.quick else (SEEDS, RELIEFS_M, None)
-    runs: list[Run] = []
-    for run in flights(seeds, reliefs_m, frames):
-        runs.append(run)
-        short = {
-            key: run.summary[key] for key in ("frames", "fixes", "rms_m", "max_m", "false_fixes", "nees_mean")
-        }
-        print(json.dumps([run.relief_m, run.day, run.with_attitude, run.method, run.seed, short]), flush=True)
-    write(options.docs, runs)
+    runs = []
+    for relief_m, run in flights(seeds, reliefs_m, frames):
+        runs.append((relief_m, run))
+        print(json.dumps([relief_m, run.day, run.with_attitude, run.method, run.seed, *pooled([run])]), flush=True)
+    rewrite(options.docs / PAGE, BEGIN, END, [*lines(runs), f"Measured with {machine()}.", ""])
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ Writes docs/scores.md. Every figure comes from the engine's own steps; without t
 from __future__ import annotations
 
 import argparse
-import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,12 +14,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import rasterio
 import torch
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
-from engine import Camera, Frame, OrthoMap, Prior
+from bench import DOCS
+from bench.accuracy.trials import Ground, flown
+from bench.inputs.farmland import farmland, vintages
+from bench.pages.text import table
+from engine import OrthoMap, Prior
 from engine.budget import Budget, Deadline
 from engine.kernels.scores import SCORES, enhance
 from engine.maps.prepared import PreparedMap
@@ -35,8 +36,6 @@ from engine.options import NccOptions
 from engine.runtime.scheduler import Scheduler
 from engine.runtime.threads import set_threads
 from engine.window import level_for
-from scenematch.files.flight import open_flight
-from scenematch.files.truth import interpolate_truth, read_truth
 from scenematch.simulator import plan_flight
 
 Gray = NDArray[np.uint8]
@@ -47,24 +46,15 @@ WRONG_M = 10.0
 PRIOR_OFF_M = 20.0  # at most, per axis
 PRIOR_SIGMA_M = 12.0
 RECORDED = {
-    "gazebo-a1": ("town A1, drawn by Gazebo", "frames", 8),
-    "gazebo-a1-evening": ("town A1 in low evening light, map of noon", "frames", 8),
-    "gazebo-a2": ("town A1, flight A2 with hard turns", "frames", 8),
-    "nust": ("campus, video on a satellite map of another date", "flight.mp4", 4),
-    "caliterra": ("bare ground from 30 to 50 m, map of the same day", "frames", 1),
+    "gazebo-a1": ("town A1, drawn by Gazebo", 8),
+    "gazebo-a1-evening": ("town A1 in low evening light, map of noon", 8),
+    "gazebo-a2": ("town A1, flight A2 with hard turns", 8),
+    "nust": ("campus, video on a satellite map of another date", 4),
+    "caliterra": ("bare ground from 30 to 50 m, map of the same day", 1),
 }
 SEASON_PX, SEASON_REACH_PX, SEASON_WITHIN_PX, SEASON_PATCHES = 200, 100, 4.0, 12
+HEAD = ["measured on", *(f'`"{score}"`' for score in SCORES)]
 TIMED_PX, TIMED_RUNS = 228, 300
-
-
-@dataclass(frozen=True)
-class Flight:
-    """A map, and frames with the truth (latitude, longitude)."""
-
-    name: str
-    site: OrthoMap
-    camera: Camera
-    frames: list[tuple[Frame, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
@@ -79,43 +69,18 @@ class Trial:
 # --------------------------------------------------------------------------------------------------- inputs
 
 
-def simulated(light: str) -> Iterator[Flight]:
+def simulated(light: str) -> Iterator[Ground]:
     for seed in SEEDS:
         plan = plan_flight(seed, rate_hz=0.28, condition=light)
         site = plan.town.site()
-        places = [(row.lat_deg, row.lon_deg) for row in plan.truth_rows()]
-        yield Flight(f"{seed}", site, plan.camera, list(zip(plan.iter_frames(), places, strict=True)))
-
-
-def recorded(folder: Path, source: str, step: int) -> Flight:
-    surface = folder / "dsm.tif"
-    camera = Camera.load(folder / "camera.yaml")
-    site = OrthoMap.open(folder / "map.tif", surface=surface if surface.exists() else None)
-    flight, rows = open_flight(folder / source, folder / "telemetry.csv", camera), read_truth(folder / "truth.csv")
-    frames = []
-    for index, item in enumerate(flight):
-        truth = None if index % step else interpolate_truth(rows, item.frame.timestamp_ns)
-        if truth is not None:
-            frames.append((item.frame, (truth.lat_deg, truth.lon_deg)))
-    return Flight(folder.name, site, camera, frames)
-
-
-def vintages(folder: Path) -> dict[int, Gray]:
-    """The same ground by year, grey."""
-    found = {}
-    for path in sorted(folder.glob("*.tif")):
-        match = re.search(r"_(\d{4})\d{4}\.tif$", path.name)
-        assert match is not None
-        with rasterio.open(path) as data:
-            colour = np.ascontiguousarray(data.read([1, 2, 3]).transpose(1, 2, 0))
-        found[int(match[1])] = np.asarray(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), np.uint8)
-    return found
+        places = [site.frame.enu_from_geodetic(row.lat_deg, row.lon_deg) for row in plan.truth_rows()]
+        yield Ground(f"{seed}", site, plan.camera, list(plan.iter_frames()), np.array(places))
 
 
 # ------------------------------------------------------------------------------------------------- measuring
 
 
-def fly(flight: Flight, score: str, site: OrthoMap | None = None) -> list[Trial]:
+def fly(flight: Ground, score: str, site: OrthoMap | None = None) -> list[Trial]:
     """Every frame searched about a place off the truth, on its own map or on one that it does not show."""
     options = NccOptions(score=score, exhaustive=True)
     ground = site or flight.site
@@ -123,8 +88,7 @@ def fly(flight: Flight, score: str, site: OrthoMap | None = None) -> list[Trial]
     pinhole = replace(flight.camera, distortion_model="plumb_bob", distortion=np.zeros(5))
     rng = np.random.default_rng(0)
     trials = []
-    for frame, place in flight.frames:
-        truth = flight.site.frame.enu_from_geodetic(*place)
+    for frame, truth in zip(flight.frames, flight.places_m, strict=True):
         east, north = truth + rng.uniform(-PRIOR_OFF_M, PRIOR_OFF_M, 2)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
         gray = flight.camera.undistort(to_gray(frame))
@@ -192,7 +156,7 @@ def median_ms(score: str) -> float:
 # ---------------------------------------------------------------------------------------------------- writing
 
 
-def flown(trials: list[Trial]) -> str:
+def outcome(trials: list[Trial]) -> str:
     fixes = np.array([trial.error_m for trial in trials if trial.accepted])
     right = fixes[fixes <= WRONG_M]
     rms = f"{np.sqrt(np.mean(right**2)):.2f} m" if len(right) else "-"
@@ -214,21 +178,22 @@ def per_score(cell: Callable[[str], str]) -> list[str]:
     return [cell(score) for score in SCORES]
 
 
-def measure(data: Path) -> list[list[str]]:
+def measure() -> list[list[str]]:
     """Rows of the table of figures, the first cell of each saying what was measured."""
     rows = []
     for light in ("noon", "evening"):
         flights = list(simulated(light))
         count = sum(len(flight.frames) for flight in flights)
-        cells = per_score(lambda score, f=flights: flown([t for one in f for t in fly(one, score)]))
+        cells = per_score(lambda score, f=flights: outcome([t for one in f for t in fly(one, score)]))
         rows.append([f"simulated towns, {light} ({count}); fitted on", *cells])
         others = list(zip(flights, flights[1:] + flights[:1], strict=True))
         cells = per_score(lambda s, o=others: chance([t for one, other in o for t in fly(one, s, other.site)]))
         rows.append([f"the same on the map of another town ({count}); fitted on", *cells])
-    for name, (title, source, step) in RECORDED.items():
-        flight = recorded(data / name, source, step)
-        rows.append([f"{title} ({len(flight.frames)})", *per_score(lambda score, f=flight: flown(fly(f, score)))])
-    years = vintages(data / "naip")
+    for name, (title, step) in RECORDED.items():
+        flight = flown(name, step)
+        cells = per_score(lambda score, f=flight: outcome(fly(f, score)))
+        rows.append([f"{title} ({len(flight.frames)})", *cells])
+    years = {int(year): farmland(year) for year in vintages()}
     pairs = list(permutations(years, 2))
     fitted = [pair for pair in pairs if not (pair[0] % 2 or pair[1] % 2)]
     for title, part in (("fitted on", fitted), ("the other pairs", [p for p in pairs if p not in fitted])):
@@ -269,20 +234,13 @@ One thread, every place of the window scored; height, heading and tilt from the 
 """
 
 
-def table(rows: list[list[str]]) -> str:
-    head = ["measured on", *(f'`"{score}"`' for score in SCORES)]
-    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
-    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=SHARED, help="recorded flights")
     parser.add_argument("--page", type=Path, default=DOCS / "scores.md", help="what to write")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
-    options.page.write_text(PAGE + table(measure(options.data)) + "\n", encoding="utf-8")
+    options.page.write_text(PAGE + "\n".join(table(HEAD, measure())), encoding="utf-8")
 
 
 if __name__ == "__main__":

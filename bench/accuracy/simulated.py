@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS
-from bench.pages.text import machine, table
+from bench.pages.text import machine, rewrite, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import LocalFrame
 from engine.options import ACCEPT_ALL
@@ -47,6 +47,7 @@ RATE_HZ = 0.28
 """Every fourth frame of the paper's flight."""
 START_SIGMA_M = 15.0
 WAYS = (("ncc", "engine"), ("sift", "engine"), ("ncc", "paper"), ("sift", "paper"))
+PAGE = "simulator-measured.md"
 BEGIN, END = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulated -->"
 SHEET_SEED, CELL_PX = 41, 170
 PLACES = ((0.0, 0.0, 20.0), (95.0, -110.0, 100.0), (-80.0, 120.0, 250.0))  # east, north and heading of its rows
@@ -61,6 +62,7 @@ class Run:
     method: str
     profile: str
     summary: dict[str, Any]
+    with_attitude: bool = True
 
 
 def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str, Any]]:
@@ -71,9 +73,13 @@ def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) 
         yield method, profile, matcher
 
 
-def fly(plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap) -> Iterator[Run]:
+def fly(
+    plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap, *, with_attitude: bool = True
+) -> Iterator[Run]:
     """The same frames by every matcher, each from the true start."""
     truth, frames = plan.truth_rows(), list(plan.iter_frames())
+    if not with_attitude:
+        frames = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
     start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
     for method, profile, matcher in ready:
         navigator = Navigator(matcher, start, options=ACCEPT_ALL if profile == "paper" else None)
@@ -84,7 +90,8 @@ def fly(plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: Ort
             spent_ms = (time.perf_counter() - begin) * 1e3
             rows.append(track_row(str(index), result, latency_ms=spent_ms, deadline_met=None))
         ground = Ground(site.ground_m, plan.town.datum_amsl_m)
-        yield Run(day, plan.seed, method, profile, summarise(rows, truth, frame=site.frame, ground=ground))
+        summary = summarise(rows, truth, frame=site.frame, ground=ground)
+        yield Run(day, plan.seed, method, profile, summary, with_attitude)
 
 
 def flights(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
@@ -131,14 +138,10 @@ def lines(runs: list[Run], ways: tuple[tuple[str, str], ...]) -> list[str]:
 
 def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
     """Put the tables between the page's markers."""
-    page = docs / "simulator-measured.md"
-    head, rest = page.read_text(encoding="utf-8").split(BEGIN)
-    tail = rest.split(END)[1]
-    body = [BEGIN, "", *lines(runs, WAYS)]
+    body = lines(runs, WAYS)
     if more:
         body += ["The engine on what is harder, two towns each:", "", *lines(more, WAYS[:2])]
-    body += [f"Measured with {machine()}.", "", END]
-    page.write_text(head + "\n".join(body) + tail, encoding="utf-8")
+    rewrite(docs / PAGE, BEGIN, END, [*body, f"Measured with {machine()}.", ""])
 
 
 def draw_sheet(path: Path) -> None:

@@ -11,15 +11,13 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 
-from bench import SHARED
 from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
+from bench.inputs.farmland import farmland
 from engine import Camera, Fix, Frame, OrthoMap, Prior
 from engine.geo import enu_from_body
 from engine.values import Window
-from scenematch.files.truth import interpolate_truth
 from scenematch.simulator import plan_flight
 
 Array = NDArray[np.float64]
@@ -134,7 +132,7 @@ def ground(name: int | str, *, map_only: bool = False) -> Ground:
     """
     if isinstance(name, int):
         return _town(name, map_only)
-    return _farmland(name) if name in YEARS else _flight(name, STEPS[name] * (8 if map_only else 1))
+    return _farmland(name) if name in YEARS else flown(name, STEPS[name] * (8 if map_only else 1))
 
 
 def _town(seed: int, map_only: bool) -> Ground:
@@ -149,20 +147,21 @@ def _town(seed: int, map_only: bool) -> Ground:
     return Ground(f"town {seed}", site, plan.camera, noon, np.array(places), evening)
 
 
-def _flight(name: str, step: int) -> Ground:
-    flown = recorded(name, step)
+def flown(name: str, step: int) -> Ground:
+    """Every ``step``-th frame of a shared flight whose place, height and heading are known."""
+    flight = recorded(name, step)
     frames, places = [], []
-    for frame, _ in flown.frames:
-        true = None if frame.timestamp_ns is None else interpolate_truth(flown.truth, frame.timestamp_ns)
-        if true is not None and frame.height_agl_m is not None and frame.heading_deg is not None:
+    for frame, _ in flight.frames:
+        place = flight.true_place_m(frame.timestamp_ns)
+        if place is not None and frame.height_agl_m is not None and frame.heading_deg is not None:
             frames.append(frame)
-            places.append(flown.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2])
-    return Ground(name, flown.site, flown.camera, frames, np.array(places))
+            places.append(place)
+    return Ground(name, flight.site, flight.camera, frames, np.array(places))
 
 
 def _farmland(name: str) -> Ground:
     """A level camera's pictures of one year over the map of another; telemetry errs as a flight's does."""
-    seen, mapped = (_year(year) for year in YEARS[name])
+    seen, mapped = (farmland(year)[:723, :934] for year in YEARS[name])
     layout = np.array([[NAIP_GSD_M, 0.0, 5e5], [0.0, -NAIP_GSD_M, 5.2e6]])
     site, taken = (OrthoMap.from_arrays(gray, layout, "EPSG:32614") for gray in (mapped, seen))
     camera, rng = plan_flight(1, frames=1).camera, np.random.default_rng(0)
@@ -174,12 +173,6 @@ def _farmland(name: str) -> Ground:
         roll, pitch, turn = rng.normal(0.0, [0.3, 0.3, 0.5])
         frames.append(Frame(image, None, height_m * rng.normal(1.0, 0.007), heading_deg + turn, roll, pitch))
     return Ground(name, site, camera, frames, places)
-
-
-def _year(year: str) -> Image:
-    path = next((SHARED / "naip").glob(f"*_{year}*.tif"))
-    with rasterio.open(path) as source:
-        return cv2.cvtColor(np.moveaxis(source.read([1, 2, 3]), 0, 2), cv2.COLOR_RGB2GRAY)[:723, :934]
 
 
 def ground_quad_px(

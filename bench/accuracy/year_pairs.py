@@ -1,7 +1,7 @@
 """Pictures of one year matched on the map of another: how many are answered, and how many answers are wrong.
 
     python -m bench.accuracy.year_pairs [--half report|fit] [--set naip-cities|naip] [--methods NCC,SIFT]
-                                        [--matches N] [--seed N] [--json FILE]
+                                        [--matches N] [--seed N]
 
 Every second match has no answer on its map. Nothing may be fitted on the half "report".
 """
@@ -9,11 +9,9 @@ Every second match has no answer on its map. Nothing may be fitted on the half "
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -118,22 +116,18 @@ def main() -> None:
     parser.add_argument("--methods", default=f"NCC,{PLAIN}")
     parser.add_argument("--matches", type=int, default=20_000, help="of each set, by each method")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="where the rows are written")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
-    cells, kept = [], {}
+    cells = []
     for source in [options.set] if options.set else SETS:
         methods = options.methods.split(",")
         rows = list(matched(source, options.half, methods, options.matches, options.seed))
-        kept[source] = [(*row, ms) for row, ms in rows]
         for method in methods:
             cells.append(
                 [f"{source}, {method}", *summary([(row, ms) for row, ms in rows if row.method == method])]
             )
     print("\n".join(table(HEAD, cells)))
-    if options.json:
-        options.json.write_text(json.dumps(kept), encoding="utf-8")
 
 
 if __name__ == "__main__":

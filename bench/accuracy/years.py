@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations
 
-import cv2
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 
 from bench import SHARED
 from bench.accuracy.trials import NAIP_GSD_M, Ground, Trial, ground_quad_px, picture
+from bench.inputs.farmland import farmland, vintages
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.values import Window
 
@@ -26,7 +25,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 
-CITIES, FARMLAND = SHARED / "naip-cities", SHARED / "naip"
+CITIES = SHARED / "naip-cities"
 YEARS = ("2016", "2018", "2020")
 HALVES = ("fit", "report")
 SETS = ("naip-cities", "naip")
@@ -127,21 +126,11 @@ def opened(source: str, half: str, place: str, year: str) -> OrthoMap:
     """The map of a place in a year; of farmland, which is at 5 m, as if it were at 0.5 m, its half."""
     if source == "naip-cities":
         return OrthoMap.open(CITIES / place / f"{year}.tif")
-    gray = _farmland(year)
+    gray = farmland(year)[:723, :934]
     middle = gray.shape[1] // 2
     columns = np.s_[:middle] if half == "fit" else np.s_[middle:]
     layout = np.array([[NAIP_GSD_M, 0.0, 5e5], [0.0, -NAIP_GSD_M, 5.2e6]])
-    return OrthoMap.from_arrays(np.ascontiguousarray(gray[:723, columns]), layout, "EPSG:32614")
-
-
-def vintages() -> tuple[str, ...]:
-    """The years of the farmland."""
-    return tuple(sorted(path.stem.rsplit("_", 1)[1][:4] for path in FARMLAND.glob("*.tif")))
-
-
-def _farmland(year: str) -> Image:
-    with rasterio.open(next(FARMLAND.glob(f"*_{year}*.tif"))) as source:
-        return np.asarray(cv2.cvtColor(np.moveaxis(source.read([1, 2, 3]), 0, 2), cv2.COLOR_RGB2GRAY)[:, :934])
+    return OrthoMap.from_arrays(np.ascontiguousarray(gray[:, columns]), layout, "EPSG:32614")
 
 
 @cache

@@ -5,14 +5,13 @@ from __future__ import annotations
 import gc
 import math
 import os
-import resource
 import socket
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench.live.soak import rss_mb
 from bench.live.standin import MS, Standin, State
 
 RATE_NS = 200 * MS
@@ -32,15 +31,13 @@ def free_port() -> int:
 class Growth:
     """Memory, files and threads of the process, looked at every so many messages."""
 
-    seen: list[tuple[int, int, int, int]] = field(default_factory=list)
+    seen: list[tuple[int, float, int, int]] = field(default_factory=list)
 
-    def look(self, messages: int, *, collect: bool = True) -> None:
-        """Look, after a collection, which holds Python's lock for so long that a frame of real time is late."""
-        if collect:
-            gc.collect()
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        kib = pages * resource.getpagesize() // 1024
-        self.seen.append((messages, kib, len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))))
+    def look(self, messages: int) -> None:
+        """Look, after a collection."""
+        gc.collect()
+        files, threads = (len(os.listdir(f"/proc/self/{kind}")) for kind in ("fd", "task"))
+        self.seen.append((messages, rss_mb() * 1e6 / 1024, files, threads))
 
     def rows(self) -> list[list[str]]:
         """After the first tenth, in which tables and caches fill."""

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import random
 import socket
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench import DOCS
 from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_port, place_off_m
-from bench.live.bridge_minutes import minutes_real
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
-from bench.pages.text import machine, paragraph, table
+from bench.pages.text import paragraph, rewrite, table
 from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 from scenematch.bridges.links import Connection
@@ -268,68 +265,16 @@ def hour_rows(r: dict[str, Any]) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def real_rows(r: dict[str, Any]) -> list[list[str]]:
-    """What the minutes showed."""
-    refused = ", ".join(f"{why} {n}" for why, n in {**r["refused"], **r["withheld"]}.items()) or "none"
-    return [
-        ["time flown", f"{r['seconds'] / 60:g} min"],
-        ["messages of the vehicle; frames", f"{r['messages']:,}; {r['frames']:,}"],
-        [
-            "fixes arrived, arrived twice, with a stamp of no capture",
-            f"{r['arrived']}, {r['twice']}, {r['foreign']}",
-        ],
-        ["reset counter, steps", f"{r['steps']}"],
-        ["not sent", refused],
-        [f"tasks that waited for {os.cpu_count()} cores, at its begin and end",
-         f"{r['load'][0]:.1f}, {r['load'][1]:.1f} (load average)"],
-        ["fewest fixes a second over 5 s", f"{r['least_hz']:.1f}"],
-        ["age at arrival, p50 and p99", f"{r['age_ms'][0]:.0f}, {r['age_ms'][1]:.0f} ms"],
-        ["stamp on the vehicle's own clock off by at most", f"{r['stamp_off_ms']:.1f} ms"],
-        ["position off the truth, RMS and worst", f"{r['rms_m']:.2f}, {r['worst_m']:.2f} m"],
-        r["growth"][0],
-        r["growth"][2],  # minutes are too short for a slope
-    ]  # fmt: skip
-
-
-def section(flown: dict[str, Any], real: dict[str, Any]) -> list[str]:
-    """Markdown of both tables."""
-    return [
-        *paragraph(HOUR),
-        *table(["the hour, scripted matcher, 5 Hz", ""], hour_rows(flown)),
-        *paragraph(
-            f"The minutes are in real time on the machine's own clock, the built-in flight forth and back with "
-            f"the real matcher (`{real['method']}`): {machine()}, one thread. What else the machine did, the load "
-            "says."
-        ),
-        *table(["real time, real matcher, 5 Hz", ""], real_rows(real)),
-    ]
-
-
-def write_section(page: Path, lines: list[str]) -> None:
-    """Put the tables where the page has room for them."""
-    text = page.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    page.write_text("\n".join([before + BEGIN, "", *lines[:-1], "", END + after]), encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0, help="of the hour at speed")
-    parser.add_argument("--real-minutes", type=float, default=3.0)
-    parser.add_argument("--method", default="auto")
+    parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--write", action="store_true", help="into docs/mavlink-measured.md")
     told = parser.parse_args()
     flown = hour(told.minutes)
-    print(
-        "\n".join(table(["the hour", ""], hour_rows(flown))),
-        {k: flown[k] for k in ("withheld", "refused", "dropped")},
-    )
-    if told.real_minutes > 0:
-        real = minutes_real(told.real_minutes, told.method)
-        print("\n".join(table(["real time", ""], real_rows(real))))
-        if told.write:
-            write_section(PAGE, section(flown, real))
+    lines = table(["the hour, scripted matcher, 5 Hz", ""], hour_rows(flown))
+    print("\n".join(lines), {k: flown[k] for k in ("withheld", "refused", "dropped")})
+    if told.write:
+        rewrite(PAGE, BEGIN, END, [*paragraph(HOUR), *lines])
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import math
 import random
 import socket
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -155,7 +155,6 @@ class Standin:
         on_fix: takes each position that it is sent, and when it came.
         settle: called with the count of datagrams sent, after each burst.
         delay_ms: of the link, least and most, either way.
-        origin: whether its estimator has one from the start.
         firmware: of its heartbeats.
     """
 
@@ -169,16 +168,15 @@ class Standin:
         settle: Callable[[int], object] = lambda _: None,
         delay_ms: tuple[float, float] = (0.0, 0.0),
         *,
-        origin: bool = True,
         firmware: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
     ) -> None:
         self.agenda, self.motion, self.place, self._firmware = agenda, motion, place, firmware
-        self.heard: Counter[str] = Counter()
         self.messages = self.datagrams = 0
         self._port, self._on_fix, self._settle, self._delay_ms = port, on_fix, settle, delay_ms
         self._random, self._silent_until_ns = random.Random(1), 0
         self.socket = self._dial()
-        self.origin = (round(place.lat_deg * 1e7), round(place.lon_deg * 1e7), 500_000) if origin else None
+        lat_1e7, lon_1e7 = round(place.lat_deg * 1e7), round(place.lon_deg * 1e7)
+        self.origin: tuple[int, int, int] | None = (lat_1e7, lon_1e7, 500_000)
         self._boot(agenda.clock() - 120 * S)
         agenda.every(TICK_NS, self._burst, agenda.clock())
 
@@ -294,7 +292,6 @@ class Standin:
             return
         for message in self._parser.parse_buffer(data) or []:
             kind = message.get_type()
-            self.heard[kind] += 1
             if kind == "ODOMETRY" and message.quality < 0:
                 continue  # the camera works, and there is no position
             if kind in ("VISION_POSITION_ESTIMATE", "ODOMETRY", "GPS_INPUT", "GLOBAL_POSITION_SENSOR"):

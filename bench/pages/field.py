@@ -1,16 +1,14 @@
-"""docs/field.md: the table of what :mod:`bench.accuracy.field` flew, before and after."""
+"""docs/field.md: the table of what :mod:`bench.accuracy.field` flew."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from bench.pages.text import machine, paragraph, table
 
 if TYPE_CHECKING:
-    from bench.accuracy.field import Figures, Votes
+    from bench.accuracy.field import Figures
 
 TITLES = {
     "brighton": "`brighton`: nine photographs of a beach, 14 s apart",
@@ -24,91 +22,47 @@ TITLES = {
 NAMES = {
     "ncc": "NCC", "sift": "SIFT", "auto": "auto", "learned": "learned",
     "paper-ncc": "paper's NCC, OpenCV", "paper-sift": "paper's SIFT, OpenCV",
-    "classical": "plain classical recipe",
 }  # fmt: skip
+COLUMNS = ["method", "frames", "fixed", "within 1, 5, 10 m", "median, m", "RMS, m", "wrong", "outside", "ms"]
 INTRO = (
     "Made by `python -m bench.accuracy.field` on {machine}, one thread, beside other work: its milliseconds are "
-    "upper bounds, and no comparison with those before. Each flight goes through "
-    "`track` with default settings and the telemetry that was recorded; a flight without positions in its "
-    "telemetry starts at its true place (sigma 15 m)."
+    "upper bounds. Each flight goes through `track` with default settings and the telemetry that was recorded; a "
+    "flight without positions in its telemetry starts at its true place (sigma 15 m)."
 )
 FIGURES = (
     "Median and RMS are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **outside** those "
-    "outside the ellipse of three of their own sigmas. In brackets: before, where it differs. The campus's truth "
-    "is good to about a metre and is the ground in the middle of each frame, not what lies below the vehicle: "
-    "fixes there that have a pose are moved to where their own axis meets the ground."
+    "outside the ellipse of three of their own sigmas. The campus's truth is good to about a metre and is the "
+    "ground in the middle of each frame, not what lies below the vehicle: fixes there that have a pose are moved "
+    "to where their own axis meets the ground."
 )
 PEERS = (
     "`paper's NCC` and `paper's SIFT` are `--profile paper`: the paper's recipe by OpenCV, which refuses almost "
-    "nothing and follows its own last answer. The plain classical recipe (`bench/accuracy/classical.py`) takes "
-    "each frame by itself, its window of 45 m about the telemetry's position (else a drawn one, sigma 15 m): "
-    "the frame rectified by attitude and height onto the map's grid, upright RootSIFT without a cap, contrast "
-    "0.01, ratio 0.9, and a vote for the translation within 3 % of the height. It answers always, and states no "
-    "sigma."
+    "nothing and follows its own last answer."
 )
-VOTES = (
-    "What its votes mean. *Right* are votes for the true place, *rival* the most for a place of the same window "
-    "that is more than 10 m off, *shifted* the most in a window that does not hold the place: moved by up to "
-    "200 m, as far as the map allows. Least, median and most of the frames."
-)
-BASE = ("classical", "paper-ncc", "paper-sift")  # no code of these is ours to change
 
 
-def write(docs: Path, rows: list[Figures], votes: list[Votes], before: list[dict[str, Any]]) -> None:
+def write(docs: Path, rows: list[Figures]) -> None:
     """Write the page below ``docs``."""
-    lines = [
-        "# The field",
-        "",
-        *paragraph(INTRO.format(machine=machine())),
-        *paragraph(FIGURES),
-        *paragraph(PEERS),
-    ]
-    former = {(row["flight"], row["method"], row["step"]): row for row in before}
+    lines = ["# The field", "", *paragraph(INTRO.format(machine=machine()))]
+    lines += [*paragraph(FIGURES), *paragraph(PEERS)]
     for flight in dict.fromkeys(row.flight for row in rows):
-        own = [row for row in rows if row.flight == flight]
-        lines += [f"## {TITLES[flight]}", ""]
-        lines += table(
-            ["method", "frames", "fixed", "within 1, 5, 10 m", "median, m", "RMS, m", "wrong", "outside", "ms"],
-            [_cells(row, former.get((row.flight, row.method, row.step))) for row in own],
-        )
-    if votes:
-        lines += ["## Votes of the plain classical recipe", "", *paragraph(VOTES)]
-        lines += table(
-            ["flight", "frames", "right", "rival", "shifted", "moved by, m"], [_counts(v) for v in votes]
-        )
+        own = [_cells(row) for row in rows if row.flight == flight]
+        lines += [f"## {TITLES[flight]}", "", *table(COLUMNS, own)]
     (docs / "field.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
-def _cells(row: Figures, before: dict[str, Any] | None) -> list[str]:
+def _cells(row: Figures) -> list[str]:
     every = f", every {row.step}th" if row.step > 1 else ""
-    texts = [_texts({name: getattr(row, name) for name in row.__dataclass_fields__})]
-    if before is not None and row.method not in BASE:
-        texts.append(_texts(before))
-    pairs = [now if not was or was[0] == now else f"{now} ({was[0]})" for now, *was in zip(*texts, strict=True)]
-    return [NAMES[row.method] + every, str(row.frames), *pairs]
+    return [NAMES[row.method] + every, str(row.frames), *outcome(row, row)]
 
 
-def _texts(row: dict[str, Any]) -> list[str]:
-    """The cells behind the number of frames."""
-    known = row["median_m"] is not None
+def outcome(true: Figures, on_map: Figures) -> list[str]:
+    """The cells behind the number of frames; distances are against the map's own truth."""
     return [
-        str(row["fixed"]),
-        ", ".join(map(str, row["within"])),
-        f"{row['median_m']:.2f}" if known else "-",
-        f"{row['rms_m']:.2f}" if known else "-",
-        str(row["wrong"]),
-        "-" if row["outside"] is None else str(row["outside"]),
-        f"{row['p50_ms']:.0f}",
+        str(true.fixed),
+        ", ".join(map(str, on_map.within)),
+        *("-" if value is None else f"{value:.2f}" for value in (on_map.median_m, on_map.rms_m)),
+        str(true.wrong),
+        "-" if true.outside is None else str(true.outside),
+        f"{true.p50_ms:.0f}",
     ]
-
-
-def _counts(votes: Votes) -> list[str]:
-    moved = f"{min(votes.shift_m):.0f} to {max(votes.shift_m):.0f}" if votes.shift_m else "-"
-    columns = [_spread(counts) for counts in (votes.right, votes.rival, votes.shifted)]
-    return [f"`{votes.flight}`", str(len(votes.right)), *columns, moved]
-
-
-def _spread(counts: list[int]) -> str:
-    if not counts:
-        return "-"
-    return f"{min(counts)}, {np.median(counts):.0f}, {max(counts)}"

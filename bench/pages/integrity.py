@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bench.accuracy.judged import METHODS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
-from bench.pages.text import paragraph, table
+from bench.pages.text import paragraph, rewrite, table
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
 Array = NDArray[np.float64]
@@ -25,16 +25,14 @@ BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 
 def write(rows: list[Row], docs: Path) -> None:
     """The section between the markers, and its pictures."""
-    page = docs / "integrity-measured.md"
-    text = page.read_text(encoding="utf-8")
-    begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    page.write_text(f"{text[:begin]}\n\n{section(rows)}\n{text[end:]}", encoding="utf-8")
+    lines = section(rows)
+    rewrite(docs / "integrity-measured.md", BEGIN, END, lines)
     risk_chart(rows, docs / "img" / "integrity-risk.png")
     reliability_chart(rows, docs / "img" / "integrity-reliability.png")
-    print(section(rows))
+    print("\n".join(lines))
 
 
-def section(rows: list[Row]) -> str:
+def section(rows: list[Row]) -> list[str]:
     """Markdown."""
     wrong = sum(_is_wrong(row) for row in rows)
     grounds = list(dict.fromkeys(row.ground for row in rows))
@@ -69,7 +67,7 @@ def section(rows: list[Row]) -> str:
     )
     lines += ["![Risk against coverage](img/integrity-risk.png)", ""]
     lines += ["![Stated against true probability](img/integrity-reliability.png)", ""]
-    return "\n".join(lines)
+    return lines
 
 
 def _is_wrong(row: Row) -> bool:

@@ -2,8 +2,7 @@
 
     python -m bench.pages.report RUN.json [--quick] [--docs DIR]
 
-Beside the run it measures the growth of cost, the search of a whole large map and the stages of a frame, each in a
-process of its own.
+Beside the run it measures the stages of a frame, in a process of its own.
 """
 
 from __future__ import annotations
@@ -20,9 +19,8 @@ from matplotlib.figure import Figure
 from bench import DOCS
 from bench.pages import sift
 from bench.pages.text import machine, table
-from bench.speed import growth, stages, whole_map
+from bench.speed import stages
 from engine.runtime.threads import set_threads
-from scenematch.report.figures import plain_log_ticks
 
 STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
@@ -41,28 +39,22 @@ def main() -> None:
     """Read the run, measure the rest, write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="what pytest-benchmark wrote")
-    parser.add_argument("--quick", action="store_true", help="leave out the largest map and the curves of growth")
+    parser.add_argument("--quick", action="store_true", help="leave out the stages of a frame")
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its pictures")
     options = parser.parse_args()
     run = json.loads(options.run.read_text(encoding="utf-8"))
     set_threads(1)
     rows = [_row(entry) for entry in run["benchmarks"]]
-    curves = [] if options.quick else growth.curves()
-    big = [] if options.quick else whole_map.run()
     flown = [] if options.quick else stages.in_own_process()
     charts = sift.charts(rows)
-    if any(row["task"] == "peak" for row in rows):
-        charts["ncc-ratio.png"] = _ratio_chart(rows)
     if flown:
         charts["frame-stages.png"] = _stages_chart(_before(), flown)
-    if curves:
-        charts["ncc-growth.png"] = _growth_chart(curves)
     (options.docs / "img").mkdir(parents=True, exist_ok=True)
     for name, figure in charts.items():
         figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
     page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=machine()), 115), ""]
     page += _stages_section(_before(), flown) + _peak_section(rows) + _step_section(rows)
-    page += _hypotheses_section(rows) + _map_section(big) + _growth_section(curves) + sift.sections(rows)
+    page += _hypotheses_section(rows) + sift.sections(rows)
     (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
 
 
@@ -178,8 +170,6 @@ def _peak_section(rows: list[dict[str, Any]]) -> list[str]:
         "scores every place at full resolution; `ncc()` prepares nothing and returns the whole surface. On the",
         "smallest windows the fixed cost of a call exceeds OpenCV's whole work.",
         "",
-        "![ratio to OpenCV](img/ncc-ratio.png)",
-        "",
         *table(columns, cells),
     ]
 
@@ -229,94 +219,6 @@ def _hypotheses_section(rows: list[dict[str, Any]]) -> list[str]:
         "",
         *table(["who", "threads", "median ms", "ratio", "error m", "peak MB"], cells),
     ]
-
-
-def _map_section(big: list[dict[str, Any]]) -> list[str]:
-    if not big:
-        return []
-    ours, loop = big
-    cells = [
-        ["scenematch", f"{ours['median_s']:.2f} (largest {ours['max_s']:.2f})", f"{ours['peak_memory_mb']:.0f}"],
-        ["OpenCV, one of the nine hypotheses", f"{loop['median_s']:.1f}", f"{loop['peak_memory_mb']:.0f}"],
-    ]
-    return [
-        "## A map of 20,000 x 20,000 pixels, no position",
-        "",
-        *textwrap.wrap(
-            f"Heading known to 5 degrees, height to 5 %. {ours['right']} of {ours['frames']} frames found, "
-            f"{ours['wrong']} wrong, one thread. Opening and preparing the map took {ours['prepared_s']:.1f} s, "
-            "once. Peak memory is that of the whole process.",
-            115,
-        ),
-        "",
-        *table(["who", "seconds a frame", "peak MB"], cells),
-    ]
-
-
-def _growth_section(curves: list[growth.Curve]) -> list[str]:
-    cells = [
-        [
-            c.name,
-            c.unit,
-            " ".join(f"{n:g}" for n in c.sizes),
-            " ".join(f"{t:.2f}" for t in c.median_ms),
-            _two_decimals(c.exponent),
-        ]
-        for c in curves
-    ]
-    return [
-        "## How the cost grows",
-        "",
-        "![growth](img/ncc-growth.png)",
-        "",
-        *table(["against", "unit", "sizes", "median ms", "fitted exponent"], cells),
-    ]
-
-
-def _ratio_chart(rows: list[dict[str, Any]]) -> Figure:
-    figure = Figure(figsize=(9, 4.5), layout="constrained")
-    ax = figure.add_subplot()
-    chosen = [r for r in rows if r["task"] == "peak" and r["threads"] == 1]
-    sizes = list(dict.fromkeys(f"{r['template_px']}\nin {r['window_px']}" for r in chosen))
-    names = [n for n in dict.fromkeys(r["peer"] for r in chosen) if n != "OpenCV"]
-    for index, name in enumerate(names):
-        own = {
-            f"{r['template_px']}\nin {r['window_px']}": _baseline(rows, r) / r["median_ms"]
-            for r in chosen
-            if r["peer"] == name
-        }
-        at = np.arange(len(sizes)) + (index - (len(names) - 1) / 2) * 0.16
-        ax.bar(at, [own.get(size, np.nan) for size in sizes], 0.15, label=name)
-    ax.axhline(1.0, color="black", linewidth=1)
-    ax.set_yscale("log")
-    plain_log_ticks(ax.yaxis)
-    ax.set_xticks(range(len(sizes)), sizes)
-    ax.set_ylabel("times as fast as OpenCV")
-    ax.set_xlabel("template in window, pixels a side, one thread")
-    ax.grid(axis="y", alpha=0.3)
-    figure.legend(loc="outside upper left", ncols=len(names), frameon=False, fontsize=8)
-    return figure
-
-
-def _two_decimals(value: float) -> str:
-    return f"{round(value, 2) + 0.0:.2f}"  # no -0.00
-
-
-def _growth_chart(curves: list[growth.Curve]) -> Figure:
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    for index, curve in enumerate(curves):
-        ax = figure.add_subplot(2, 3, index + 1)
-        ax.loglog(curve.sizes, curve.median_ms, "o-", color="#0072b2")
-        ax.set_xticks(curve.sizes, [f"{size:g}" for size in curve.sizes], fontsize=8)
-        ax.minorticks_off()
-        ax.set_ylim(min(curve.median_ms) / 3, max(curve.median_ms) * 3)
-        plain_log_ticks(ax.yaxis)
-        ax.tick_params(axis="y", labelsize=8)
-        ax.set_title(f"{curve.name}: exponent {_two_decimals(curve.exponent)}", fontsize=10)
-        ax.set_xlabel(curve.unit, fontsize=8)
-        ax.set_ylabel("median ms", fontsize=8)
-        ax.grid(which="both", alpha=0.25)
-    return figure
 
 
 if __name__ == "__main__":

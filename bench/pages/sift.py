@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.pages.text import bullets, paragraph, table
@@ -47,7 +46,6 @@ STEP = (
     "first table states how many times as long SIFT takes."
 )
 PAPER_RATIO = 121 / 40  # Table I of the paper: SIFT's time over NCC's
-PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.4}
 COLOURS = {
     "scenematch": "#d55e00",
     "scenematch, upright": "#e69f00",
@@ -72,7 +70,7 @@ def charts(rows: list[Row]) -> dict[str, Figure]:
     features = [row for row in rows if row["task"] == "features"]
     if not features:
         return {}
-    return {"sift-ratio.png": _ratio_chart(features), "sift-quality.png": _quality_chart(features)}
+    return {"sift-quality.png": _quality_chart(features)}
 
 
 # ------------------------------------------------------------------------------------------------- features
@@ -94,8 +92,8 @@ def _time_ms(rows: list[Row], peer: str, size: tuple[int, int], batch: int, thre
     return float("nan")
 
 
-def _ratio(rows: list[Row], peer: str, size: tuple[int, int], batch: int = 1, threads: int = 1) -> float:
-    return _time_ms(rows, BASELINE, size, batch, threads) / _time_ms(rows, peer, size, batch, threads)
+def _ratio(rows: list[Row], peer: str, size: tuple[int, int]) -> float:
+    return _time_ms(rows, BASELINE, size, 1, 1) / _time_ms(rows, peer, size, 1, 1)
 
 
 def _figures(rows: list[Row], peer: str, size: tuple[int, int]) -> Row:
@@ -115,7 +113,6 @@ def _features_section(rows: list[Row]) -> list[str]:
     batch = max(row["batch"] for row in rows)
     lines = ["## Features: a picture in, at most 300 keypoints with descriptors out", ""]
     lines += paragraph(TIMES.format(batch=batch)) + paragraph(PAIRS) + bullets(*FIGURES) + paragraph(CONDITIONS)
-    lines += ["![times as fast as OpenCV SIFT](img/sift-ratio.png)", ""]
     lines += ["![time and correct matches](img/sift-quality.png)", ""]
     columns = ["who", "1 thread", "2 threads", f"{batch}, 1 thread", f"{batch}, 2 threads", "ratio"]
     columns += ["keypoints", "repeat %", "score %", "right %", "matches", "error px"]
@@ -143,33 +140,6 @@ def _feature_cells(rows: list[Row], peer: str, size: tuple[int, int], batch: int
         _both(row, "correct", ".0f"),
         _both(row, "error_px", ".2f"),
     ]
-
-
-def _ratio_chart(rows: list[Row]) -> Figure:
-    """Bars: one group a size, one bar a peer, for one picture and for a batch."""
-    figure, batch = Figure(figsize=(11, 4.8), layout="constrained"), max(row["batch"] for row in rows)
-    sizes, names = _sizes(rows), [name for name in _peers(rows) if name != BASELINE]
-    left: Axes | None = None
-    for index, (count, threads) in enumerate(((1, 1), (batch, 2))):
-        ax = figure.add_subplot(1, 2, index + 1, sharey=left)
-        left = left or ax
-        for place, name in enumerate(names):
-            at = np.arange(len(sizes)) + (place - (len(names) - 1) / 2) * 0.13
-            ratios = [_ratio(rows, name, size, count, threads) for size in sizes]
-            bars = ax.bar(at, ratios, 0.12, color=COLOURS[name], label=name if index == 0 else None)
-            labels = [_shown(ratio, ".1f" if ratio >= 1 else ".2f").replace("-", "") for ratio in ratios]
-            ax.bar_label(bars, labels, fontsize=7, padding=2, rotation=90, bbox=PLATE)
-        ax.axhline(1.0, color=COLOURS[BASELINE], linewidth=1.5)
-        ax.set_yscale("log")
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.margins(y=0.12)
-        ax.set_xticks(range(len(sizes)), [f"{w} x {h}" for w, h in sizes])
-        ax.set_title("one picture, one thread" if count == 1 else f"{count} pictures, two threads", fontsize=10)
-        ax.grid(axis="y", alpha=0.3)
-    assert left is not None
-    left.set_ylabel("times as fast as OpenCV SIFT")
-    figure.legend(loc="outside upper center", ncols=len(names), frameon=False, fontsize=8)
-    return figure
 
 
 def _quality_chart(rows: list[Row]) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import textwrap
+from pathlib import Path
 
 import cv2
 import torch
@@ -27,6 +28,12 @@ def bullets(*texts: str) -> list[str]:
         line for text in texts for line in textwrap.wrap(text, 115, initial_indent="- ", subsequent_indent="  ")
     ]
     return [*lines, ""]
+
+
+def rewrite(page: Path, begin: str, end: str, lines: list[str]) -> None:
+    """Put lines, the last of them empty, between two markers of a page."""
+    before, rest = page.read_text(encoding="utf-8").split(begin)
+    page.write_text("\n".join([before + begin, "", *lines, end + rest.split(end)[1]]), encoding="utf-8")
 
 
 def machine() -> str:

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from bench.live.soak import rss_mb
+from bench.live.startup import peak_mb
 from engine.runtime.threads import set_threads
 
 
@@ -35,16 +37,10 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 
 def peak_memory_mb(call: Callable[[], Any]) -> float | None:
     """By how much one call raises the process's resident memory at its highest; None where Linux does not tell."""
-    status, clear = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     try:
-        clear.write_text("5")  # forget the highest so far
-        before = _kilobytes(status, "VmRSS")
+        Path("/proc/self/clear_refs").write_text("5")  # forget the highest so far
+        before = rss_mb()
         call()
-        return (_kilobytes(status, "VmHWM") - before) / 1e3
-    except (OSError, ValueError):
+        return peak_mb() - before
+    except OSError:
         return None
-
-
-def _kilobytes(status: Path, name: str) -> int:
-    line = next(line for line in status.read_text().splitlines() if line.startswith(name))
-    return int(line.split()[1])

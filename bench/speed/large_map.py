@@ -24,7 +24,7 @@ import numpy as np
 
 from bench import DOCS
 from bench.inputs.scenes import mosaic
-from bench.pages.text import machine, paragraph, table
+from bench.pages.text import machine, paragraph, rewrite, table
 
 BEGIN, END = "<!-- bench.speed.large_map -->", "<!-- end of bench.speed.large_map -->"
 AT = (0.61234, 0.38765)
@@ -210,7 +210,7 @@ def section(runs: list[Run], side: int) -> str:
     heads = ["map", "method", "fixes", "RMS m", "false", "p50 ms", "p95 ms", "max ms", "first frame ms"]
     lines = table([*heads, "to the first frame s", "RSS MB", "growth MB"], cells)
     lines += paragraph(f"Measured on {machine()}, one thread; the large map is {side:,} x {side:,} px.")
-    return "\n".join([BEGIN, "", *lines, END])
+    return lines
 
 
 def main() -> None:
@@ -237,11 +237,8 @@ def main() -> None:
         runs = []
         for name, site, surface, method in ways:
             runs.append(watch(name, site, surface, flight, method))
-            print(section(runs[-1:], asked.side).splitlines()[4])
-    page = asked.docs / "large-maps.md"
-    text = page.read_text(encoding="utf-8")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    page.write_text(before + section(runs, asked.side) + after, encoding="utf-8")
+            print(section(runs[-1:], asked.side)[2])
+    rewrite(asked.docs / "large-maps.md", BEGIN, END, section(runs, asked.side))
 
 
 if __name__ == "__main__":

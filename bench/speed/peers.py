@@ -65,8 +65,6 @@ class OpenCvStep:
     """
 
     def __init__(self, site: OrthoMap, camera: Camera, *, prepared: bool, radius_px: int = 8) -> None:
-        from engine.values import Window
-
         self._site, self._camera, self._radius_px = site, camera, radius_px
         self._gray = site.gray(Window(0, 0, site.width_px, site.height_px))
         self._map = self._enhance(self._gray) if prepared else None

@@ -4,7 +4,7 @@
 an a-contrario test bounds the expected number of poses with as many inliers by chance.
 
 Convention:
-    ``cam_from_map``: x_cam = R X_map + t, camera axes x right, y down, z forward; map axes in metres, z up.
+    ``cam_from_map``: x_cam = R (X - C), camera axes x right, y down, z forward; map axes in metres, z up.
     Pixels are those of a pinhole camera, distortion already taken out.
 
 References:
@@ -102,23 +102,17 @@ class PoseStats:
     """A pose with its uncertainty.
 
     Attributes:
-        rotation: (3, 3) R of x_cam = R X_map + t.
-        translation: (3,) t in metres.
-        center_m: (3,) the camera's centre in the map's axes, -R^T t.
+        rotation: (3, 3) R of x_cam = R (X_map - center).
+        center_m: (3,) the camera's centre in the map's axes.
         covariance: (6, 6) of the centre (m) and of a small rotation about the camera's axes (rad).
         inliers: (N,) bool.
-        rms_px: Root mean square of the inliers' reprojection distances.
-        sigma_px: Standard deviation estimated for an image point's x and y.
         log10_nfa: log10 of the number of false alarms; the lower, the more significant.
     """
 
     rotation: Array
-    translation: Array
     center_m: Array
     covariance: Array
     inliers: Mask
-    rms_px: float
-    sigma_px: float
     log10_nfa: float
 
     @property
@@ -206,12 +200,9 @@ def _stats(
     inliers[known[fit.inliers]] = True
     return PoseStats(
         rotation=fit.rotation,
-        translation=-fit.rotation @ center,
         center_m=center,
         covariance=covariance,
         inliers=inliers,
-        rms_px=float(np.sqrt(np.mean(fit.view.squared[fit.inliers]))),
-        sigma_px=math.sqrt(fit.variance_px2),
         log10_nfa=log10_nfa,
     )
 

@@ -13,7 +13,6 @@ from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
 from engine.matching.evidence import RELIABILITY
 from engine.navigation.anchors import Anchor, RecentAnchors
-from engine.navigation.attitude_bias import Bias
 from engine.navigation.evidence import (
     MAX_PROBABILITY,
     Sources,
@@ -142,16 +141,6 @@ class Navigator:
     def map_offset(self) -> MapOffset | None:
         """How far the map is off by the priors of :meth:`update`; no fix is moved by it. None without priors."""
         return self._map_offset.offset
-
-    @property
-    def attitude_lag_s(self) -> float:
-        """How late the frames' attitude is, as far as fixes measured it."""
-        return self._errors.lag_s
-
-    @property
-    def attitude_bias(self) -> Bias | None:
-        """By how much the frames' attitude is off; None before a fix measured it."""
-        return self._errors.bias
 
     @property
     def calibration(self) -> Calibration:

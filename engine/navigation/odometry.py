@@ -12,7 +12,6 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -25,12 +24,10 @@ from engine.matching.align import to_gray
 from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.motion import GroundMotion
 from engine.options import AssumedErrors
-from engine.values import Attitude, Frame, check_positive
+from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
-Tracker = Callable[[Gray, Gray, Array], tuple[Array, Array]]
-"""Two pictures (H, W) and the homography (3, 3) that is expected between them, to points (N, 2) px of each."""
 
 _SMALL_PX = 160  # width at which a first shift is looked for
 _MAX_SIDE_PX = 640  # larger pictures are made smaller first
@@ -41,45 +38,16 @@ _MAX_OFF_DEG = 70.0  # from the vertical, up to which a point lies on the ground
 _STEPS, _CONVERGED = 6, 1e-6  # of Gauss-Newton at most; the last one's length, as a share of the height
 _LEAST_PX = 0.05  # of a point's error
 _HUBER_SIGMAS = 2.0
+_MAX_POINTS, _MIN_POINTS = 200, 20  # followed from picture to picture; that must agree on one motion
+_MIN_SHARE = 0.5  # of those that were followed, which must agree
+_MIN_SPREAD = 0.12  # of those, as a share of the picture's sides: what is fixed to the camera often fills a corner
+_MAX_SIGMA_MPS = 2.0  # a velocity that is less certain is refused
+_MAX_INTERVAL_S = 3.0  # between two pictures
+_TILT_CHANGE_SIGMA_DEG, _HEADING_CHANGE_SIGMA_DEG = 1.0, 2.0  # between two pictures
+_RELIEF_SHARE = 0.01  # by which the ground that is followed lies above or below the one that the height is over
+_POINTS_PER_ERROR = 3.0  # followed points whose errors are one and the same
+_ERROR_MEMORY_S = 1.0  # how long an error stays the same, since the same ground is followed
 _LEVEL_DEG = 0.02  # where roll and pitch are unknown their change is not solved for: see docs/odometry.md
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryOptions:
-    """How pictures are followed, and which motion is refused.
-
-    Attributes:
-        max_points: that are followed from picture to picture.
-        min_points: that must agree on one motion.
-        min_share: of those that were followed, which must agree.
-        min_spread: standard deviation of those that agree, along each side of the picture and as a share of it:
-            what is fixed to the camera often fills a corner.
-        max_sigma_mps: a velocity that is less certain is refused.
-        max_interval_s: between two pictures.
-        tilt_change_sigma_deg: by how much the change of roll and of pitch between two pictures may be off.
-        heading_change_sigma_deg: the same of the heading.
-        relief_share: by how much the ground that is followed lies above or below the one that the height is over,
-            as a share of the height.
-        points_per_error: followed points whose errors are one and the same.
-        error_memory_s: how long an error stays the same, since the same ground is followed.
-    """
-
-    max_points: int = 200
-    min_points: int = 20
-    min_share: float = 0.5
-    min_spread: float = 0.12
-    max_sigma_mps: float = 2.0
-    max_interval_s: float = 3.0
-    tilt_change_sigma_deg: float = 1.0
-    heading_change_sigma_deg: float = 2.0
-    relief_share: float = 0.01
-    points_per_error: float = 3.0
-    error_memory_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-        if self.min_share > 1.0:
-            raise OptionError(f"min_share: expected at most 1, got {self.min_share}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,15 +68,10 @@ class VisualOdometry:
 
     Args:
         camera: that took them, its lens included.
-        options: settings; the defaults serve.
-        tracker: finds the same points in two pictures; None is :func:`track_corners`.
     """
 
-    def __init__(
-        self, camera: Camera, options: OdometryOptions | None = None, tracker: Tracker | None = None
-    ) -> None:
-        self._camera, self._options = camera, options or OdometryOptions()
-        self._tracker = tracker or self._track_corners
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
         self._last: _Picture | None = None
         self._velocity_mps: Array | None = None  # (3,) that is expected of the next step
 
@@ -143,7 +106,7 @@ class VisualOdometry:
         if earlier.timestamp_ns is None or later.timestamp_ns is None:
             return NoMotion("a frame has no stamp")
         interval_s = (later.timestamp_ns - earlier.timestamp_ns) * 1e-9
-        if not 0.0 < interval_s <= self._options.max_interval_s:
+        if not 0.0 < interval_s <= _MAX_INTERVAL_S:
             return NoMotion(f"the pictures are {interval_s:.1f} s apart")
         height_m, begin, end = earlier.height_agl_m, earlier.attitude, later.attitude
         if height_m is None or begin is None or end is None:
@@ -159,12 +122,12 @@ class VisualOdometry:
         expected = view.homography(moved_m)
         if self._velocity_mps is None:
             expected = _shifted(last.gray, now.gray, expected)
-        points = self._tracker(last.gray, now.gray, expected)
+        points = self._track_corners(last.gray, now.gray, expected)
         agreed = self._agreed(*points)
         if isinstance(agreed, NoMotion):
             return agreed
         known = None not in (earlier.roll_deg, earlier.pitch_deg, later.roll_deg, later.pitch_deg)
-        solved = view.solve(*agreed, moved_m, self._options, has_tilt=known)
+        solved = view.solve(*agreed, moved_m, has_tilt=known)
         if solved is None:
             return NoMotion("the ground is seen too obliquely, or shows no one motion")
         return self._judged(earlier, interval_s, *solved, len(agreed[0]))
@@ -174,27 +137,27 @@ class VisualOdometry:
     ) -> GroundMotion | NoMotion:
         """The motion, unless it is too uncertain."""
         sigma_mps = math.sqrt(float(np.linalg.eigvalsh(noise_m2)[-1])) / interval_s
-        if not sigma_mps <= self._options.max_sigma_mps:
+        if not sigma_mps <= _MAX_SIGMA_MPS:
             return NoMotion(f"the velocity is uncertain by {sigma_mps:.1f} m/s")
         errors, height_m = with_frame_accuracy(frame, AssumedErrors()), frame.height_agl_m or 1.0
-        height_share = math.hypot(errors.height_sigma_m(height_m) / height_m, self._options.relief_share)
+        height_share = math.hypot(errors.height_sigma_m(height_m) / height_m, _RELIEF_SHARE)
         lasting = math.hypot(height_share, math.radians(errors.heading_deg))
-        drift = 1.0 + 2.0 * self._options.error_memory_s / interval_s
+        drift = 1.0 + 2.0 * _ERROR_MEMORY_S / interval_s
         return GroundMotion(interval_s, moved_m, noise_m2, lasting, drift, points)
 
     def _agreed(self, begin_px: Array, end_px: Array) -> tuple[Array, Array] | NoMotion:
         """Those of the points that one homography explains, as places (N, 2) one ahead of the lens."""
-        o, camera = self._options, self._camera
-        if len(begin_px) < o.min_points:
-            return NoMotion(f"{len(begin_px)} points could be followed, {o.min_points} are needed")
+        camera = self._camera
+        if len(begin_px) < _MIN_POINTS:
+            return NoMotion(f"{len(begin_px)} points could be followed, {_MIN_POINTS} are needed")
         begin, end = camera.undistort_points(begin_px), camera.undistort_points(end_px)
         reach = _RANSAC_PX / camera.focal_px
         _, found = cv2.findHomography(begin, end, cv2.RANSAC, reach, confidence=_RANSAC_CONFIDENCE)
         kept = np.zeros(len(begin), bool) if found is None else found[:, 0] > 0
-        if kept.sum() < max(o.min_points, o.min_share * len(kept)):
+        if kept.sum() < max(_MIN_POINTS, _MIN_SHARE * len(kept)):
             return NoMotion(f"{kept.sum()} of {len(kept)} points agree on one motion")
         spread = (begin_px[kept].std(axis=0) / [camera.width_px, camera.height_px]).min()
-        if spread < o.min_spread:
+        if spread < _MIN_SPREAD:
             return NoMotion("the points that agree fill a small part of the picture")
         return begin[kept], end[kept]
 
@@ -203,13 +166,13 @@ class VisualOdometry:
         size = np.array([earlier.shape[1], earlier.shape[0]])
         small = np.maximum(np.round(size * min(1.0, _MAX_SIDE_PX / size.max())), 1.0)
         if (small == size).all():
-            return track_corners(earlier, later, expected, self._options.max_points)
+            return track_corners(earlier, later, expected)
         across, down = small / size
         shrink = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1.0]])
         shape = small.astype(int).tolist()
         first, second = (cv2.resize(gray, shape, interpolation=cv2.INTER_AREA) for gray in (earlier, later))
         expected = shrink @ expected @ np.linalg.inv(shrink)
-        points = track_corners(first, second, expected, self._options.max_points)
+        points = track_corners(first, second, expected)
         begin, end = ((xy_px + 0.5) * size / small - 0.5 for xy_px in points)
         return begin, end
 
@@ -226,7 +189,7 @@ def odometry_of(matcher: object) -> VisualOdometry:
     return VisualOdometry(camera)
 
 
-def track_corners(earlier: Gray, later: Gray, expected: Array, max_points: int = 200) -> tuple[Array, Array]:
+def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, Array]:
     """Corners of one picture, and where another shows them, by Lucas-Kanade.
 
     Args:
@@ -234,13 +197,12 @@ def track_corners(earlier: Gray, later: Gray, expected: Array, max_points: int =
         later: the same.
         expected: (3, 3) homography from pixels of the earlier to those of the later; what it explains need not be
             found, so that a turn or a long way costs nothing.
-        max_points: as many corners at most.
 
     Returns:
         Two (N, 2) lists of pixels.
     """
     none = np.zeros((0, 2))
-    corners = cv2.goodFeaturesToTrack(earlier, max_points, _QUALITY, _APART_PX)
+    corners = cv2.goodFeaturesToTrack(earlier, _MAX_POINTS, _QUALITY, _APART_PX)
     if corners is None:
         return none, none
     begin, size = np.asarray(corners, np.float32), (later.shape[1], later.shape[0])
@@ -281,9 +243,7 @@ class _View:
         matrix = self._camera.matrix
         return np.asarray(matrix @ turned @ np.linalg.inv(matrix))
 
-    def solve(
-        self, begin: Array, end: Array, moved_m: Array, options: OdometryOptions, *, has_tilt: bool
-    ) -> tuple[Array, Array] | None:
+    def solve(self, begin: Array, end: Array, moved_m: Array, *, has_tilt: bool) -> tuple[Array, Array] | None:
         """The motion by places (N, 2) one ahead of the lens, before and after, from a first guess (3,) of it.
 
         Returns:
@@ -294,8 +254,8 @@ class _View:
         if steep.min() < math.cos(math.radians(_MAX_OFF_DEG)):
             return None
         ground_m = rays * (self._height_m / -rays[:, 2])[:, None]
-        tilt_deg = options.tilt_change_sigma_deg if has_tilt else _LEVEL_DEG
-        sigmas = np.radians([tilt_deg, tilt_deg, options.heading_change_sigma_deg])
+        tilt_deg = _TILT_CHANGE_SIGMA_DEG if has_tilt else _LEVEL_DEG
+        sigmas = np.radians([tilt_deg, tilt_deg, _HEADING_CHANGE_SIGMA_DEG])
         prior = np.diag([*sigmas**-2.0, 0.0, 0.0, 0.0])
         state = np.array([0.0, 0.0, 0.0, *moved_m])  # turn about east, north, up; motion
         for _ in range(_STEPS):
@@ -303,7 +263,7 @@ class _View:
             if seen is None:
                 return None
             off = end - seen
-            weights = _weights(np.hypot(*off.T), _LEAST_PX / self._camera.focal_px) / options.points_per_error
+            weights = _weights(np.hypot(*off.T), _LEAST_PX / self._camera.focal_px) / _POINTS_PER_ERROR
             weighted = (by_state * weights[:, None, None]).reshape(-1, 6).T
             try:
                 covariance = np.linalg.inv(weighted @ by_state.reshape(-1, 6) + prior)

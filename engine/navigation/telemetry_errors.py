@@ -61,16 +61,6 @@ class TelemetryErrors:
         self._searched = False  # whether the newest frame is the first of a search
 
     @property
-    def lag_s(self) -> float:
-        """How late the attitude is on average."""
-        return self._lag.mean_s
-
-    @property
-    def bias(self) -> Bias | None:
-        """Of the attitude; None before a fix measured it."""
-        return self._bias.bias
-
-    @property
     def calibration(self) -> Calibration:
         """All that was learnt."""
         known = self._heights > 0 and self._height_m is not None

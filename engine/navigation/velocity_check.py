@@ -56,7 +56,7 @@ class VelocityCheck:
         acceleration_mps2: of the vehicle.
     """
 
-    def __init__(self, sigma_mps: float = 0.5, acceleration_mps2: float = 3.0) -> None:
+    def __init__(self, sigma_mps: float, acceleration_mps2: float) -> None:
         self._sigma_mps, self._acceleration_mps2 = sigma_mps, acceleration_mps2
         self._seen: deque[_Seen] = deque()  # of the last seconds
         self._contradictions = 0

@@ -1,4 +1,4 @@
-"""The benchmark of GPUs on a machine without one: its table, its counting, and how graphs are replayed."""
+"""The benchmark of GPUs on a machine without one: its table and its counting."""
 
 from __future__ import annotations
 
@@ -43,31 +43,3 @@ def test_copies_are_told_apart_by_their_direction():
         "Memcpy DtoH (Device -> Pageable)",
     ]
     assert gpu.directions([*names, "vectorized_elementwise_kernel", names[0]]) == (2, 1)
-
-
-def doubled(x, y):
-    return 2.0 * x + y
-
-
-def faithful(work):
-    """A capture as CUDA's: the result has a fixed place, and replaying writes it anew."""
-    output = work().clone()
-    return lambda: output.copy_(work()), output
-
-
-def forgetful(work):
-    return lambda: None, work().clone()
-
-
-def refusing(work):
-    raise RuntimeError("operation not permitted when stream is capturing")
-
-
-@pytest.mark.parametrize(("capture", "is_captured"), [(faithful, True), (forgetful, False), (refusing, False)])
-def test_what_cannot_be_replayed_faithfully_is_called_as_it_is(capture, is_captured):
-    x, y = torch.arange(3.0), torch.ones(3)
-    replayed = gpu.Replayed(doubled, (x, y), capture)
-    assert replayed.is_captured is is_captured
-    assert replayed(x, y).tolist() == [1.0, 3.0, 5.0]
-    assert replayed(y, x).tolist() == [2.0, 3.0, 4.0]  # other inputs, no stale result
-    assert y.tolist() == [1.0] * 3  # and the caller's tensors stay the caller's

@@ -190,20 +190,20 @@ def flown_by_navigator(matcher, options=None):
 def test_the_navigator_takes_it_off_new_and_late_frames_and_forgets_it_when_it_leads_nowhere():
     matcher = Measuring(-6.0)
     navigator = flown_by_navigator(matcher)
-    assert navigator.attitude_bias.heading_deg == pytest.approx(-6.0, abs=0.3)
+    assert navigator.calibration.attitude.heading_deg == pytest.approx(-6.0, abs=0.3)
     assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
     navigator.update(level_at(2.55))  # a late one
     assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
     matcher.refuses = True
     for k in range(15):
         navigator.update(level_at(3.0 + 0.1 * k))
-    assert navigator.attitude_bias is None
+    assert navigator.calibration.attitude is None
     assert matcher.frames[-1].heading_deg == 0.0
 
 
 def test_without_a_surface_model_nothing_is_learnt():
     navigator = flown_by_navigator(Measuring(-6.0, has_surface=False))
-    assert navigator.attitude_bias is None
+    assert navigator.calibration.attitude is None
 
 
 def test_where_every_match_is_accepted_the_attitude_stays_as_it_came():

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
 from engine.navigation.motion import DeadReckoning, DriftModel, GroundMotion
-from engine.navigation.odometry import NoMotion, OdometryOptions, VisualOdometry
+from engine.navigation.odometry import NoMotion, VisualOdometry
 from scenematch.runs.settings import TrackSettings, load_settings
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
@@ -54,8 +54,8 @@ def frame(image, seconds=0.0, attitude=LEVEL, height_m=HEIGHT_M, **more):
     return Frame(image, round(seconds * 1e9), height_m, *angles_deg, **more)
 
 
-def motion_between(first: Frame, second: Frame, options=None, camera=CAMERA):
-    odometry = VisualOdometry(camera, options)
+def motion_between(first: Frame, second: Frame, camera=CAMERA):
+    odometry = VisualOdometry(camera)
     assert isinstance(odometry.update(first), NoMotion)
     return odometry.update(second)
 
@@ -189,9 +189,10 @@ def test_telemetry_that_does_not_support_a_motion_is_refused():
     )
 
 
-def test_a_velocity_that_is_too_uncertain_is_refused():
+def test_a_velocity_that_is_too_uncertain_is_refused(monkeypatch):
+    monkeypatch.setattr("engine.navigation.odometry._MAX_SIGMA_MPS", 1e-6)
     shown = frame(picture((0, 0), LEVEL)), frame(picture((5, 0), LEVEL), INTERVAL_S)
-    assert "uncertain" in motion_between(*shown, OdometryOptions(max_sigma_mps=1e-6)).reason
+    assert "uncertain" in motion_between(*shown).reason
 
 
 def test_a_buffer_that_is_filled_again_is_no_picture_that_repeats():
@@ -215,14 +216,6 @@ def test_the_way_after_a_picture_that_repeats_is_unknown():
     motions = [odometry.update(frame(image, k * INTERVAL_S)) for k, image in enumerate(shown)]
     assert [isinstance(motion, GroundMotion) for motion in motions] == [False, False, False, True]
     assert motions[3].moved_m == pytest.approx([3.0, 0.0], abs=0.2)
-
-
-@pytest.mark.parametrize("name", OdometryOptions.__dataclass_fields__)
-def test_options_are_refused_by_name(name):
-    with pytest.raises(OptionError, match=f"^{name}: expected a number above 0"):
-        OdometryOptions(**{name: 0})
-    with pytest.raises(OptionError, match=r"^min_share: expected at most 1, got 1.5"):
-        OdometryOptions(min_share=1.5)
 
 
 # Dead reckoning

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.live.sequences import (
+from engine import Fix, Navigator, NavigatorState
+from tests.support.sequences import (
     IMAGES,
     METHODS,
     PRIORS,
@@ -21,7 +22,6 @@ from bench.live.sequences import (
     is_sound,
     random_steps,
 )
-from engine import Fix, Navigator, NavigatorState
 
 RIGHT = Step("right", "next", "none", "right")
 STEPS = st.builds(Step, *map(st.sampled_from, (IMAGES, STAMPS, PRIORS, TELEMETRY)))
@@ -42,7 +42,6 @@ def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
     "method", [method if method == "sift" else pytest.param(method, marks=pytest.mark.slow) for method in METHODS]
 )
 def test_random_sequences_end_in_documented_ways_and_some_in_fixes(tiny, method):
-    """A slice of ``python -m bench.live.sequences``."""
     endings = sum((sequence(tiny, seed, method) for seed in range(12)), start=sequence(tiny, 99, method))
     assert endings["fix"] > 0
     assert endings["TelemetryError"] > 0

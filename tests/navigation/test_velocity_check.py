@@ -30,7 +30,7 @@ def match_at(place_m, confidence=0.9999, sigma_m=0.3):
 
 def flown(stated=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=1, confidence=0.9999, check=None):
     """A vehicle that turns and brakes: the check, and the times of the frames that it does not believe."""
-    check, rng = check or VelocityCheck(), np.random.default_rng(seed)
+    check, rng = check or VelocityCheck(0.5, 3.0), np.random.default_rng(seed)
     place, doubted, phase = np.zeros(2), [], rng.uniform(0, 2 * math.pi)
     for k in range(int(seconds * rate_hz)):
         time_s = k / rate_hz
@@ -79,14 +79,14 @@ def test_a_vehicle_that_hovers_and_matches_that_are_doubtful_say_nothing():
 
 def test_matches_that_jump_do_not_outweigh_a_velocity():
     """Wrong matches lie anywhere: their way is not smooth."""
-    check, rng = VelocityCheck(), np.random.default_rng(5)
+    check, rng = VelocityCheck(0.5, 3.0), np.random.default_rng(5)
     frame = Frame(IMAGE, None, east_velocity_mps=7.0, north_velocity_mps=0.0)
     assert not any(check.note(match_at(rng.uniform(-50, 50, 2)), frame, 0.2 * k) for k in range(500))
     assert check.is_believed
 
 
 def test_frames_without_a_velocity_and_pauses_say_nothing():
-    check = VelocityCheck()
+    check = VelocityCheck(0.5, 3.0)
     bare, stated = Frame(IMAGE, None), Frame(IMAGE, None, east_velocity_mps=7.0, north_velocity_mps=0.0)
     assert not any(check.note(match_at((0.0, 7.0 * k)), bare, float(k)) for k in range(20))
     assert not any(check.note(match_at((0.0, 42.0 * k)), stated, 6.0 * k) for k in range(20))

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.pages import browser
 from engine import Frame, Navigator, NoFix, Prior, Reason, SceneMatcher
 from engine.navigation.live import Answer
 from engine.navigation.navigator import NavigatorState
@@ -35,6 +34,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from scenematch.report import live_view
 from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
+from tests.support import browser
 
 FRAMES = 8
 DARK = 5  # a frame that shows nothing

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.pages.browser import missing, open_browser
 from engine.geo import LocalFrame
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
@@ -20,6 +19,7 @@ from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.reporting import report
 from scenematch.runs.settings import TrackSettings
 from scenematch.runs.tracking import track
+from tests.support.browser import missing, open_browser
 from tests.support.contrast import SCRIPT
 from tests.support.runs import bare_runs
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.pages.browser import missing, open_browser
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.options import MatcherOptions, NccOptions, PeakRule, SiftOptions
 from engine.values import Reason, Window
@@ -26,6 +25,7 @@ from scenematch.runs.settings import TrackSettings
 from scenematch.runs.simulation import write_flight
 from scenematch.runs.tracking import track
 from scenematch.simulator import plan_flight
+from tests.support.browser import missing, open_browser
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 

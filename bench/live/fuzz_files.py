@@ -1,4 +1,4 @@
-"""Fuzz of what lies on disk: mutated logs, tables and routes into their readers; each is read or refused."""
+"""Fuzz of what lies on disk: mutated logs, bags, tables and routes into their readers; each is read or refused."""
 
 from __future__ import annotations
 
@@ -18,12 +18,16 @@ from typing import Any
 
 import numpy as np
 
+from bench.inputs.bags import BAG_KINDS, write_bag
 from bench.inputs.log_files import S, dataflash_flight, ulog_flight
+from engine.camera import Camera
 from engine.errors import EngineError
+from engine.values import Frame, Prior
 from scenematch.files.export import WRITERS, pose_rows
-from scenematch.files.flight import _frame
+from scenematch.files.flight import _frame, open_flight
 from scenematch.files.logs.readers import open_log
 from scenematch.files.resampling import UTC_FROM_NS, telemetry_at, truth_from_log
+from scenematch.files.ros.bags import read_bag_camera
 from scenematch.files.route import read_route
 from scenematch.files.telemetry import TelemetryRow, ground_amsl_m, read_telemetry, write_telemetry
 from scenematch.files.track import read_track
@@ -62,6 +66,16 @@ def use_log(path: Path) -> None:
             truth_from_log(log, utc=utc)
     with suppress(EngineError):
         log.clock_shift_ns(UTC_FROM_NS)
+
+
+def use_bag(path: Path) -> None:
+    """Every picture of a bag, which of ROS 2 is the folder about a file, and its camera."""
+    bag = path if path.suffix == ".bag" else path.parent
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # rosbags' own, where a file breaks while it opens
+        for item in open_flight(bag):
+            assert item.frame.image.dtype == np.uint8
+        read_bag_camera(bag)
 
 
 def use_rows(rows: list[TelemetryRow]) -> None:
@@ -147,7 +161,19 @@ def seeds(folder: Path) -> dict[str, tuple[str, bytes, Callable[[Path], object]]
         "track.csv": ("track.csv", TRACK.encode(), use_track),
         "plan": ("a.plan", json.dumps(PLAN, indent=1).encode(), read_route),
         "GeoJSON": ("a.geojson", json.dumps(GEOJSON, indent=1).encode(), read_route),
+        **{f"bag, {kind}": seed_bag(folder, kind) for kind in BAG_KINDS},
     }
+
+
+def seed_bag(folder: Path, kind: str) -> tuple[str, bytes, Callable[[Path], object]]:
+    """The file of a bag that holds its messages; a folder's other file, the metadata, stays sound."""
+    rng, start = np.random.default_rng(1), Prior(lat_deg=48.0, lon_deg=15.0, sigma_m=10.0)
+    pictures = rng.integers(0, 256, (3, 6, 8, 3), dtype=np.uint8)
+    frames = [Frame(one, S + k * S // 10, 100.0, 10.0, 1.0, 2.0, 3.0, 4.0) for k, one in enumerate(pictures)]
+    path = folder / ("seed.bag" if kind == "ros1" else kind)
+    write_bag(path, ((frame, start) for frame in frames), Camera.from_fov(8, 6, 60.0), kind=kind)
+    file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix != ".yaml")
+    return str(file.relative_to(folder)), file.read_bytes(), use_bag
 
 
 # --------------------------------------------------------------------------------------------------- mutations
@@ -159,6 +185,11 @@ _WORDS = [
 _CELLS = (
     "", "nan", "-inf", "1e999", "-0", "9" * 400, "1e308", "-1e308", "0x10", "1_000", "９", "\x00", "\ufeff", '"',
     ",", "\n", "\r", "[", "{", "null", "true", str(2**63), str(-(2**63)), str(2**63 - 1), "1e-320", "-->",
+)  # fmt: skip
+
+_STRANGE: tuple[Any, ...] = (
+    None, True, -1, 10**400, 1e308, float("nan"), "", "LineString", [], {}, [[]], {"type": "Feature"}, [1],
+    [1, 2, 3],
 )  # fmt: skip
 
 
@@ -202,24 +233,6 @@ def garbled(rng: random.Random, data: bytes) -> bytes:
 def rebuilt(rng: random.Random, data: bytes) -> bytes:
     """JSON of which one value is another, of any kind and depth."""
     content = json.loads(data)
-    strange: Any = rng.choice(
-        (
-            None,
-            True,
-            -1,
-            10**400,
-            1e308,
-            float("nan"),
-            "",
-            "LineString",
-            [],
-            {},
-            [[]],
-            {"type": "Feature"},
-            [1],
-            [1, 2, 3],
-        )
-    )
     if rng.random() < 0.1:
         return (b"[" * 100_000) if rng.random() < 0.5 else b'{"type":"Feature","geometry":' * 5000
     places: list[tuple[Any, Any]] = []
@@ -232,14 +245,14 @@ def rebuilt(rng: random.Random, data: bytes) -> bytes:
 
     walk(content)
     node, key = rng.choice(places)
-    node[key] = strange
+    node[key] = rng.choice(_STRANGE)
     return json.dumps(content).encode()
 
 
 def mutated(rng: random.Random, name: str, data: bytes) -> bytes:
     """A damaged file of a kind."""
     makers = [damaged]
-    if not name.endswith((".BIN", ".ulg")):
+    if not name.endswith((".BIN", ".ulg", ".bag", ".db3", ".mcap")):
         makers.append(garbled)
     if name.endswith((".plan", ".geojson")):
         makers.append(rebuilt)

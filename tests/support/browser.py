@@ -1,12 +1,7 @@
-"""A headless Chromium: what a page does in it, and pictures of pages for the documentation.
-
-``python -m bench.pages.browser PAGE.html docs/img/report.png [--height 1500] [--script JS] [--element CSS]``
-``python -m bench.pages.browser FLIGHT.rrd docs/img/live-view.png [--width 1500] [--height 900]``: rerun's.
-"""
+"""A headless Chromium: what a page does in it, what it asks for, and pictures of it."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -187,29 +182,3 @@ def _free_port() -> int:
 def _listens(port: int) -> bool:
     with socket.socket() as made:
         return made.connect_ex(("127.0.0.1", port)) == 0
-
-
-def main() -> None:
-    """Take a picture of a page, or of a recording in rerun's viewer."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("page", type=Path)
-    parser.add_argument("picture", type=Path)
-    parser.add_argument("--width", type=int, default=1280)
-    parser.add_argument("--height", type=int, default=1500)
-    parser.add_argument("--script", default="", help="run before the picture is taken")
-    parser.add_argument("--element", help="CSS selector of what is taken; all of the window unless given")
-    arguments = parser.parse_args()
-    if arguments.page.suffix == ".rrd":
-        with serve_recording(arguments.page) as address, open_browser(SOFTWARE_GL) as browser:
-            browser.open(address, arguments.width, arguments.height)
-            browser.wait_until_still()
-            browser.save(arguments.picture)
-        return
-    with open_browser() as browser:
-        browser.open(arguments.page, arguments.width, arguments.height)
-        browser.run(arguments.script)
-        browser.save(arguments.picture, arguments.element)
-
-
-if __name__ == "__main__":
-    main()

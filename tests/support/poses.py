@@ -1,4 +1,4 @@
-"""Matches with a known pose, and matches with none: what the bench and the tests of the pose draw from."""
+"""Matches with a known pose and matches with none, drawn, and what the solver makes of many of them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera
-from engine.matching.pose import AttitudePrior
+from engine.matching.pose import AttitudePrior, solve_pose
 
 Array = NDArray[np.float64]
 Matches = tuple[Array, Array]  # (N, 3) metres, (N, 2) pixels
 
 SIZE_PX = 300
 CAMERA = Camera(SIZE_PX, SIZE_PX, np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]]))
+CHI2_3_SIGMA = 14.156  # three degrees of freedom, 99.73 %
 GROUNDS = ("planar nadir", "tilted", "high relief", "distorted")
 
 
@@ -221,3 +222,57 @@ WRONG: dict[str, Callable[[np.random.Generator], Matches]] = {
     "a false cluster": _false_cluster,
 }
 """Ways to draw matches that no pose explains."""
+
+
+# ------------------------------------------------------------------------------------------- many of them
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How errors lie within their covariance, over the frames that gave a pose."""
+
+    cases: int
+    accepted: int
+    off: int  # accepted more than 10 m and 3 sigma off
+    within: float  # share within 3 sigma in the sense of Mahalanobis, of the centre
+    within_axis: float  # the same, the worst of east, north and up
+    nees: float  # mean; 3 is consistent
+    within_turn: float  # of the attitude
+    nees_turn: float
+
+
+def accepted(kind: str, sets: int, seed: int) -> int:
+    """How many sets of wrong matches gave a pose; every other one comes with telemetry."""
+    rng, count = np.random.default_rng([seed, list(WRONG).index(kind)]), 0
+    for i in range(sets):
+        points, pixels = WRONG[kind](rng)
+        prior = measured(rng, attitude(rng, rng.uniform(0, 10))) if i % 2 else None
+        count += solve_pose(points, pixels, CAMERA.matrix, prior=prior) is not None
+    return count
+
+
+def coverage(ground: str, with_prior: bool, cases: int, seed: int) -> Coverage:
+    """Errors of many simulated frames against their own covariance."""
+    rng, rows = np.random.default_rng([seed, GROUNDS.index(ground), with_prior]), []
+    for _ in range(cases):
+        s = scene(rng, ground, with_prior=with_prior)
+        pose = solve_pose(s.points_m, s.points_px, CAMERA.matrix, prior=s.prior)
+        if pose is None:
+            continue
+        error = pose.center_m - s.center_m
+        turn = cv2.Rodrigues(s.rotation @ pose.rotation.T)[0][:, 0]
+        within = np.abs(error) < 3 * np.sqrt(np.diag(pose.covariance_center_m2))
+        nees = error @ np.linalg.solve(pose.covariance_center_m2, error)
+        off = nees > CHI2_3_SIGMA and np.linalg.norm(error) > 10
+        rows.append([nees, turn @ np.linalg.solve(pose.covariance[3:, 3:], turn), off, *within])
+    table = np.array(rows, dtype=float)
+    return Coverage(
+        cases=cases,
+        accepted=len(table),
+        off=int(table[:, 2].sum()),
+        within=float(np.mean(table[:, 0] < CHI2_3_SIGMA)),
+        within_axis=float(table[:, 3:].mean(axis=0).min()),
+        nees=float(table[:, 0].mean()),
+        within_turn=float(np.mean(table[:, 1] < CHI2_3_SIGMA)),
+        nees_turn=float(table[:, 1].mean()),
+    )

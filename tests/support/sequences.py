@@ -1,17 +1,12 @@
-"""Sequences of frames as nobody should send them: does each end in a fix, a refusal or a documented error?
-
-    python -m bench.live.sequences [COUNT [FIRST]]
+"""Sequences of frames as nobody should send them, flown over a tiny map.
 
 Gaps, duplicates, reordered and backward stamps, NaN priors, flat, black and saturated frames, wrong shapes and
-types, impossible telemetry; a real matcher on a tiny map. Prints what became of the frames, one JSON object.
+types, impossible telemetry.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import sys
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +26,6 @@ from engine import (
     OrthoMap,
     Prior,
     SceneMatcher,
-    set_threads,
 )
 from engine.options import PoseOptions, SiftOptions
 
@@ -193,24 +187,3 @@ def is_sound(covariance_m2: Any) -> bool:
     return bool(
         finite and np.allclose(covariance_m2, covariance_m2.T) and np.linalg.eigvalsh(covariance_m2)[0] > 0.0
     )
-
-
-def main() -> None:
-    """Fly 10,000 sequences, or as many as are asked for, from seed ``FIRST`` on."""
-    set_threads(1)
-    warnings.simplefilter("error")
-    count = int(sys.argv[1]) if sys.argv[1:] else 10_000
-    first = int(sys.argv[2]) if sys.argv[2:] else 0
-    ground, endings = Ground(), Counter[str]()
-    for seed in range(first, first + count):
-        rng = np.random.default_rng(seed)
-        steps = random_steps(rng, int(rng.integers(1, 24)))
-        try:
-            endings += fly(ground, steps, METHODS[seed % 3], start=bool(rng.integers(2)))
-        except Exception as error:
-            raise AssertionError(f"sequence {seed}: {steps}") from error
-    print(json.dumps({"sequences": count, "frames": endings.total(), "endings": dict(endings.most_common())}))
-
-
-if __name__ == "__main__":
-    main()
