@@ -1,7 +1,7 @@
 """A transform to be trained: grey levels turned into what two years of one place have in common.
 
 A small convolutional network; ``python -m bench.train_transform`` trains it from nothing. The engine does
-without it: ``docs/seasons.md`` has the comparison.
+without it: ``docs/results/seasons.md`` has the comparison.
 
 Reference:
     Fragoso et al., A seasonally invariant deep transform for visual terrain-relative navigation, Science Robotics

@@ -1,10 +1,10 @@
 """All shared real flights by every method, beside the paper's recipe and the plain classical one.
 
     python -m bench.accuracy.field [--methods ncc sift ...] [--sets brighton ...] [--step N] [--weights FILE]
-                                   [--docs DIR] [--save-before]
+                                   [--docs DIR]
 
-Each flight goes through :func:`scenematch.track`, as a user would run it. Writes docs/field.md; ``--save-before``
-writes the figures that the page then compares with.
+Each flight goes through :func:`scenematch.track`, as a user would run it. Writes the page
+docs/results/field.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
+from bench import RESULTS, SHARED
 from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
@@ -46,7 +46,6 @@ VIDEO = "flight.mp4"
 START_SIGMA_M = 15.0
 SHIFT_M, MIN_SHIFT_M, DIRECTIONS = 200.0, 60.0, 8
 SHIFTED_WINDOWS = 2
-BEFORE = Path(__file__).parents[1] / "pages" / "field_before.json"
 
 
 @dataclass(frozen=True)
@@ -283,8 +282,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=[*REAL, *DRAWN], default=[*REAL, *DRAWN])
     parser.add_argument("--step", type=int, help="every how many frames one is taken, of every set")
     parser.add_argument("--weights", type=Path, nargs="+", default=(), help="of the learned method, else left out")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
-    parser.add_argument("--save-before", action="store_true", help="keep the figures as those before")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
@@ -292,10 +290,7 @@ def main() -> None:
     for result in measure(options):
         results[type(result)].append(result)
         print(json.dumps(asdict(result)), flush=True)
-    if options.save_before:
-        BEFORE.write_text(json.dumps([asdict(row) for row in results[Figures]], indent=1) + "\n", encoding="utf-8")
-    before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else []
-    field.write(options.docs, results[Figures], results[Votes], before)
+    field.write(options.docs, results[Figures], results[Votes])
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.map_alone [--flights NAME ...] [--map FILE]
 
-Prints the recorded flights' rows of the table in docs/how-ncc-works.md. Frames are matched one by one, each with a
+Prints the recorded flights' rows of the table in docs/results/ncc.md. Frames are matched one by one, each with a
 prior that is 4 m off per axis and says 8 m. The Gazebo maps are exact and said to be good to 0.1 m; that of
 caliterra as :data:`bench.accuracy.nees.RECORDED` has it.
 """

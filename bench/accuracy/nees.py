@@ -4,7 +4,7 @@
 
 Frames are matched one by one, each with a prior that is 4 m off per axis and says 8 m. What maps and truths are
 known to be off is stated (:data:`RECORDED`) and not fitted to the NEES; the simulated worlds are exact. Writes the
-table into docs/integrity-measured.md and its chart beside it.
+table into docs/results/integrity.md and its chart beside it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
+from bench import RESULTS, SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
 from bench.pages.text import paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
@@ -300,7 +300,7 @@ def chart(rows: list[Row]) -> Figure:
 def main() -> None:
     """Measure, and write the section and its chart."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--docs", type=Path, default=DOCS)
+    parser.add_argument("--docs", type=Path, default=RESULTS)
     parser.add_argument(
         "--flights", nargs="*", default=None, choices=[*TOWNS, *RECORDED], help="print, write nothing"
     )
@@ -309,7 +309,7 @@ def main() -> None:
     rows = measure(options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())])
     if options.flights is not None:
         return
-    page = options.docs / "integrity-measured.md"
+    page = options.docs / "integrity.md"
     before, rest = page.read_text(encoding="utf-8").split(BEGIN)
     page.write_text(before + section(rows) + rest.split(END)[1], encoding="utf-8")
     chart(rows).savefig(options.docs / "img" / "integrity-nees.png", dpi=130, facecolor="white")

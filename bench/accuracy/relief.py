@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.relief [--quick] [--docs DIR]
 
-Writes the table of docs/simulator-measured.md, section "Hills", between its markers.
+Writes the table of docs/results/simulator.md, section "Hills", between its markers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import cv2
 
-from bench import DOCS
+from bench import RESULTS
 from bench.accuracy.simulated import RATE_HZ, START_SIGMA_M, matchers
 from bench.pages.text import machine, table
 from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
@@ -111,7 +111,7 @@ def lines(runs: list[Run]) -> list[str]:
 
 def write(docs: Path, runs: list[Run]) -> None:
     """Put the table between the page's markers."""
-    page = docs / "simulator-measured.md"
+    page = docs / "simulator.md"
     head, rest = page.read_text(encoding="utf-8").split(BEGIN)
     tail = rest.split(END)[1]
     body = [BEGIN, "", *lines(runs), f"Measured with {machine()}.", "", END]
@@ -122,7 +122,7 @@ def main() -> None:
     """Fly, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town with high hills")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)

@@ -1,10 +1,10 @@
 """What the field is like, simulated and drawn anew: snow, a city on a map that is 5 m off, an oblique camera.
 
     python -m bench.accuracy.scenes [--scenes snow ...] [--methods ncc sift auto] [--seeds N] [--quick] [--sheet]
-                                    [--docs DIR] [--save-before]
+                                    [--docs DIR]
 
 Every frame is matched by itself about a prior that is drawn (sigma 15 m), and the flight is followed from its true
-start. Writes docs/field-simulated.md; ``--sheet`` draws its picture instead.
+start. Writes docs/results/field-simulated.md; ``--sheet`` draws its picture instead.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS
+from bench import RESULTS
 from bench.accuracy.field import figures
 from bench.pages import scenes as page
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
@@ -45,7 +45,6 @@ CITY_CHANGED, LEAN_DEG, LEAN_FROM_M = 0.2, 12.0, 6000.0
 HILLS_M, HILLS_HEIGHT_M, HILLS_PITCH_DEG = 60.0, 120.0, -45.0
 SEASONS = ("autumn", "winter")
 METHODS = ("ncc", "sift", "auto")
-BEFORE = Path(__file__).parents[1] / "pages" / "scenes_before.json"
 SIZE_PX, FOV_DEG = (640, 480), 62.0
 """Of the camera of a photographing drone; snow is flown with the paper's."""
 
@@ -229,8 +228,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="how many towns of each scene")
     parser.add_argument("--quick", action="store_true", help="eight frames of each town")
     parser.add_argument("--sheet", action="store_true", help="draw frames and map of every scene, match nothing")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its picture")
-    parser.add_argument("--save-before", action="store_true", help="keep the figures as those before")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page and of its picture")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
@@ -246,10 +244,7 @@ def main() -> None:
                     results.setdefault((name, method, result.how), []).append(result)
                     print(json.dumps([seed, asdict(pooled([result]))]), flush=True)
     rows = [pooled(same) for same in results.values()]
-    if options.save_before:
-        BEFORE.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
-    before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else []
-    page.write(options.docs, rows, before)
+    page.write(options.docs, rows)
 
 
 if __name__ == "__main__":

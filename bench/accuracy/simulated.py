@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.simulated [--quick] [--sheet] [--docs DIR]
 
-Writes the tables of docs/simulator-measured.md; --sheet draws docs/img/sim-conditions.png instead.
+Writes the tables of docs/results/simulator.md; --sheet draws docs/img/sim-conditions.png instead.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS
+from bench import DOCS, RESULTS
 from bench.pages.text import machine, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import LocalFrame
@@ -131,7 +131,7 @@ def lines(runs: list[Run], ways: tuple[tuple[str, str], ...]) -> list[str]:
 
 def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
     """Put the tables between the page's markers."""
-    page = docs / "simulator-measured.md"
+    page = docs / "simulator.md"
     head, rest = page.read_text(encoding="utf-8").split(BEGIN)
     tail = rest.split(END)[1]
     body = [BEGIN, "", *lines(runs, WAYS)]
@@ -173,12 +173,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town")
     parser.add_argument("--sheet", action="store_true", help="draw the frames of every condition, fly nothing")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
     if options.sheet:
-        draw_sheet(options.docs / "img" / "sim-conditions.png")
+        draw_sheet(DOCS / "img" / "sim-conditions.png")
         return
     seeds, frames = (SEEDS[:1], 5) if options.quick else (SEEDS, None)
     runs: list[Run] = []

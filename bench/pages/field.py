@@ -1,9 +1,9 @@
-"""docs/field.md: the table of what :mod:`bench.accuracy.field` flew, before and after."""
+"""docs/results/field.md: the table of what :mod:`bench.accuracy.field` flew."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,15 +28,13 @@ NAMES = {
 }  # fmt: skip
 INTRO = (
     "Made by `python -m bench.accuracy.field` on {machine}, one thread, beside other work: its milliseconds are "
-    "upper bounds, and no comparison with those before. Each flight goes through "
-    "`track` with default settings and the telemetry that was recorded; a flight without positions in its "
+    "upper bounds. Each flight goes through `track` with default settings; a flight without positions in its "
     "telemetry starts at its true place (sigma 15 m)."
 )
 FIGURES = (
     "Median and RMS are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **outside** those "
-    "outside the ellipse of three of their own sigmas. In brackets: before, where it differs. The campus's truth "
-    "is good to about a metre and is the ground in the middle of each frame, not what lies below the vehicle: "
-    "fixes there that have a pose are moved to where their own axis meets the ground."
+    "outside the ellipse of three of their own sigmas. The truth of `nust` is the ground "
+    "in the middle of each frame, good to about a metre, and its fixes are moved there."
 )
 PEERS = (
     "`paper's NCC` and `paper's SIFT` are `--profile paper`: the paper's recipe by OpenCV, which refuses almost "
@@ -51,10 +49,9 @@ VOTES = (
     "that is more than 10 m off, *shifted* the most in a window that does not hold the place: moved by up to "
     "200 m, as far as the map allows. Least, median and most of the frames."
 )
-BASE = ("classical", "paper-ncc", "paper-sift")  # no code of these is ours to change
 
 
-def write(docs: Path, rows: list[Figures], votes: list[Votes], before: list[dict[str, Any]]) -> None:
+def write(docs: Path, rows: list[Figures], votes: list[Votes]) -> None:
     """Write the page below ``docs``."""
     lines = [
         "# The field",
@@ -63,13 +60,12 @@ def write(docs: Path, rows: list[Figures], votes: list[Votes], before: list[dict
         *paragraph(FIGURES),
         *paragraph(PEERS),
     ]
-    former = {(row["flight"], row["method"], row["step"]): row for row in before}
     for flight in dict.fromkeys(row.flight for row in rows):
         own = [row for row in rows if row.flight == flight]
         lines += [f"## {TITLES[flight]}", ""]
         lines += table(
             ["method", "frames", "fixed", "within 1, 5, 10 m", "median, m", "RMS, m", "wrong", "outside", "ms"],
-            [_cells(row, former.get((row.flight, row.method, row.step))) for row in own],
+            [_cells(row) for row in own],
         )
     if votes:
         lines += ["## Votes of the plain classical recipe", "", *paragraph(VOTES)]
@@ -79,26 +75,18 @@ def write(docs: Path, rows: list[Figures], votes: list[Votes], before: list[dict
     (docs / "field.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
-def _cells(row: Figures, before: dict[str, Any] | None) -> list[str]:
+def _cells(row: Figures) -> list[str]:
     every = f", every {row.step}th" if row.step > 1 else ""
-    texts = [_texts({name: getattr(row, name) for name in row.__dataclass_fields__})]
-    if before is not None and row.method not in BASE:
-        texts.append(_texts(before))
-    pairs = [now if not was or was[0] == now else f"{now} ({was[0]})" for now, *was in zip(*texts, strict=True)]
-    return [NAMES[row.method] + every, str(row.frames), *pairs]
-
-
-def _texts(row: dict[str, Any]) -> list[str]:
-    """The cells behind the number of frames."""
-    known = row["median_m"] is not None
     return [
-        str(row["fixed"]),
-        ", ".join(map(str, row["within"])),
-        f"{row['median_m']:.2f}" if known else "-",
-        f"{row['rms_m']:.2f}" if known else "-",
-        str(row["wrong"]),
-        "-" if row["outside"] is None else str(row["outside"]),
-        f"{row['p50_ms']:.0f}",
+        NAMES[row.method] + every,
+        str(row.frames),
+        str(row.fixed),
+        ", ".join(map(str, row.within)),
+        "-" if row.median_m is None else f"{row.median_m:.2f}",
+        "-" if row.rms_m is None else f"{row.rms_m:.2f}",
+        str(row.wrong),
+        "-" if row.outside is None else str(row.outside),
+        f"{row.p50_ms:.0f}",
     ]
 
 

@@ -1,4 +1,4 @@
-"""Tables and charts of the benchmark of integrity, written into docs/integrity-measured.md."""
+"""Tables and charts of the benchmark of integrity, written into docs/results/integrity.md."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 
 def write(rows: list[Row], docs: Path) -> None:
     """The section between the markers, and its pictures."""
-    page = docs / "integrity-measured.md"
+    page = docs / "integrity.md"
     text = page.read_text(encoding="utf-8")
     begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     page.write_text(f"{text[:begin]}\n\n{section(rows)}\n{text[end:]}", encoding="utf-8")

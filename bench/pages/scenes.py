@@ -1,10 +1,10 @@
-"""docs/field-simulated.md: the tables and the picture of :mod:`bench.accuracy.scenes`, before and after."""
+"""docs/results/field-simulated.md: the tables and the picture of :mod:`bench.accuracy.scenes`."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -27,9 +27,9 @@ TITLES = {
 }
 NAMES = {"ncc": "NCC", "sift": "SIFT", "auto": "auto"}
 INTRO = (
-    "Made by `python -m bench.accuracy.scenes`, one run of it, on {machine}, one thread: towns that are drawn for "
+    "Made by `python -m bench.accuracy.scenes` on {machine}, one thread: towns that are drawn for "
     "it, on which nothing was fitted. *Each frame* is matched by itself about a drawn prior (sigma 15 m); *track* "
-    "is the flight from its true start, a frame every 3.6 s. In round brackets: before, where it differs."
+    "is the flight from its true start, a frame every 3.6 s."
 )
 FIGURES = (
     "Errors are those of the vehicle's true position. In the city they are those against where that position lies "
@@ -63,37 +63,31 @@ class Row:
     on_map: Figures
 
 
-def write(docs: Path, rows: list[Row], before: list[dict[str, Any]]) -> None:
+def write(docs: Path, rows: list[Row]) -> None:
     """Write the page below ``docs``."""
     lines = ["# The field, simulated", "", *paragraph(INTRO.format(machine=machine())), *paragraph(FIGURES)]
     lines += [f"![frames and maps of the scenes](img/{PICTURE})", ""]
     lines += ["A scene a row, in the order of the tables: three frames, and its map on the right.", ""]
-    former = {(row["scene"], row["method"], row["how"]): row for row in before}
     for scene in dict.fromkeys(row.scene for row in rows):
         lines += paragraph(f"**{TITLES[scene]}.**")
         own = [row for row in rows if row.scene == scene]
-        lines += table(COLUMNS, [_cells(row, former.get((row.scene, row.method, row.how))) for row in own])
+        lines += table(COLUMNS, [_cells(row) for row in own])
     (docs / "field-simulated.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
-def _cells(row: Row, before: dict[str, Any] | None) -> list[str]:
-    texts = [_texts(asdict(row))] + ([] if before is None else [_texts(before)])
-    pairs = [now if not was or was[0] == now else f"{now} ({was[0]})" for now, *was in zip(*texts, strict=True)]
-    return [NAMES[row.method], row.how, str(row.true.frames), *pairs]
-
-
-def _texts(row: dict[str, Any]) -> list[str]:
-    """The cells behind the number of frames."""
-    true, on_map = row["true"], row["on_map"]
-    known = true["fixed"] > 0
+def _cells(row: Row) -> list[str]:
+    true, on_map = row.true, row.on_map
     return [
-        f"{true['fixed']}, {100.0 * true['fixed'] / true['frames']:.0f} %",
-        ", ".join(map(str, on_map["within"])),
-        f"{on_map['median_m']:.2f}" if known else "-",
-        f"{on_map['rms_m']:.2f}" if known else "-",
-        str(true["wrong"]),
-        str(true["outside"]),
-        f"{true['p50_ms']:.0f}",
+        NAMES[row.method],
+        row.how,
+        str(true.frames),
+        f"{true.fixed}, {100.0 * true.fixed / true.frames:.0f} %",
+        ", ".join(map(str, on_map.within)),
+        "-" if on_map.median_m is None else f"{on_map.median_m:.2f}",
+        "-" if on_map.rms_m is None else f"{on_map.rms_m:.2f}",
+        str(true.wrong),
+        str(true.outside),
+        f"{true.p50_ms:.0f}",
     ]
 
 
