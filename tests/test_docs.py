@@ -99,7 +99,7 @@ def headings(page):
 
 
 def test_the_readme_is_short():
-    assert len(read("README.md").split()) <= 700
+    assert len(read("README.md").split()) <= 500
 
 
 def test_every_page_is_reached_from_the_readme():
