@@ -3,8 +3,8 @@
     python -m bench.speed.large_map [--side 100000] [--folder DIR] [--docs DIR]
 
 Builds a sparse cloud-optimised GeoTIFF with a simulated town in the midst of others, and a surface model of that
-size, follows a flight in rounds with `scenematch track` on each, watches each process from outside, and writes the
-table of docs/results/large-maps.md, between its markers. Takes some fifteen minutes; `--folder` keeps what was built.
+size, follows a flight in rounds with `scenematch track` on each, watches each process from outside, and writes
+the table of docs/results/large-maps.md. Takes some fifteen minutes; `--folder` keeps what was built.
 """
 
 from __future__ import annotations
