@@ -19,7 +19,7 @@ import cv2
 
 from bench import RESULTS
 from bench.accuracy.simulated import RATE_HZ, START_SIGMA_M, matchers
-from bench.pages.text import machine, table
+from bench.pages.text import machine, paragraph, table
 from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.runtime.threads import set_threads
 from scenematch.files.track import track_row
@@ -114,7 +114,7 @@ def write(docs: Path, runs: list[Run]) -> None:
     page = docs / "simulator.md"
     head, rest = page.read_text(encoding="utf-8").split(BEGIN)
     tail = rest.split(END)[1]
-    body = [BEGIN, "", *lines(runs), f"Measured with {machine()}.", "", END]
+    body = [BEGIN, "", *lines(runs), *paragraph(f"Measured with {machine()}."), END]
     page.write_text(head + "\n".join(body) + tail, encoding="utf-8")
 
 

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from bench import RESULTS, SHARED
-from bench.pages.text import machine
+from bench.pages.text import machine, paragraph
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.budget import Budget, Deadline
 from engine.kernels.scores import SCORES, enhance
@@ -241,7 +241,7 @@ def measure(data: Path) -> list[list[str]]:
 
 PAGE = f"""# Scores
 
-Made by `python -m bench.accuracy.scores` on {{machine}}, one thread.
+{{made}}
 Height, heading and tilt are the telemetry's, the prior is up to {PRIOR_OFF_M:.0f} m off per axis.
 
 - **Flights** (frames): fixes, wrong ones by more than {WRONG_M:.0f} m, RMS of the others, median lead of the
@@ -267,7 +267,8 @@ def main() -> None:
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
-    options.page.write_text(PAGE.format(machine=machine()) + table(measure(options.data)) + "\n", encoding="utf-8")
+    made = "\n".join(paragraph(f"Made by `python -m bench.accuracy.scores` on {machine()}, one thread."))
+    options.page.write_text(PAGE.format(made=made) + table(measure(options.data)) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS, RESULTS
-from bench.pages.text import machine, table
+from bench.pages.text import machine, paragraph, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import LocalFrame
 from engine.options import ACCEPT_ALL
@@ -137,7 +137,7 @@ def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
     body = [BEGIN, "", *lines(runs, WAYS)]
     if more:
         body += ["The engine on what is harder, two towns each:", "", *lines(more, WAYS[:2])]
-    body += [f"Measured with {machine()}.", "", END]
+    body += [*paragraph(f"Measured with {machine()}."), END]
     page.write_text(head + "\n".join(body) + tail, encoding="utf-8")
 
 
