@@ -4,4 +4,5 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+RESULTS = DOCS / "results"  # measured tables, one page a benchmark
 SHARED = ROOT.parent / "shared" / "data"

@@ -5,7 +5,7 @@
 
 Each fault is put into the inputs of a flight folder with truth; the flight begins at its true place.
 A false fix is off by more than 5 m and by more than three of its own standard deviations. ``--docs`` writes the
-table of docs/wrong-inputs.md.
+table of docs/results/wrong-inputs.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS
+from bench import RESULTS
 from bench.inputs.faults import Fault, FlightInputs, faults, load
 from bench.pages.text import rewrite, table
 from engine import Fix, Navigator, Prior, SceneMatcher
@@ -203,7 +203,7 @@ def main() -> None:
     parser.add_argument("--map", default="map.tif")
     parser.add_argument("--only", default="")
     parser.add_argument("--no-diagnosis", action="store_true")
-    parser.add_argument("--docs", type=Path, nargs="?", const=DOCS)
+    parser.add_argument("--docs", type=Path, nargs="?", const=RESULTS)
     wanted = parser.parse_args()
     set_threads(1)
     begin, cells = time.monotonic(), []

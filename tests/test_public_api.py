@@ -78,7 +78,7 @@ MODULES = {
 }
 """Public modules besides the engine's, whose ``__all__`` counts, and the optional package that each needs."""
 PACKAGES = ("engine", "scenematch")
-TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
 UNUSED = (
     "matplotlib",
     "rasterio",

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.audit [--quick] [--fit] [--page FILE]
 
-Rewrites docs/audit-measured.md below its marker. ``--fit`` fits the rule on grounds of its own, which
+Rewrites docs/results/audit.md below its marker. ``--fit`` fits the rule on grounds of its own, which
 are not reported on, prints its weights, and writes nothing.
 """
 
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
+from bench import RESULTS, SHARED
 from bench.accuracy.confidence import fitted
 from bench.accuracy.flights import STEPS, Recorded, recorded
 from bench.inputs.farmland import farmland
@@ -37,7 +37,7 @@ from scenematch.simulator import build_town
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-PAGE = DOCS / "audit-measured.md"
+PAGE = RESULTS / "audit.md"
 MEASURED = "<!-- bench.accuracy.audit -->\n"
 WRONG_M = 10.0
 START_SIGMA_M = 15.0

@@ -1,6 +1,6 @@
 """The closed loop, measured: five minutes by the engine's fixes alone, and every fault.
 
-``python -m bench.accuracy.closed_loop [--seeds 31 32] [--out DIR]``: the table of docs/simulator-measured.md.
+``python -m bench.accuracy.closed_loop [--seeds 31 32] [--out DIR]``: the table of docs/results/simulator.md.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""All shared real flights by every method, beside the paper's recipe.
+"""All shared real flights by every method, beside the paper's recipe and the plain classical one.
 
     python -m bench.accuracy.field [--methods ncc sift ...] [--sets brighton ...] [--step N] [--weights FILE]
                                    [--docs DIR]
 
-Each flight goes through :func:`scenematch.track`, as a user would run it. Writes docs/field.md.
+Each flight goes through :func:`scenematch.track`, as a user would run it. Writes the page
+docs/results/field.md.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
+from bench import RESULTS, SHARED
+from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
-from engine import Fix, Navigator, SceneMatcher
+from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.options import ACCEPT_ALL, LearnedOptions
 from engine.runtime.threads import set_threads
 from scenematch import FlightFiles, TrackSettings, track
 from scenematch.files.track import TrackRow, read_track, track_row
+from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightInputs, open_inputs
@@ -36,7 +39,8 @@ Array = NDArray[np.float64]
 
 REAL = ("brighton", "seneca", "caliterra", "nust")
 DRAWN = {"gazebo-a1": 8, "gazebo-a2": 8, "gazebo-a1-evening": 8}
-METHODS = ("ncc", "sift", "auto", "learned", "paper-ncc", "paper-sift")
+METHODS = ("ncc", "sift", "auto", "learned", "paper-ncc", "paper-sift", "classical")
+RECIPE_STEPS = {"nust": 4, "caliterra": 2, "gazebo-a1": 24, "gazebo-a2": 24, "gazebo-a1-evening": 24}
 VIDEO = "flight.mp4"
 START_SIGMA_M = 15.0
 
@@ -154,6 +158,42 @@ def figures(
     )
 
 
+# ------------------------------------------------------------------------- the plain classical recipe
+
+
+def by_recipe(name: str, step: int, seed: int = 1) -> Figures:
+    """The recipe on each frame by itself, in a window about the telemetry's position, else about a drawn one."""
+    _, inputs = inputs_of(name, step)
+    site, rng = inputs.site, np.random.default_rng(seed)
+    recipe = ClassicalRecipe(site, inputs.camera)
+    recipe.prepare()
+    errors, spent = [], []
+    for item in inputs.flight:
+        truth = interpolate_truth(inputs.truth or [], item.frame.timestamp_ns or 0)
+        if truth is None:
+            continue
+        true = site.pixel_from_enu(site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg))
+        begin = time.perf_counter()
+        nadir = _elected(recipe, item.frame, _expected(site, item.prior, true, rng))
+        spent.append((time.perf_counter() - begin) * 1e3)
+        errors.append(np.nan if nadir is None else float(np.hypot(*(nadir - true))) * site.gsd_m_per_px)
+    return figures((name, "classical", step), np.array(errors), None, spent)
+
+
+def _expected(site: OrthoMap, prior: Prior | None, true: Array, rng: np.random.Generator) -> Array:
+    if prior is None or prior.lat_deg is None:
+        return np.asarray(true + rng.normal(0.0, START_SIGMA_M / site.gsd_m_per_px, 2))
+    return np.asarray(site.pixel_from_enu(site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)))
+
+
+def _elected(recipe: ClassicalRecipe, frame: Frame, centre_px: Array) -> Array | None:
+    features = recipe.rectified(frame)
+    if features is None or frame.height_agl_m is None:
+        return None
+    gsd = recipe.site.gsd_m_per_px
+    return recipe.elect(features, centre_px, 3.0 * START_SIGMA_M / gsd, TOLERANCE_SHARE * frame.height_agl_m / gsd)
+
+
 # ------------------------------------------------------------------------------------------- the page
 
 
@@ -166,7 +206,10 @@ def measure(options: argparse.Namespace) -> Iterator[Figures]:
             if method == "learned" and not options.weights:
                 continue
             step = options.step or DRAWN.get(name, 1)
-            yield fly(name, method, step, options.weights)
+            if method == "classical":
+                yield by_recipe(name, options.step or RECIPE_STEPS.get(name, 1))
+            else:
+                yield fly(name, method, step, options.weights)
 
 
 def main() -> None:
@@ -176,7 +219,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=[*REAL, *DRAWN], default=[*REAL, *DRAWN])
     parser.add_argument("--step", type=int, help="every how many frames one is taken, of every set")
     parser.add_argument("--weights", type=Path, nargs="+", default=(), help="of the learned method, else left out")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.flights [--quick] [--docs DIR]
 
-Writes docs/flights.md. The recorded flights are left out where they are not there; the built-in one always flies.
+Writes docs/results/flights.md. Recorded flights that are missing are left out; the built-in one always flies.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
+from bench import RESULTS, SHARED
 from bench.inputs.views import FRAMES
 from bench.pages import flights
 from bench.pages.flights import Run
@@ -193,7 +193,7 @@ def main() -> None:
     """Fly, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few frames of each flight")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its picture")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page and of its picture")
     options = parser.parse_args()
     set_threads(1)
     there = [(name, step) for name, step in STEPS.items() if (SHARED / name).is_dir()]

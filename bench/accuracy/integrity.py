@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import DOCS, ROOT, SHARED
+from bench import RESULTS, ROOT, SHARED
 from bench.accuracy.judged import METHODS, Bench, Row
 from bench.accuracy.trials import ground
 from bench.pages import integrity
@@ -92,7 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--matches", type=int, default=100_000)
     parser.add_argument("--resume", action="store_true", help="keep what an earlier run matched")
-    parser.add_argument("--docs", type=Path, default=DOCS)
+    parser.add_argument("--docs", type=Path, default=RESULTS)
     options = parser.parse_args()
     if not options.resume:
         shutil.rmtree(PARTS, ignore_errors=True)

@@ -4,7 +4,7 @@
 
 Frames are matched one by one, each with a prior that is 4 m off per axis and says 8 m. What maps and truths are
 known to be off is stated (:data:`RECORDED`) and not fitted to the NEES; the simulated worlds are exact. Writes the
-table into docs/integrity-measured.md.
+table into docs/results/integrity.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS, SHARED
+from bench import RESULTS, SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
 from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
@@ -279,7 +279,7 @@ def section(rows: list[Row]) -> list[str]:
 def main() -> None:
     """Measure, and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--docs", type=Path, default=DOCS)
+    parser.add_argument("--docs", type=Path, default=RESULTS)
     parser.add_argument(
         "--flights", nargs="*", default=None, choices=[*TOWNS, *RECORDED], help="print, write nothing"
     )
@@ -290,7 +290,7 @@ def main() -> None:
     rows = measure(names, with_surface=not options.map_alone)
     if options.flights is not None or options.map_alone:
         return
-    rewrite(options.docs / "integrity-measured.md", BEGIN, END, section(rows))
+    rewrite(options.docs / "integrity.md", BEGIN, END, section(rows))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.odometry [FLIGHT ...] [--quick]
 
-Prints the two tables of docs/odometry.md. Without names it flies those that nothing was fitted to, gazebo-a1 and
+Prints the tables of docs/results/odometry.md. Without names it flies what nothing was fitted to, gazebo-a1 and
 nust; gazebo-a2 and "built-in" are what the covariance was fitted to.
 """
 

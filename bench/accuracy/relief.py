@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.relief [--quick] [--docs DIR]
 
-Writes the table of docs/simulator-measured.md, section "Hills", between its markers.
+Writes the table of docs/results/simulator.md, section "Hills", between its markers.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import cv2
 
-from bench import DOCS
+from bench import RESULTS
 from bench.accuracy.simulated import PAGE, RATE_HZ, WAYS, Run, fly, matchers
-from bench.pages.text import machine, rewrite, table
+from bench.pages.text import machine, paragraph, rewrite, table
 from engine.runtime.threads import set_threads
 from scenematch.simulator import plan_flight
 
@@ -74,7 +74,7 @@ def main() -> None:
     """Fly, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town with high hills")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
@@ -83,7 +83,7 @@ def main() -> None:
     for relief_m, run in flights(seeds, reliefs_m, frames):
         runs.append((relief_m, run))
         print(json.dumps([relief_m, run.day, run.with_attitude, run.method, run.seed, *pooled([run])]), flush=True)
-    rewrite(options.docs / PAGE, BEGIN, END, [*lines(runs), f"Measured with {machine()}.", ""])
+    rewrite(options.docs / PAGE, BEGIN, END, [*lines(runs), *paragraph(f"Measured with {machine()}.")])
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
                                     [--docs DIR]
 
 Every frame is matched by itself about a prior that is drawn (sigma 15 m), and the flight is followed from its true
-start. Writes docs/field-simulated.md.
+start. Writes docs/results/field-simulated.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS
+from bench import RESULTS
 from bench.accuracy.field import figures
 from bench.pages import scenes as page
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
@@ -227,7 +227,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", type=int, default=2, help="how many towns of each scene")
     parser.add_argument("--quick", action="store_true", help="eight frames of each town")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)

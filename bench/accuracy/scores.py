@@ -1,6 +1,6 @@
 """Scores of NCC on simulated and recorded flights and over the seasons: ``python -m bench.accuracy.scores``.
 
-Writes docs/scores.md. Every figure comes from the engine's own steps; without the recorded data there is no page.
+Writes docs/results/scores.md. Every figure comes from the engine's own steps; it needs the recorded data.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench import DOCS
+from bench import RESULTS
 from bench.accuracy.trials import Ground, flown
 from bench.inputs.farmland import farmland, vintages
-from bench.pages.text import table
+from bench.pages.text import machine, paragraph, table
 from engine import OrthoMap, Prior
 from engine.budget import Budget, Deadline
 from engine.kernels.scores import SCORES, enhance
@@ -203,32 +203,16 @@ def measure() -> list[list[str]]:
     return rows
 
 
-PAGE = f"""# Scores: what is correlated
+PAGE = f"""# Scores
 
-`NccOptions.score` selects the input of the zero-mean NCC. `engine.kernels.scores.enhance` computes it from the
-grey levels, in the same way for the map and for each frame; matching itself does not change, and nodata is left
-out.
+{{made}}
+Height, heading and tilt are the telemetry's, the prior is up to {PRIOR_OFF_M:.0f} m off per axis.
 
-| score | what it is | when |
-|---|---|---|
-| `"grey"` | the grey levels, smoothed by 1-2-1 | map and frames of the same day and light |
-| `"local"` | minus their neighbourhood's mean, over its deviation | the default: light, haze, sensors differ |
-| `"gradient"` | the same of the gradient's magnitude | another season inverts tones; needs sharp pictures |
-| `"mixed"` | the sum of local and gradient | fields and crops of another season or year; takes the time of both |
-
-`NccOptions.enhance_radius_px` is the neighbourhood of the last three. NCC without mean subtraction is
-equation 1 of the paper: `ncc(search, templates, zero_mean=False)` and `profile="paper"`.
-
-## Measured
-
-One thread, every place of the window scored; height, heading and tilt from the telemetry, the prior up to
-{PRIOR_OFF_M:.0f} m off per axis. Lead is the median distance of the peak from its rival in sigmas of the score
-([integrity](integrity.md)), negative where the peak is at a wrong position.
-
-- Flights (frames): **fixes, wrong ones** by more than {WRONG_M:.0f} m, **RMS of the others, lead**.
-- Map of another town (frames): **positions accepted**, all wrong; the **95th percentile of the lead**.
-- Years of farmland (patches), one year on the map of another, {SEASON_PX} x {SEASON_PX} px of 5 m, searched
-  {SEASON_REACH_PX} px to each side: **found within {SEASON_WITHIN_PX:.0f} px, the same of the worst pair, lead**.
+- **Flights** (frames): fixes, wrong ones by more than {WRONG_M:.0f} m, RMS of the others, median lead of the
+  peak over its rival in sigmas.
+- **Map of another town** (frames): positions accepted, all wrong; 95th percentile of the lead.
+- **Years of farmland** (patches of {SEASON_PX} x {SEASON_PX} px of 5 m, searched {SEASON_REACH_PX} px to
+  each side): found within {SEASON_WITHIN_PX:.0f} px, the same of the worst pair, lead.
 - Rows that say "fitted on" chose the scores and their settings; the others only judge them.
 
 """
@@ -236,11 +220,12 @@ One thread, every place of the window scored; height, heading and tilt from the 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--page", type=Path, default=DOCS / "scores.md", help="what to write")
+    parser.add_argument("--page", type=Path, default=RESULTS / "scores.md", help="what to write")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
-    options.page.write_text(PAGE + "\n".join(table(HEAD, measure())), encoding="utf-8")
+    made = "\n".join(paragraph(f"Made by `python -m bench.accuracy.scores` on {machine()}, one thread."))
+    options.page.write_text(PAGE.format(made=made) + "\n".join(table(HEAD, measure())), encoding="utf-8")
 
 
 if __name__ == "__main__":

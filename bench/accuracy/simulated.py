@@ -2,7 +2,7 @@
 
     python -m bench.accuracy.simulated [--quick] [--sheet] [--docs DIR]
 
-Writes the tables of docs/simulator-measured.md; --sheet draws docs/img/sim-conditions.png instead.
+Writes the tables of docs/results/simulator.md; --sheet draws docs/img/sim-conditions.png instead.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS
-from bench.pages.text import machine, rewrite, table
+from bench import DOCS, RESULTS
+from bench.pages.text import machine, paragraph, rewrite, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import LocalFrame
 from engine.options import ACCEPT_ALL
@@ -47,7 +47,7 @@ RATE_HZ = 0.28
 """Every fourth frame of the paper's flight."""
 START_SIGMA_M = 15.0
 WAYS = (("ncc", "engine"), ("sift", "engine"), ("ncc", "paper"), ("sift", "paper"))
-PAGE = "simulator-measured.md"
+PAGE = "simulator.md"
 BEGIN, END = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulated -->"
 SHEET_SEED, CELL_PX = 41, 170
 PLACES = ((0.0, 0.0, 20.0), (95.0, -110.0, 100.0), (-80.0, 120.0, 250.0))  # east, north and heading of its rows
@@ -141,7 +141,7 @@ def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
     body = lines(runs, WAYS)
     if more:
         body += ["The engine on what is harder, two towns each:", "", *lines(more, WAYS[:2])]
-    rewrite(docs / PAGE, BEGIN, END, [*body, f"Measured with {machine()}.", ""])
+    rewrite(docs / PAGE, BEGIN, END, [*body, *paragraph(f"Measured with {machine()}.")])
 
 
 def draw_sheet(path: Path) -> None:
@@ -176,12 +176,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town")
     parser.add_argument("--sheet", action="store_true", help="draw the frames of every condition, fly nothing")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
     set_threads(1)
     cv2.setNumThreads(1)
     if options.sheet:
-        draw_sheet(options.docs / "img" / "sim-conditions.png")
+        draw_sheet(DOCS / "img" / "sim-conditions.png")
         return
     seeds, frames = (SEEDS[:1], 5) if options.quick else (SEEDS, None)
     runs: list[Run] = []

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from bench import DOCS
+from bench import RESULTS
 from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_port, place_off_m
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import paragraph, rewrite, table
@@ -26,7 +26,7 @@ from scenematch.bridges.mavlink_out import MavlinkOptions
 from scenematch.bridges.mavlink_status import MIN_RATE_HZ
 from scenematch.bridges.vehicle import NedOrigin
 
-PAGE = DOCS / "mavlink-measured.md"
+PAGE = RESULTS / "mavlink.md"
 BEGIN, END = "<!-- written by bench.live.bridge_hour -->", "<!-- end of what bench.live.bridge_hour writes -->"
 HOUR = (
     "`python -m bench.live.bridge_hour` flies the bridge beside a stand-in autopilot (pymavlink, UDP on loopback, "
@@ -268,7 +268,7 @@ def hour_rows(r: dict[str, Any]) -> list[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--write", action="store_true", help="into docs/mavlink-measured.md")
+    parser.add_argument("--write", action="store_true", help="into docs/results/mavlink.md")
     told = parser.parse_args()
     flown = hour(told.minutes)
     lines = table(["the hour, scripted matcher, 5 Hz", ""], hour_rows(flown))

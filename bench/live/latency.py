@@ -4,7 +4,7 @@
 
 A section is budgets, hogs, embedded, slow, queue, soak, tradeoff, startup, entries or all.
 
-Figures go to .benchmarks/latency.json, section by section; ``all`` writes docs/latency.md from its own as well.
+Figures go to .benchmarks/latency.json, section by section; ``all`` writes docs/results/latency.md as well.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from bench import DOCS, ROOT
+from bench import RESULTS, ROOT
 from bench.live.burden import PERIOD_S, hogs, throttle
 from bench.live.embedded import embedded
 from bench.live.endless import Course, draw, fly, summary, warm
@@ -129,7 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("section", nargs="?", default="all", choices=[*SECTIONS, "all"])
     parser.add_argument("--quick", action="store_true", help="a few frames of everything: does it run?")
-    parser.add_argument("--docs", type=Path, help="folder of the page; docs, and .benchmarks where quick")
+    parser.add_argument("--docs", type=Path, help="folder of the page; docs/results, and .benchmarks if quick")
     options = parser.parse_args()
     set_threads(1)
     course = draw(QUICK_DRAWN if options.quick else None)
@@ -143,7 +143,7 @@ def main() -> None:
         kept.parent.mkdir(exist_ok=True)
         kept.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     if whole:
-        latency.write(options.docs or (kept.parent if options.quick else DOCS), results)
+        latency.write(options.docs or (kept.parent if options.quick else RESULTS), results)
 
 
 if __name__ == "__main__":

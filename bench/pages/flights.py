@@ -1,4 +1,4 @@
-"""docs/flights.md: the tables and the picture of what :mod:`bench.accuracy.flights` flew."""
+"""docs/results/flights.md: the tables and the picture of what :mod:`bench.accuracy.flights` flew."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ TITLES = {
 COLOURS = ("#d55e00", "#e69f00", "#0072b2", "#999999")
 WITHIN_M = (0.1, 30.0)
 INTRO = (
-    "Made by `make bench-flights`, one run of it, on {machine}, one thread. Each flight is followed from its "
-    "true start (sigma 15 m) by the navigator, with the telemetry that was recorded; only every n-th frame is "
-    "flown, as the headings say, so that predictions reach further than in a real flight."
+    "Made by `make bench-flights` on {machine}, one thread. Each flight is followed from its "
+    "true start (sigma 15 m) by the navigator, with the recorded telemetry; only every n-th frame is flown."
 )
 METHODS = (
     "`scenematch SIFT` uses the telemetry's heading, roll and pitch in its pose, where present; the second row "

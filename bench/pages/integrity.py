@@ -1,4 +1,4 @@
-"""Tables and charts of the benchmark of integrity, written into docs/integrity-measured.md."""
+"""Tables and charts of the benchmark of integrity, written into docs/results/integrity.md."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 def write(rows: list[Row], docs: Path) -> None:
     """The section between the markers, and its pictures."""
     lines = section(rows)
-    rewrite(docs / "integrity-measured.md", BEGIN, END, lines)
+    rewrite(docs / "integrity.md", BEGIN, END, lines)
     risk_chart(rows, docs / "img" / "integrity-risk.png")
     reliability_chart(rows, docs / "img" / "integrity-reliability.png")
     print("\n".join(lines))

@@ -1,4 +1,4 @@
-"""docs/latency.md: the tables and pictures of what :mod:`bench.live.latency` measured."""
+"""docs/results/latency.md: the tables and pictures of what :mod:`bench.live.latency` measured."""
 
 from __future__ import annotations
 

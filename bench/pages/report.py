@@ -1,4 +1,4 @@
-"""``make bench``: turn a pytest-benchmark run into docs/benchmarks.md and its charts.
+"""``make bench``: turn a pytest-benchmark run into docs/results/benchmarks.md and its charts.
 
     python -m bench.pages.report RUN.json [--quick] [--docs DIR]
 
@@ -16,22 +16,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from bench import DOCS
+from bench import RESULTS
 from bench.pages import sift
 from bench.pages.text import machine, table
 from bench.speed import stages
 from engine.runtime.threads import set_threads
 
-STAGES_BEFORE = Path(__file__).parent / "stages_before.json"  # by bench.speed.stages, of an earlier engine
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
 INTRO = (
-    "Made by `make bench`; every figure below comes from one run of it, on {machine}. A time is the median of the "
-    "calls, and a ratio above 1 means faster than the peer it is counted from. Times are compared only where the "
-    "results were shown to be the same, or where the quality of the results stands beside them: the peers' peaks "
-    "lie on the same pixel, the score's error against the float64 reference stands beside its time, and so do the "
-    "figures of the features. No GPU was measured. In all sections but the first, NCC is its peak alone, without "
-    "the dense refinement. Table I with its tails and the trade-off of accuracy against budget are in "
-    "[latency](latency.md), whole flights by SIFT in [flights](flights.md)."
+    "Made by `make bench` on {machine}. A time is the median of the calls; a ratio above 1 means faster than the "
+    "peer. In all sections but the first, NCC is its peak alone, without the dense refinement."
 )
 
 
@@ -40,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="what pytest-benchmark wrote")
     parser.add_argument("--quick", action="store_true", help="leave out the stages of a frame")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page and of its pictures")
+    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page and of its pictures")
     options = parser.parse_args()
     run = json.loads(options.run.read_text(encoding="utf-8"))
     set_threads(1)
@@ -48,12 +42,12 @@ def main() -> None:
     flown = [] if options.quick else stages.in_own_process()
     charts = sift.charts(rows)
     if flown:
-        charts["frame-stages.png"] = _stages_chart(_before(), flown)
+        charts["frame-stages.png"] = _stages_chart(flown)
     (options.docs / "img").mkdir(parents=True, exist_ok=True)
     for name, figure in charts.items():
         figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
     page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=machine()), 115), ""]
-    page += _stages_section(_before(), flown) + _peak_section(rows) + _step_section(rows)
+    page += _stages_section(flown) + _peak_section(rows) + _step_section(rows)
     page += _hypotheses_section(rows) + sift.sections(rows)
     (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
 
@@ -72,16 +66,11 @@ def _baseline(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
     return next(r["median_ms"] for r in rows if r["group"] == row["group"] and r["peer"] == peer)
 
 
-def _before() -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(STAGES_BEFORE.read_text(encoding="utf-8"))
-    return found
-
-
-def _stages_section(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
-    """A tracked flight by the engine, before and now, each in turns with OpenCV's step."""
+def _stages_section(flown: list[dict[str, Any]]) -> list[str]:
+    """A tracked flight by the engine, in turns with OpenCV's step."""
     cells = [
         [
-            f"{row['flight']}, {row['method']}{when}",
+            f"{row['flight']}, {row['method']}",
             f"{row['p50_ms']:.2f}",
             f"{row['p99_ms']:.2f}",
             f"{row['opencv_p50_ms']:.2f}",
@@ -90,40 +79,37 @@ def _stages_section(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> 
             f"{row['rms_m']:.3f}",
             f"{row['nees']:.2f}",
         ]
-        for index, row in enumerate(now)
-        for row, when in ((before[index], ", before"), (row, ""))
+        for row in flown
     ]
-    if not now:
+    if not flown:
         return []
     columns = ["flight, method", "p50 ms", "p99 ms", "OpenCV's step ms", "ratio to it", "fixed", "RMS m", "NEES"]
     text = (
         "`SceneMatcher.locate` of a tracked flight, one thread: a refined and verified pose with its covariance. "
         "OpenCV's step (grey, enhance, warp, match; no check and no refinement, 1.1 to 1.3 m off) has the same "
-        "frames in turns of twenty. *Before* is the engine before poses were refined from the coarsest level, "
-        "measured likewise on another machine: compare the ratios. NEES is per axis: 1 where errors match the "
-        "covariance, less where it is cautious."
+        "frames in turns of twenty. NEES is per axis: 1 where errors match the covariance, less where it is "
+        "cautious."
     )
     return [
         "## A frame of a tracked flight",
         "",
         *textwrap.wrap(text, 115),
         "",
-        "![stages of a frame, before and now](img/frame-stages.png)",
+        "![stages of a frame](img/frame-stages.png)",
         "",
         *table(columns, cells),
     ]
 
 
-def _stages_chart(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> Figure:
+def _stages_chart(flown: list[dict[str, Any]]) -> Figure:
     """Stacked bars of the stages' medians, over the time of OpenCV's step in the same run."""
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     axes = figure.subplots()
-    bars = [pair for pairs in zip(before, now, strict=True) for pair in zip(pairs, (" before", ""), strict=True)]
-    labels = [f"{row['flight']}, {row['method']}{when}" for row, when in bars]
-    names = list(dict.fromkeys(name for row, _ in bars for name in row["stages_ms"] if name != "rest"))
-    left = np.zeros(len(bars))
+    labels = [f"{row['flight']}, {row['method']}" for row in flown]
+    names = list(dict.fromkeys(name for row in flown for name in row["stages_ms"] if name != "rest"))
+    left = np.zeros(len(flown))
     for index, name in enumerate([*names, "rest"]):
-        share = np.array([row["stages_ms"].get(name, 0.0) / row["opencv_p50_ms"] for row, _ in bars])
+        share = np.array([row["stages_ms"].get(name, 0.0) / row["opencv_p50_ms"] for row in flown])
         axes.barh(labels, share, left=left, label=name, color=f"C{index % 10}", alpha=1.0 if index < 10 else 0.5)
         left += share
     axes.axvline(1.0, color="black", linewidth=1.0)

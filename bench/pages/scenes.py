@@ -1,4 +1,4 @@
-"""docs/field-simulated.md: the tables of :mod:`bench.accuracy.scenes`."""
+"""docs/results/field-simulated.md: the tables of :mod:`bench.accuracy.scenes`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TITLES = {
 }
 NAMES = {"ncc": "NCC", "sift": "SIFT", "auto": "auto"}
 INTRO = (
-    "Made by `python -m bench.accuracy.scenes`, one run of it, on {machine}, one thread: towns that are drawn for "
+    "Made by `python -m bench.accuracy.scenes` on {machine}, one thread: towns that are drawn for "
     "it, on which nothing was fitted. *Each frame* is matched by itself about a drawn prior (sigma 15 m); *track* "
     "is the flight from its true start, a frame every 3.6 s."
 )

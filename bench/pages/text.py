@@ -1,14 +1,18 @@
-"""What the pages of the benchmarks share: tables, and the machine that the figures come from."""
+"""What the pages of the benchmarks share: tables, and where the figures come from."""
 
 from __future__ import annotations
 
 import os
 import platform
+import subprocess
 import textwrap
+from datetime import date
 from pathlib import Path
 
 import cv2
 import torch
+
+from bench import ROOT
 
 
 def table(columns: list[str], rows: list[list[str]]) -> list[str]:
@@ -37,6 +41,9 @@ def rewrite(page: Path, begin: str, end: str, lines: list[str]) -> None:
 
 
 def machine() -> str:
-    """The machine and the libraries, in half a sentence."""
+    """The machine, the libraries, the commit and the day, in half a sentence."""
+    asked = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
     versions = f"Python {platform.python_version()}, torch {torch.__version__}, OpenCV {cv2.__version__}"
-    return f"{os.cpu_count()} cores of a server CPU ({platform.machine()}), no GPU, {versions}"
+    made = f"commit {commit}, {date.today()}"
+    return f"{os.cpu_count()} cores of a server CPU ({platform.machine()}), no GPU, {versions}, {made}"

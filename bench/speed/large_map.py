@@ -3,8 +3,8 @@
     python -m bench.speed.large_map [--side 100000] [--folder DIR] [--docs DIR]
 
 Builds a sparse cloud-optimised GeoTIFF with a simulated town in the midst of others, and a surface model of that
-size, follows a flight in rounds with `scenematch track` on each, watches each process from outside, and writes the
-table of docs/large-maps.md, between its markers. Takes some fifteen minutes; `--folder` keeps what was built.
+size, follows a flight in rounds with `scenematch track` on each, watches each process from outside, and writes
+the table of docs/results/large-maps.md. Takes some fifteen minutes; `--folder` keeps what was built.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import DOCS
+from bench import RESULTS
 from bench.inputs.scenes import mosaic
 from bench.pages.text import machine, paragraph, rewrite, table
 
@@ -218,7 +218,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--side", type=int, default=100_000)
     parser.add_argument("--folder", type=Path)
-    parser.add_argument("--docs", type=Path, default=DOCS)
+    parser.add_argument("--docs", type=Path, default=RESULTS)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = asked.folder or Path(temporary)
