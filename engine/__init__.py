@@ -32,7 +32,6 @@ if TYPE_CHECKING:
         MatcherOptions,
         NavigatorOptions,
         NccOptions,
-        PeakRule,
         PoseOptions,
         SiftOptions,
     )
@@ -67,7 +66,6 @@ __all__ = [
     "NoFix",
     "OptionError",
     "OrthoMap",
-    "PeakRule",
     "PoseOptions",
     "Prior",
     "Realtime",
@@ -93,7 +91,7 @@ _NAMES = {
     "OptionError ShapeError StateError TelemetryError",
     "engine.navigation.live": "Answer Live LiveOptions",
     "engine.matching.matcher": "SceneMatcher",
-    "engine.options": "AssumedErrors LearnedOptions MatcherOptions NavigatorOptions NccOptions PeakRule "
+    "engine.options": "AssumedErrors LearnedOptions MatcherOptions NavigatorOptions NccOptions "
     "PoseOptions SiftOptions",
     "engine.navigation.navigator": "Navigator",
     "engine.navigation.state": "NavigatorState",

@@ -20,52 +20,6 @@ _DOUBTED_HEADING_DEG, _DOUBTED_HEIGHT_SHARE = 24.0, 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PeakRule:
-    """When a correlation peak is accepted.
-
-    Scores are counted in :func:`engine.matching.covariance.score_sigma`, so that a rule holds for patches of any
-    size. Over two simulated towns right places lead by 8 and more, with a quarter of the frame hidden by 2.3 and
-    more; on another town's map the best led by 1.4, mirrored by 2.5, and where the prior pointed elsewhere by 3.4.
-    On 324 searches of heading or height the best reached 11.1 and led by at most 6.7.
-
-    Attributes:
-        min_sigmas: a peak below this may be chance.
-        min_margin_sigmas: how far the best rival must stay below the peak.
-        min_margin_sigmas_whole_map: the same where the whole map was searched, or the place contradicts the prior,
-            and nothing else vouches for it.
-        max_prior_chi_square: of a position against its prior, above which the two contradict each other; chance
-            exceeds this once in ten thousand.
-        min_sigmas_searched: as ``min_sigmas``, where the heading or the height was searched for: streets of
-            another town, turned until they fit, look like these.
-        min_margin_sigmas_searched: as ``min_margin_sigmas``, in the same case.
-        min_confidence: probability of :func:`engine.matching.confidence.probability` below which a peak is not
-            accepted.
-        null_test_below: confidence below which the peak must also beat the null hypothesis, its own template
-            upside down and mirrored in the same window; 1 always asks for it.
-        min_deviation: standard deviation in grey levels below which a frame has no texture.
-        exclusion_m: rivals nearer than this are the peak itself.
-    """
-
-    min_sigmas: float = 5.0
-    min_margin_sigmas: float = 2.0
-    min_margin_sigmas_whole_map: float = 3.5
-    max_prior_chi_square: float = 18.4
-    min_sigmas_searched: float = 13.0
-    min_margin_sigmas_searched: float = 8.0
-    min_confidence: float = 0.99
-    null_test_below: float = 0.9999
-    min_deviation: float = 3.0
-    exclusion_m: float = 6.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-        if not self.min_confidence < 1.0:
-            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
-        if not self.null_test_below <= 1.0:
-            raise OptionError(f"null_test_below: expected a probability of at most 1, got {self.null_test_below}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AssumedErrors:
     """One standard deviation of the telemetry, the map and the ground, where they do not state their own.
 
@@ -167,9 +121,9 @@ class NccOptions:
         heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
             also where the frame has none.
         height_search_share: the height may be off by this share; 0 trusts it.
-        second_look: correlate structure besides grey levels where the highest peak of a window is refused.
         refine: refine the pose densely after the peak, where heading and height are trusted.
-        rule: when a peak is accepted.
+        exclusion_m: rivals nearer than this are the peak itself.
+        min_deviation: standard deviation in grey levels below which a frame has no texture.
         errors: what is assumed of the telemetry and the map.
     """
 
@@ -181,9 +135,9 @@ class NccOptions:
     exhaustive: bool = False
     heading_search_deg: float = 0.0
     height_search_share: float = 0.0
-    second_look: bool = True
     refine: bool = True
-    rule: PeakRule = field(default_factory=PeakRule)
+    exclusion_m: float = 6.0
+    min_deviation: float = 3.0
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
@@ -197,6 +151,7 @@ class NccOptions:
         for name, limit in (("heading_search_deg", 180.0), ("height_search_share", 0.5)):
             if not 0.0 <= getattr(self, name) <= limit:
                 raise OptionError(f"{name}: expected 0 to {limit:g}, got {getattr(self, name)}")
+        check_positive(self, "exclusion_m", "min_deviation")
         check_score(self.score)
         if self.enhance_radius_px < 0:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
@@ -251,7 +206,6 @@ class SiftOptions:
         max_tilt_deg: a pose further off the vertical is taken for a wrong one.
         use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
             features alone hardly separate a tilt from a displacement.
-        risk: probability of a wrong fix that is allowed, see :mod:`engine.matching.evidence`.
         refine: refine the pose densely after PnP, where height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
         errors: what is assumed of the telemetry and the map.
@@ -280,7 +234,6 @@ class SiftOptions:
     min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
     use_attitude: bool = True
-    risk: float = 1e-4
     refine: bool = True
     pose: PoseOptions = field(default_factory=PoseOptions)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
@@ -294,8 +247,6 @@ class SiftOptions:
                 raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         if not self.min_deviation >= 0.0:
             raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
-        if not 0.0 < self.risk < 1.0:
-            raise OptionError(f"risk: expected a probability above 0 and below 1, got {self.risk}")
         for name in ("scale", "ratio", "vote_ratio", "vote_share"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
@@ -355,12 +306,14 @@ class MatcherOptions:
 
     Attributes:
         profile: "engine", or "paper" for the paper's own recipe with OpenCV.
+        risk: probability of a wrong fix that is allowed, see :mod:`engine.matching.evidence`.
         ncc: settings of the NCC method.
         sift: settings of the SIFT method.
         learned: settings of the learned method.
     """
 
     profile: str = "engine"
+    risk: float = 1e-4
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
     learned: LearnedOptions = field(default_factory=LearnedOptions)
@@ -368,6 +321,8 @@ class MatcherOptions:
     def __post_init__(self) -> None:
         if self.profile not in PROFILES:
             raise OptionError(f"profile: expected one of {', '.join(PROFILES)}, got {self.profile!r}")
+        if not 0.0 < self.risk < 1.0:
+            raise OptionError(f"risk: expected a probability above 0 and below 1, got {self.risk}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,11 +1,11 @@
-"""Fit the probability that a fix is right: prints the constants of ``engine.matching.confidence``.
+"""Calibrate the evidence that a place is right (:mod:`engine.matching.evidence`).
 
     python -m bench.accuracy.confidence [--matches N] [--method "NCC, first look"|"NCC, second look"|SIFT]
 
 On towns that no other benchmark reports on, and as many matches of one year on the map of another: over the
 cities' half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of
-the telemetry and how coarsely SIFT looks changes from match to match. SIFT has no weights: how often evidence is
-met for wrong places is printed, beside how often it may be.
+the telemetry and how coarsely SIFT looks changes from match to match. Printed is how often evidence is met for
+wrong places, beside how often it may be.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from bench.accuracy.judged import FIRST_LOOK, SECOND_LOOK, Bench, Row
 from bench.accuracy.trials import Trial, ground
 from bench.accuracy.year_pairs import matched as year_matched
-from engine.matching.confidence import PeakModel
 from engine.options import SiftOptions
 from engine.runtime.threads import set_threads
 
@@ -94,7 +93,7 @@ def _by_sift(bench: Bench, made: Trial, rng: np.random.Generator) -> Row:
 
 
 def main() -> None:
-    """Fit, and print."""
+    """Match, count and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--matches", type=int, default=12_000, help="by each method")
     parser.add_argument("--method", choices=METHODS)
@@ -110,9 +109,9 @@ def main() -> None:
         found = [row for part in parts for row in part if row.regressors]
         right = np.array([row.right for row in found])
         values = np.array([row.regressors for row in found])
-        fit = alarms(values[:, 0], right) if method == "SIFT" else PeakModel(*fitted(values, right))
         wrong = int((~right).sum())
-        print(f"{fit}\n{sum(map(len, parts))} matches, {len(found)} found something, {wrong} wrong", flush=True)
+        counts = f"{sum(map(len, parts))} matches, {len(found)} found something, {wrong} wrong"
+        print(f"{method}\n{alarms(values[:, 0], right)}\n{counts}", flush=True)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from bench.accuracy.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.matching.confidence import regressors
 from engine.matching.feature_pose import PoseCandidate
 from engine.matching.ncc import Ncc
 from engine.matching.peak_evidence import PeakCandidate
@@ -118,11 +117,10 @@ class Bench:
         result = ncc.judge(query, found)
         again = None if isinstance(result, Fix) else ncc.find_again(query, found)
         if again is not None:
-            found, result = again, ncc.judge_again(query, again)
-        assert found.features is not None  # there is a prior, and a heading and height to trust
-        scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found), -found.features.ratio]
-        values = regressors(found.features).tolist()
-        return self.row(made, "NCC", found.fix, isinstance(result, Fix), scores, values)
+            found, result = again, ncc.judge(query, again)
+        ratio = found.evidence.rival_sigmas / max(found.evidence.sigmas, 1e-3)
+        scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found), -ratio]
+        return self.row(made, "NCC", found.fix, isinstance(result, Fix), scores, [found.evidence.nats])
 
     def looked(self, made: Trial, method: str) -> Row:
         """The match by one look of NCC alone."""
@@ -132,10 +130,11 @@ class Bench:
             found = ncc.find_again(query, found)
         if found is None:
             return self.row(made, method, None, False, [], [])
-        result = (ncc.judge_again if method == SECOND_LOOK else ncc.judge)(query, found)
-        assert found.features is not None  # there is a prior, and a heading and height to trust
-        scores, values = [found.fix.confidence or 0.0, found.peak.score], regressors(found.features).tolist()
-        return self.row(made, method, found.fix, isinstance(result, Fix), scores, values)
+        accepted, scores = (
+            isinstance(ncc.judge(query, found), Fix),
+            [found.fix.confidence or 0.0, found.peak.score],
+        )
+        return self.row(made, method, found.fix, accepted, scores, [found.evidence.nats])
 
     def posed(self, made: Trial, frame: Frame, prior: Prior | None, options: SiftOptions) -> Row:
         """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""

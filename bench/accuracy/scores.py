@@ -21,15 +21,16 @@ from bench import RESULTS
 from bench.accuracy.trials import Ground, flown
 from bench.inputs.farmland import farmland, vintages
 from bench.pages.text import machine, paragraph, table
-from engine import OrthoMap, Prior
+from engine import MatcherOptions, OrthoMap, Prior
 from engine.budget import Budget, Deadline
 from engine.kernels.scores import SCORES, enhance
 from engine.maps.prepared import PreparedMap
 from engine.matching.acceptance import judge_peak
 from engine.matching.align import to_gray
-from engine.matching.confidence import PriorAgreement, peak_features
 from engine.matching.correlation import Aligned, Correlator
 from engine.matching.covariance import score_sigma
+from engine.matching.evidence import PeakEvidence, sigmas_of
+from engine.matching.peak_evidence import places_in
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, prepare
 from engine.options import NccOptions
@@ -41,6 +42,7 @@ from scenematch.simulator import plan_flight
 Gray = NDArray[np.uint8]
 
 CPU = torch.device("cpu")
+RISK = MatcherOptions().risk
 SEEDS = (7, 8, 9)
 WRONG_M = 10.0
 PRIOR_OFF_M = 20.0  # at most, per axis
@@ -92,7 +94,7 @@ def fly(flight: Ground, score: str, site: OrthoMap | None = None) -> list[Trial]
         east, north = truth + rng.uniform(-PRIOR_OFF_M, PRIOR_OFF_M, 2)
         prior = Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
         gray = flight.camera.undistort(to_gray(frame))
-        query = Query(frame, gray, pinhole, ground, prior, CPU, Scheduler(Deadline(Budget()), CPU))
+        query = Query(frame, gray, pinhole, ground, prior, CPU, Scheduler(Deadline(Budget()), CPU), RISK)
         trials.append(search(query, prepared, options, truth))
     return trials
 
@@ -111,12 +113,13 @@ def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDAr
     peak = None if window is None else correlator.search(aligned, window)
     if peak is None:
         return refused
-    pixels = aligned.template.numel()
+    pixels = aligned.template.size
     nadir = site.full_from_level(np.array([peak.x, peak.y]) - aligned.patch.offset_px, level)
     error_m = float(np.hypot(*(site.enu_from_pixel(nadir) - truth)))
     lead = (peak.score - peak.second_score) / score_sigma(pixels)
-    at_prior = peak_features(peak, score_sigma(pixels), PriorAgreement(0.0, 1.0))
-    accepted = judge_peak(peak, pixels, at_prior, None, options.rule) is None
+    sigmas, rival = (sigmas_of(score, score_sigma(pixels)) for score in (peak.score, peak.second_score))
+    places = places_in(aligned, window)
+    accepted = judge_peak(peak, PeakEvidence(sigmas, rival, places, places, None), RISK) is None
     return Trial(error_m, lead if error_m <= WRONG_M else -lead, accepted)
 
 

@@ -17,7 +17,7 @@ from engine.geo import attitude_from_rotation, enu_from_body
 from engine.matching.align import to_gray, view_of
 from engine.matching.pose import AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
-from engine.options import SiftOptions
+from engine.options import MatcherOptions, SiftOptions
 from engine.runtime.scheduler import Scheduler
 from engine.values import Attitude, GridPose, Reason, Window
 from engine.window import level_crop, level_for
@@ -134,7 +134,7 @@ class OpenCvFeatures:
         device, options, site = torch.device("cpu"), self._options, self.site
         scheduler = Scheduler(Deadline(budget or Budget()), device)
         gray = self._camera.undistort(to_gray(frame))
-        query = Query(frame, gray, self._pinhole, site, prior, device, scheduler)
+        query = Query(frame, gray, self._pinhole, site, prior, device, scheduler, MatcherOptions().risk)
         window = self._window(query)
         if window is None:
             return query.refuse(Reason.OUTSIDE_MAP, "no window", "sift")

@@ -1,6 +1,6 @@
 """Acceptance: when a match by either method is accepted, and why it is refused.
 
-The rules are documented in ``docs/integrity.md``; their thresholds were fitted on simulated flights.
+By the evidence for it and the risk that is allowed, see :mod:`engine.matching.evidence`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import chi_square
-from engine.matching.confidence import PeakFeatures
-from engine.matching.covariance import score_sigma
-from engine.matching.evidence import PoseEvidence, needed_nats, probability
-from engine.options import PeakRule
+from engine.matching.evidence import PeakEvidence, PoseEvidence, needed_nats, probability
 from engine.values import Fix, Peak, Reason
 
 Array = NDArray[np.float64]
@@ -28,66 +25,25 @@ Refusal = tuple[Reason, str]
 """Why a match is not accepted, and the figures behind it."""
 
 
-def judge_peak(
-    peak: Peak,
-    pixels: int,
-    features: PeakFeatures | None,
-    confidence: float | None,
-    rule: PeakRule,
-    *,
-    searched: bool = False,
-) -> Refusal | None:
+def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bool = True) -> Refusal | None:
     """The reason to refuse a correlation peak, or None where it is accepted.
 
     Args:
         peak: the peak.
-        pixels: of the template.
-        features: of the confidence model; None where nothing was known of the position, or more was searched
-            than a window at one heading and height.
-        confidence: that the model gives them; None without them.
-        rule: the thresholds.
-        searched: the heading or the height was searched for.
+        evidence: for it.
+        risk: probability of a wrong fix that is allowed.
+        is_tested: whether the evidence was tested by the null hypothesis.
     """
-    sigma = score_sigma(pixels)
-    min_score = sigma * (rule.min_sigmas_searched if searched else rule.min_sigmas)
-    if peak.score < min_score:
-        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f} may be chance; {min_score:.3f} is asked for"
     if not peak.curvature.any():
         return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
-    # A position that contradicts the prior is vouched for by the match alone, as in a search of the whole map.
-    alone = features is None or features.agreement.prior_chi_square > rule.max_prior_chi_square
-    margin = rule.min_margin_sigmas_whole_map if alone else rule.min_margin_sigmas
-    margin = sigma * (rule.min_margin_sigmas_searched if searched else margin)
-    if peak.score - peak.second_score < margin:
-        rival = f"a rival reaches {peak.second_score:.3f}"
-        return Reason.AMBIGUOUS, f"best NCC {peak.score:.3f}, {rival}; {margin:.3f} between them is asked for"
-    if features is None or confidence is None or confidence >= rule.min_confidence:
+    if is_tested and evidence.nats >= needed_nats(risk):
         return None
-    return _improbable_peak(features, confidence, rule)
-
-
-def judge_second_look(peak: Peak, features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal | None:
-    """The reason to refuse the peak of a second look, or None where it is accepted.
-
-    Args:
-        peak: the peak.
-        features: of the confidence model, with the sigma of chance that was measured.
-        confidence: that the model gives them.
-        rule: the thresholds.
-    """
-    if not peak.curvature.any():
-        return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
-    if features.agreement.prior_chi_square > rule.max_prior_chi_square:
-        figure = f"chi-square {features.agreement.prior_chi_square:.1f}"
-        return Reason.AMBIGUOUS, f"the best place of a second look contradicts the prior ({figure})"
-    return None if confidence >= rule.min_confidence else _improbable_peak(features, confidence, rule)
-
-
-def _improbable_peak(features: PeakFeatures, confidence: float, rule: PeakRule) -> Refusal:
-    figures = f"NCC {features.sigmas:.1f} sigmas, rival at {features.ratio:.0%}"
-    figures += f", chi-square {features.agreement.prior_chi_square:.1f} from the prior"
-    asked = f"{rule.min_confidence:g} is asked for ({figures})"
-    return Reason.AMBIGUOUS, f"right with a probability of {confidence:.3f}, {asked}"
+    if replace(evidence, rival_sigmas=0.0, prior_chi_square=None).nats < needed_nats(risk):
+        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f}, {evidence.sigmas:.1f} sigmas, may be chance"
+    figures = f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.rival_sigmas:.1f}, {_known(evidence)}"
+    if not is_tested:
+        return Reason.UNCONFIRMED, f"found by a search, not confirmed by the structure about the place ({figures})"
+    return Reason.AMBIGUOUS, f"{_wrong(evidence.nats, risk)} ({figures})"
 
 
 def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
@@ -99,13 +55,20 @@ def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
     """
     if evidence.nats >= needed_nats(risk):
         return None
-    off, alarms = evidence.prior_chi_square, f"log10 of false alarms {evidence.log10_nfa:.1f}"
-    known = f"chi-square {'unknown' if off is None else f'{off:.1f}'} from the prior"
-    wrong = f"wrong with a probability of {1.0 - probability(evidence.nats):.1g}, {risk:g} is allowed"
+    alarms, wrong = f"log10 of false alarms {evidence.log10_nfa:.1f}", _wrong(evidence.nats, risk)
     if replace(evidence, null_log10_nfa=0.0).nats >= needed_nats(risk):
         figures = f"{alarms} against {evidence.null_log10_nfa:.1f}"
         return Reason.AMBIGUOUS, f"the mirrored frame fits the map as well ({figures}): {wrong}"
-    return Reason.BAD_POSE, f"{wrong} ({alarms}, rival at {evidence.rival_share:.0%}, {known})"
+    return Reason.BAD_POSE, f"{wrong} ({alarms}, rival at {evidence.rival_share:.0%}, {_known(evidence)})"
+
+
+def _wrong(nats: float, risk: float) -> str:
+    return f"wrong with a probability of {1.0 - probability(nats):.1g}, {risk:g} is allowed"
+
+
+def _known(evidence: PeakEvidence | PoseEvidence) -> str:
+    off = evidence.prior_chi_square
+    return f"chi-square {'unknown' if off is None else f'{off:.1f}'} from the prior"
 
 
 def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:

@@ -86,7 +86,7 @@ class Auto(Method):
             return refined
         offset_m = offset_between_m(first, second)
         if not agree_in_place(first, second):
-            if float(np.hypot(*offset_m)) < self.ncc.options.rule.exclusion_m:
+            if float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m:
                 return _vaguer(second, offset_m)
             detail = f"NCC and SIFT are {float(np.hypot(*offset_m)):.1f} m apart"
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)

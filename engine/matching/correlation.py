@@ -184,7 +184,7 @@ class Correlator:
             region = self.cut(window, aligned.level)
         if region.window.width_px < width or region.window.height_px < height:
             return None
-        exclusion_px = options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+        exclusion_px = options.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
         quick = None if quick is None else _about(quick, region.window)
         peak = self._peak(region, aligned.template, exclusion_px, quick)
         return None if peak.score <= -1.0 and region.valid is not None else _moved(peak, region.window)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
 from engine.matching.acceptance import judge_pose
-from engine.matching.confidence import prior_agreement
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import PoseEvidence, needed_nats, probability
+from engine.matching.evidence import PoseEvidence, is_beyond_doubt, prior_chi_square, probability
 from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
 from engine.matching.point_finding import PointFinder
 from engine.matching.pose import PoseStats, solve_pose
@@ -92,14 +91,14 @@ class FeatureMatcher:
 
     def judge(self, found: PoseCandidate) -> Fix | NoFix:
         """The fix where its pose is accepted, else a refusal."""
-        fix, refusal = found.fix, judge_pose(found.evidence, self.options.risk)
+        fix, refusal = found.fix, judge_pose(found.evidence, self.query.risk)
         if refusal is None:
             return fix
         return self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
         """The candidate, unless beyond doubt with what its frame reaches mirrored, by the same telemetry."""
-        if is_beyond_doubt(found.evidence.nats, self.options.risk):
+        if is_beyond_doubt(found.evidence.nats, self.query.risk):
             return found
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
         null = replace(self, query=mirrored)._find_with(hypothesis)
@@ -124,7 +123,7 @@ class FeatureMatcher:
 
     def is_doubtful(self, found: PoseCandidate) -> bool:
         """Whether too little speaks for a pose."""
-        return found.evidence.nats < needed_nats(self.options.risk)
+        return found.evidence.nats < self.query.needed_nats
 
     def matches_in(self, window: Window) -> tuple[Array, Array, PoseStats | None]:
         """What is matched in a window at the frame's own height and heading, and the pose of it: for reports.
@@ -240,20 +239,15 @@ class FeatureMatcher:
             variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2]) - errors.map_m**2
             ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
             height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
-        prior_chi_square = None
+        off = None
         if query.prior is not None and query.prior_px is not None:
             prior_m = query.site.enu_from_pixel(query.prior_px)
-            prior_chi_square = prior_agreement(fix, prior_m, query.prior.sigma_m).prior_chi_square
+            off = prior_chi_square(fix, prior_m, query.prior.sigma_m)
         log10_nfa, rival_share = stats.log10_nfa, 0.0
         if vote is not None:
             log10_nfa, rival_share = vote.log10_nfa, vote.rival / vote.votes
-        evidence = PoseEvidence(log10_nfa, prior_chi_square, height_chi_square, rival_share)
+        evidence = PoseEvidence(log10_nfa, off, height_chi_square, rival_share)
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
-
-
-def is_beyond_doubt(nats: float, risk: float) -> bool:
-    """Whether a place has evidence for the square of the risk: no null hypothesis is asked."""
-    return nats >= 2.0 * needed_nats(risk)
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:

@@ -43,17 +43,17 @@ _MIDDLE_ROUNDS = 2
 _FINE_ROUNDS = 2
 
 
-def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak | None, Aligned]:
-    """The best peak over all hypotheses in the window, at the level of ``first``, and whose it is."""
+def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak | None, Aligned, int]:
+    """The best peak over all hypotheses in the window, at the level of ``first``; its hypothesis; their number."""
     level, poses = _coarse_level(correlator, first, window)
     if level == first.level and len(poses) == 1:
-        return correlator.search(first, window), first
+        return correlator.search(first, window), first, 1
     quick = _quick_level(correlator, first, level)
     if quick is not None:
         best = _from_level(correlator, first, window, *quick)
         if best is not None and _is_beyond_doubt(best[0]):
-            return best
-    return _from_level(correlator, first, window, level, poses) or (None, first)
+            return *best, len(poses)
+    return *(_from_level(correlator, first, window, level, poses) or (None, first)), len(poses)
 
 
 def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
@@ -157,7 +157,7 @@ def _coarse(
     templates, trims = _same_size(fitting)
     if templates.shape[1] > region.window.height_px or templates.shape[2] > region.window.width_px:
         return []
-    exclusion_m = correlator.options.rule.exclusion_m
+    exclusion_m = correlator.options.exclusion_m
     separation = max(2, round(exclusion_m / (query.site.gsd_m_per_px * 2.0**level)))
     found: list[tuple[float, GridPose, Array]] = []
     with query.scheduler.stage("match"):
@@ -275,7 +275,7 @@ def _best_at_full_resolution(
 def _best_elsewhere(correlator: Correlator, found: list[tuple[Peak, Aligned]]) -> float:
     """The best score at another place than the winner's."""
     winner = correlator.nadir_px(*found[0])
-    distance_px = correlator.options.rule.exclusion_m / correlator.query.site.gsd_m_per_px
+    distance_px = correlator.options.exclusion_m / correlator.query.site.gsd_m_per_px
     scores = [
         peak.score
         for peak, aligned in found[1:]

@@ -262,4 +262,4 @@ class SceneMatcher:
         with scheduler.stage("grey"):
             gray = self.camera.undistort(to_gray(frame))
         prior = None if prior is None else _bounded(prior)
-        return Query(frame, gray, self._pinhole, self.site, prior, self.device, scheduler)
+        return Query(frame, gray, self._pinhole, self.site, prior, self.device, scheduler, self.options.risk)

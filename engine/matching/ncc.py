@@ -11,22 +11,23 @@ from engine.geo import wrap_heading_deg
 from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
 from engine.matching import hypothesis_search
-from engine.matching.acceptance import agree_in_place, judge_peak, judge_second_look, offset_between_m
+from engine.matching.acceptance import agree_in_place, judge_peak, offset_between_m
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
+from engine.matching.evidence import is_beyond_doubt, is_hopeless
 from engine.matching.explanation import Explanation, explain_correlation
 from engine.matching.method import Method
 from engine.matching.oblique import is_ground_below, is_oblique
 from engine.matching.peak_evidence import (
     PeakCandidate,
+    candidate_of,
     candidates_of,
-    fix_of,
-    is_hopeless,
+    null_tested,
+    places_in,
     quick_look,
-    with_confidence,
 )
 from engine.matching.query import Query
 from engine.matching.refinement import Refinement, improved, with_unconfirmed_tilt
-from engine.matching.second_look import can_look_coarsely, candidate_of, hopeful_look, second_look
+from engine.matching.second_look import can_look_coarsely, confirmed, hopeful_look, second_look
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
@@ -40,8 +41,6 @@ _HOPEFUL_LOOK = "ncc second look by a coarser level"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
 _TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
 _TURNED_SIGMA_DEG = 2.0  # of the heading then
-_MIN_CONFIDENCE_TURNED = 0.9995
-_MIN_CONFIDENCE_COARSE = 0.999  # of a peak of the coarsest level, from which refinement begins
 
 
 class Ncc(Method):
@@ -83,9 +82,8 @@ class Ncc(Method):
         untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
         self.refine(untilted, self.correlate(untilted))
         found = self.find(query)
-        if isinstance(found, PeakCandidate):
-            candidates_of(self._correlator(query), found)  # as of a refused frame
-        if isinstance(found, PeakCandidate) and found.features is not None and self.options.second_look:
+        if isinstance(found, PeakCandidate):  # as of a refused frame
+            candidates_of(self._correlator(query), found)
             self.find_again(query, found)
 
     def warmup_search(self, query: Query) -> None:
@@ -101,16 +99,15 @@ class Ncc(Method):
         """A refined fix that begins at the coarsest level, else one by correlation alone, see :meth:`correlate`.
 
         The peak of the coarsest level is the fix where it was accepted and there is no time for a finer one, or
-        where it is beyond doubt and the finer one is at the same place, but not accepted.
+        where the finer one is at the same place, but not accepted.
         """
         coarse = self._by_coarse_peak(query)
         if coarse is None:
             return self.correlate(query, try_turns=try_turns)
         scheduler, work_px, is_refuted = query.scheduler, float(query.gray.size), False
-        is_certain = (coarse.confidence or 0.0) >= _MIN_CONFIDENCE_COARSE
         try:
             with scheduler.with_fix():
-                if is_certain and scheduler.can_afford({_AT_ONCE: work_px}):
+                if scheduler.can_afford({_AT_ONCE: work_px}):
                     with scheduler.costed(_AT_ONCE, work_px):
                         refined = Refinement(query, self.samples, self.options).refine_at_once(coarse)
                     if refined is not None:
@@ -126,9 +123,8 @@ class Ncc(Method):
             return coarse
         if isinstance(fine, Fix):
             return with_unconfirmed_tilt(query, fine) if is_refuted and fine.stage == "coarse" else fine
-        if is_certain and any(self._is_same(coarse, peak) for peak in fine.candidates[:1]):
-            return replace(coarse, confidence=self.options.rule.min_confidence)
-        return coarse if fine.reason is Reason.LATE else fine
+        is_same = any(self._is_same(coarse, peak) for peak in fine.candidates[:1])
+        return coarse if is_same or fine.reason is Reason.LATE else fine
 
     def _by_coarse_peak(self, query: Query) -> Fix | None:
         """The peak of the coarsest level, where it is accepted and a pose may be refined from it as from any.
@@ -152,7 +148,7 @@ class Ncc(Method):
     def _is_same(self, coarse: Fix, fine: Fix) -> bool:
         """Whether two peaks are of one place: where one would not be the other's rival."""
         distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
-        return distance_m < self.options.rule.exclusion_m and agree_in_place(coarse, fine)
+        return distance_m < self.options.exclusion_m and agree_in_place(coarse, fine)
 
     def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
         """A fix by correlation alone.
@@ -177,7 +173,7 @@ class Ncc(Method):
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             with suppress(OutOfTime):  # the refusal that there is stands
                 result = self._look_again(query, found, result)
-                if isinstance(result, NoFix) and try_turns and found.features is not None:
+                if isinstance(result, NoFix) and try_turns and found.is_tested:
                     result = self._look_turned(query, coarser, works[coarser], result)
             if isinstance(result, NoFix):
                 result = replace(result, candidates=candidates_of(self._correlator(query), found))
@@ -222,13 +218,13 @@ class Ncc(Method):
         """The correlation surface of a window at the frame's own height and heading."""
         return explain_correlation(self._correlator(query), window)
 
-    def find(self, query: Query, *, coarser: int = 0, min_confidence: float = 0.0) -> PeakCandidate | NoFix:
+    def find(self, query: Query, *, coarser: int = 0, headings: int = 1) -> PeakCandidate | NoFix:
         """The highest peak of one frame, or a refusal where there is none.
 
         Args:
             query: the frame.
             coarser: see :meth:`correlate`.
-            min_confidence: see :func:`engine.matching.peak_evidence.with_confidence`.
+            headings: of how many tried it is one.
         """
         refusal = self._refuse_unusable(query)
         if refusal is not None:
@@ -245,58 +241,52 @@ class Ncc(Method):
             size = f"{window.width_px} x {window.height_px} px"
             detail = f"a window of {size} is not searched; a better prior is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
-        searched = not self._trusts(query)
-        if searched or wide or query.prior is None:
-            peak, aligned = hypothesis_search.search(correlator, aligned, window)
+        searched, hypotheses = not self._trusts(query), headings
+        is_window = not (searched or wide or query.prior is None)
+        if is_window:
+            peak, aligned = self._in_window(correlator, aligned, window)
         else:
-            peak = correlator.search(aligned, window, quick_look(correlator, aligned, window, min_confidence))
-            peak, aligned = self._over_its_ground(correlator, aligned, window, peak, min_confidence)
+            peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
             return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
         if query.scheduler.deadline.remaining_ms < 0:
             detail = "the budget was spent before the peak was known"
             return query.refuse(Reason.LATE, detail, METHOD, window=window)
-        fix = fix_of(correlator, aligned, peak, window, searched=searched)
-        found = PeakCandidate(peak, aligned, fix, None, searched)
-        no_features = searched or wide or query.prior is None
-        return found if no_features else with_confidence(correlator, found, min_confidence)
+        tried = hypotheses * places_in(aligned, window)
+        found = candidate_of(correlator, aligned, peak, window, searched=searched, tried=tried)
+        if is_window and headings > 1 and found.evidence.nats < query.needed_nats:
+            return found  # the null hypothesis would only take away
+        if is_window:
+            return null_tested(correlator, found)
+        return replace(found, is_tested=not searched and is_beyond_doubt(found.evidence.nats, query.risk))
 
-    def _over_its_ground(
-        self,
-        correlator: Correlator,
-        aligned: Aligned,
-        window: Window,
-        peak: Peak | None,
-        min_confidence: float,
-    ) -> tuple[Peak | None, Aligned]:
-        """The peak of an oblique frame, drawn once more if it was found over other ground than at the prior."""
+    def _in_window(self, correlator: Correlator, aligned: Aligned, window: Window) -> tuple[Peak | None, Aligned]:
+        """The peak of one hypothesis; of an oblique frame over the ground where it was found, not at the prior."""
         query, pose = correlator.query, aligned.pose
+        peak = correlator.search(aligned, window, quick_look(correlator, aligned, window))
         if peak is None or pose.grid_attitude is None or not is_oblique(query, pose.grid_attitude):
             return peak, aligned
         nadir_px = correlator.nadir_px(peak, aligned)
         again = None if is_ground_below(query, nadir_px) else correlator.align(pose, aligned.level, nadir_px)
-        second = None
-        if isinstance(again, Aligned):
-            second = correlator.search(again, window, quick_look(correlator, again, window, min_confidence))
-        return (peak, aligned) if second is None or not isinstance(again, Aligned) else (second, again)
+        if not isinstance(again, Aligned):
+            return peak, aligned
+        second = correlator.search(again, window, quick_look(correlator, again, window))
+        return (peak, aligned) if second is None else (second, again)
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
         """The fix where its peak is accepted, else a refusal."""
-        pixels, fix = found.aligned.template.size, found.fix
-        rule, confidence = self.options.rule, fix.confidence
-        refusal = judge_peak(found.peak, pixels, found.features, confidence, rule, searched=found.searched)
+        refusal = judge_peak(found.peak, found.evidence, query.risk, is_tested=found.is_tested)
         if refusal is not None:
-            return query.refuse(*refusal, METHOD, score=found.peak.score, window=fix.window)
-        return fix
+            return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
+        return found.fix
 
     def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
-        """The fix by a heading that is a few degrees off, where one is much more probable, else the refusal.
+        """The fix by a heading that is a few degrees off, where one is accepted, else the refusal.
 
         A compass beside motors is often off by more than is assumed of it, and a patch that is turned by 4 degrees
-        hardly correlates. Several headings were tried, so that more is asked for than of the frame's own.
+        hardly correlates.
         """
-        rule = replace(self.options.rule, min_confidence=_MIN_CONFIDENCE_TURNED)
         best: Fix | None = None
         for turn_deg in _TURNS_DEG:
             if not query.scheduler.can_afford({("ncc", coarser): work}):
@@ -307,26 +297,21 @@ class Ncc(Method):
                 query, frame=replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
             )
             with query.scheduler.costed(("ncc", coarser), work):
-                found = self.find(turned, coarser=coarser, min_confidence=_MIN_CONFIDENCE_TURNED)
-            if isinstance(found, NoFix) or judge_peak(
-                found.peak, found.aligned.template.size, found.features, found.fix.confidence, rule
-            ):
-                continue
-            if best is None or (found.fix.confidence or 0.0) > (best.confidence or 0.0):
+                found = self.find(turned, coarser=coarser, headings=1 + len(_TURNS_DEG))
+            result = found if isinstance(found, NoFix) else self.judge(turned, found)
+            if isinstance(result, Fix) and (best is None or (result.confidence or 0.0) > (best.confidence or 0.0)):
                 attitude = Attitude(query.frame.roll_deg or 0.0, query.frame.pitch_deg or 0.0, heading_deg)
-                best = replace(found.fix, attitude=attitude)
+                best = replace(result, attitude=attitude)
         return refusal if best is None else best
 
     def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
-        """The fix of the second look about the same place, if wanted and affordable, else the refusal."""
-        if not self.options.second_look:
-            return refusal
+        """The fix of the second look about the same place, if affordable, else the refusal."""
         again = self.find_again(query, found, self._looked_at(query, found))
-        return refusal if again is None else self.judge_again(query, again)
+        return refusal if again is None else self.judge(query, again)
 
     def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
         """The window of a second look: the first one's, or of what was searched for the place's surroundings."""
-        if found.features is not None:
+        if found.is_tested:
             return found.fix.window
         place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
         correlator = self._correlator(replace(query, prior=place))
@@ -350,23 +335,14 @@ class Ncc(Method):
                 return None
             with scheduler.costed(_HOPEFUL_LOOK, work_px), scheduler.stage("second look"):
                 hopeful = hopeful_look(correlator, found.aligned, window)
-            best = None if hopeful is None else candidate_of(correlator, found, hopeful)
-            if best is not None and is_hopeless(best.fix.confidence or 0.0, self.options.rule.min_confidence):
+            best = None if hopeful is None else confirmed(correlator, found, hopeful, window)
+            if best is not None and is_hopeless(best.evidence.nats, query.risk):
                 return best
         if not scheduler.can_afford({_SECOND_LOOK: work_px}):
             return None
         with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
             looked = second_look(correlator, found.aligned, window)
-        return None if looked is None else candidate_of(correlator, found, looked)
-
-    def judge_again(self, query: Query, found: PeakCandidate) -> Result:
-        """The fix where the peak of the second look is accepted, else a refusal."""
-        assert found.features is not None
-        assert found.fix.confidence is not None
-        refusal = judge_second_look(found.peak, found.features, found.fix.confidence, self.options.rule)
-        if refusal is not None:
-            return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
-        return found.fix
+        return None if looked is None else confirmed(correlator, found, looked, window)
 
     def _trusts(self, query: Query) -> bool:
         return self.options.of_frame(query.frame).trusts(query.telemetry.grid_heading_deg)
@@ -384,7 +360,7 @@ class Ncc(Method):
             return self._refuse_without_height(query)
         if pose.grid_heading_deg is None and self.options.heading_search_deg < 180.0:
             return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
-        return query.refuse_flat(METHOD, self.options.rule.min_deviation)
+        return query.refuse_flat(METHOD, self.options.min_deviation)
 
     def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
         """The frame by its own height and heading, or by any heading where it came without one."""

@@ -1,16 +1,13 @@
-"""What a correlation peak means: the fix that it makes if it is accepted, and how probable it is."""
+"""What a correlation peak means: the fix that it makes if it is accepted, and the evidence for it."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from engine.kernels.coarse_to_fine import QuickLook
 from engine.kernels.scores import enhance
-from engine.matching.acceptance import judge_peak
-from engine.matching.confidence import PeakFeatures, PriorAgreement, peak_features, prior_agreement, probability
 from engine.matching.correlation import METHOD, Aligned, Correlator
 from engine.matching.covariance import (
     misalignment_covariance_px2,
@@ -18,13 +15,18 @@ from engine.matching.covariance import (
     peak_covariance_px,
     score_sigma,
 )
-from engine.matching.query import Query
+from engine.matching.evidence import (
+    PeakEvidence,
+    independent_places,
+    is_beyond_doubt,
+    is_hopeless,
+    prior_chi_square,
+    probability,
+    sigmas_of,
+)
 from engine.values import Fix, Peak, Window
 
-HOPELESS_ODDS = 0.01
-"""Odds as a share of those that are asked for, below which what a quick look found is not looked at closely."""
 _MAX_CANDIDATES = 4  # of a refused frame
-_EXPECTED_CHI_SQUARE = 2.0  # of two degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,84 +36,90 @@ class PeakCandidate:
     Attributes:
         peak: in pixels of the aligned level.
         aligned: the hypothesis that it belongs to.
-        fix: what the peak means, if it is accepted; with its confidence where there are features.
-        features: of the confidence model; None where more was searched than a window at one heading and height.
-        searched: heading or height were searched for.
+        fix: what the peak means, if it is accepted; with its probability.
+        evidence: for it.
+        tried: places, times headings and heights, among which it is the best.
+        searched: whether heading and height were fitted to the picture.
+        is_tested: whether the null hypothesis is among its rivals, or would change nothing. A score that a fit
+            made as high as possible is no evidence until the structure about the place confirms it.
     """
 
     peak: Peak
     aligned: Aligned
     fix: Fix
-    features: PeakFeatures | None
+    evidence: PeakEvidence
+    tried: float
     searched: bool
+    is_tested: bool = True
 
 
-def quick_look(correlator: Correlator, aligned: Aligned, window: Window, min_confidence: float = 0.0) -> QuickLook:
+def quick_look(correlator: Correlator, aligned: Aligned, window: Window) -> QuickLook:
     """Which peaks of a wide window are kept although not every place was scored.
+
+    Returns:
+        QuickLook: clear is a peak that is accepted without the null hypothesis; hopeless one of which a closer
+        look is not expected to make a fix.
+    """
+    risk = correlator.query.risk
+
+    def nats(peak: Peak) -> float:
+        return candidate_of(correlator, aligned, peak, window).evidence.nats
+
+    return QuickLook(lambda peak: is_beyond_doubt(nats(peak), risk), lambda peak: is_hopeless(nats(peak), risk))
+
+
+def candidate_of(
+    correlator: Correlator,
+    aligned: Aligned,
+    peak: Peak,
+    window: Window,
+    *,
+    searched: bool = False,
+    tried: float = 0.0,
+    sigma: float | None = None,
+) -> PeakCandidate:
+    """What a peak means.
 
     Args:
         correlator: of the frame.
         aligned: the hypothesis.
-        window: that is searched.
-        min_confidence: that is asked for, if more than the rule's.
-
-    Returns:
-        QuickLook: clear is a peak that is accepted without the null hypothesis; hopeless one whose odds are less
-        than :data:`HOPELESS_ODDS` of those that are asked for.
+        peak: in pixels of its level.
+        window: in which its rival is the best.
+        searched: whether heading and height were fitted to the picture.
+        tried: places, times headings and heights, among which it is the best, if more than those of the window.
+        sigma: one standard deviation of a score of chance, if it was measured.
     """
-    query, rule = correlator.query, correlator.options.rule
-    asked = max(rule.min_confidence, min_confidence)
-
-    def features(peak: Peak) -> PeakFeatures:
-        return features_of(query, aligned, peak, fix_of(correlator, aligned, peak, window, searched=False))
-
-    def is_clear(peak: Peak) -> bool:
-        known = features(peak)
-        confidence = probability(known)
-        refusal = judge_peak(peak, aligned.template.size, known, confidence, rule)
-        return refusal is None and confidence >= max(asked, rule.null_test_below)
-
-    return QuickLook(is_clear, lambda peak: is_hopeless(probability(features(peak)), asked))
-
-
-def is_hopeless(confidence: float, asked: float) -> bool:
-    """Whether a probability is so low that a closer look cannot be expected to bring what is asked for."""
-    return confidence * (1.0 - asked) < HOPELESS_ODDS * asked * (1.0 - confidence)
+    query, (rows, columns) = correlator.query, aligned.template.shape
+    fix, off = fix_of(correlator, aligned, peak, window, searched=searched), None
+    if query.prior is not None and query.prior_px is not None:
+        off = prior_chi_square(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+    sigma = score_sigma(rows * columns) if sigma is None else sigma
+    measured = places_in(aligned, window)
+    tried = max(tried, measured)
+    scores = (sigmas_of(peak.score, sigma), sigmas_of(peak.second_score, sigma))
+    evidence = PeakEvidence(*scores, measured, tried, off)
+    return PeakCandidate(
+        peak, aligned, replace(fix, confidence=probability(evidence.nats)), evidence, tried, searched
+    )
 
 
-def with_confidence(correlator: Correlator, found: PeakCandidate, min_confidence: float = 0.0) -> PeakCandidate:
-    """The candidate with its probability; one that is not high must also beat the null hypothesis.
-
-    Args:
-        correlator: of the frame.
-        found: at one heading and height.
-        min_confidence: the null hypothesis only lowers a probability, and is not asked about one below this, which
-            suffices for nothing.
-    """
-    query, peak, aligned, rule = correlator.query, found.peak, found.aligned, correlator.options.rule
-    features = features_of(query, aligned, peak, found.fix)
-    confidence = probability(features)
-    if min_confidence <= confidence < rule.null_test_below:
-        matters = confidence >= max(rule.min_confidence, min_confidence)
-        null_score = _null_score(correlator, aligned, found.fix.window, peak.second_score, matters=matters)
-        peak = replace(peak, second_score=max(peak.second_score, null_score))
-        features = features_of(query, aligned, peak, found.fix)
-        confidence = probability(features)
-    return replace(found, peak=peak, features=features, fix=replace(found.fix, confidence=confidence))
+def places_in(aligned: Aligned, window: Window) -> float:
+    """How many places of a window a hypothesis may lie at."""
+    (rows, columns), scale = aligned.template.shape, 2.0**aligned.level
+    return independent_places(
+        max(window.width_px / scale - columns, 1.0) * max(window.height_px / scale - rows, 1.0)
+    )
 
 
-def features_of(query: Query, aligned: Aligned, peak: Peak, fix: Fix) -> PeakFeatures:
-    """What the confidence model is told of a peak."""
-    return peak_features(peak, score_sigma(aligned.template.size), agreement_of(query, fix))
-
-
-def agreement_of(query: Query, fix: Fix) -> PriorAgreement:
-    """Of a fix with the prior; without one any place of the map is as good as another."""
-    site = query.site
-    if query.prior is None or query.prior_px is None:
-        area_m2 = site.width_px * site.height_px * site.gsd_m_per_px**2
-        return PriorAgreement(_EXPECTED_CHI_SQUARE, math.sqrt(area_m2 / 12.0))
-    return prior_agreement(fix, site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
+    """The candidate, unless beyond doubt with what its frame reaches upside down and mirrored."""
+    query, peak, aligned, window = correlator.query, found.peak, found.aligned, found.fix.window
+    if is_beyond_doubt(found.evidence.nats, query.risk):
+        return found
+    matters = found.evidence.nats >= query.needed_nats
+    null_score = _null_score(correlator, aligned, window, peak.second_score, matters=matters)
+    peak = replace(peak, second_score=max(peak.second_score, null_score))
+    return candidate_of(correlator, aligned, peak, window, tried=found.tried)
 
 
 def _null_score(
@@ -160,14 +168,14 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
 
 
 def candidates_of(correlator: Correlator, found: PeakCandidate) -> tuple[Fix, ...]:
-    """The peaks of a refused frame, each with its probability beside the others; none where no model holds.
+    """The peaks of a refused frame, each with its probability beside the others; none of a search.
 
     Rivals belong to it: over repeated structure they follow the vehicle as faithfully as the right place does.
     """
     query, aligned, window = correlator.query, found.aligned, found.fix.window
-    if found.features is None or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
+    if not found.is_tested or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
         return ()
-    exclusion_px = correlator.options.rule.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+    exclusion_px = correlator.options.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
     apart_px = max(2, round(exclusion_px))
     with query.scheduler.stage("candidates"):
         best = correlator.best_places(aligned, window, apart_px, _MAX_CANDIDATES)
@@ -179,6 +187,5 @@ def candidates_of(correlator: Correlator, found: PeakCandidate) -> tuple[Fix, ..
         if max(abs(place - [found.peak.x, found.peak.y])) <= apart_px:
             continue
         peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
-        fix = fix_of(correlator, aligned, peak, window, searched=False)
-        fixes.append(replace(fix, confidence=probability(features_of(query, aligned, peak, fix))))
+        fixes.append(candidate_of(correlator, aligned, peak, window).fix)
     return tuple(fixes[:_MAX_CANDIDATES])

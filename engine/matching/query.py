@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
 from engine.matching.covariance import with_frame_accuracy
+from engine.matching.evidence import needed_nats
 from engine.matching.pose import AttitudePrior
 from engine.options import AssumedErrors
 from engine.orthomap import OrthoMap
@@ -42,6 +43,7 @@ class Query:
         prior: where the vehicle should be, or None: anywhere on the map.
         device: where pictures are correlated.
         scheduler: times its stages, and decides which steps there is time for.
+        risk: probability of a wrong fix that is allowed.
     """
 
     frame: Frame
@@ -51,6 +53,12 @@ class Query:
     prior: Prior | None
     device: Device
     scheduler: Scheduler = field(repr=False)
+    risk: float
+
+    @property
+    def needed_nats(self) -> float:
+        """The evidence that a fix needs."""
+        return needed_nats(self.risk)
 
     @cached_property
     def prior_px(self) -> Array | None:

@@ -18,9 +18,8 @@ from engine.kernels.peaks import best_positions, find_peak
 from engine.kernels.scores import enhance, orientation
 from engine.kernels.search_levels import COARSE_TEMPLATE_PX
 from engine.kernels.sums import counts, counts_inside
-from engine.matching.confidence import SECOND_LOOK_MODEL, peak_features, probability
 from engine.matching.correlation import Aligned, Correlator
-from engine.matching.peak_evidence import PeakCandidate, agreement_of, fix_of
+from engine.matching.peak_evidence import PeakCandidate, candidate_of
 from engine.ncc_fft import ncc
 from engine.runtime.device import on_host, placed
 from engine.values import Peak, Window
@@ -85,7 +84,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
     about = second_look(correlator, aligned, correlator.near(aligned, nadir, _ABOUT_PX << aligned.level))
     if about is None:
         return None
-    exclusion_px = correlator.options.rule.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level)
+    exclusion_px = correlator.options.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level)
     rivals = [p.score for p, _ in found if np.hypot(p.x - best.x, p.y - best.y) > exclusion_px]
     second = max([about.peak.second_score, *rivals])
     return SecondLook(replace(about.peak, second_score=second), about.chance_sigma)
@@ -129,8 +128,8 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
     chance = scores[1:][scores[1:] > -1.0]
     if not chance.size:
         return None
-    rule, site = correlator.options.rule, correlator.query.site
-    peak = find_peak(scores[0], exclusion_px=rule.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level))
+    options, site = correlator.options, correlator.query.site
+    peak = find_peak(scores[0], exclusion_px=options.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level))
     peak = replace(
         peak,
         x=peak.x + crop.x0,
@@ -178,19 +177,21 @@ def _channels(gray: NDArray[np.uint8], radius_px: int, valid: NDArray[np.bool_] 
     return np.concatenate([enhance(gray, radius_px=radius_px, valid=valid)[None], orientation(gray, valid=valid)])
 
 
-def candidate_of(correlator: Correlator, found: PeakCandidate, looked: SecondLook) -> PeakCandidate:
+def confirmed(correlator: Correlator, found: PeakCandidate, looked: SecondLook, window: Window) -> PeakCandidate:
     """What the peak of a second look means.
 
     Args:
         correlator: of the frame.
         found: at the first look.
         looked: the second.
+        window: that it looked at.
     """
     peak = looked.peak
-    if found.features is None and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
+    if not found.is_tested and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
         elsewhere = found.peak.second_score / found.peak.score * peak.score
         peak = replace(peak, second_score=max(peak.second_score, elsewhere))
-    fix = fix_of(correlator, found.aligned, peak, found.fix.window, searched=found.searched)
-    features = peak_features(peak, looked.chance_sigma, agreement_of(correlator.query, fix))
-    fix = replace(fix, confidence=probability(features, SECOND_LOOK_MODEL))
-    return PeakCandidate(peak, found.aligned, fix, features, found.searched)
+    own = candidate_of(
+        correlator, found.aligned, peak, window,
+        searched=found.searched, tried=found.tried, sigma=looked.chance_sigma,
+    )  # fmt: skip
+    return replace(own, fix=replace(own.fix, window=found.fix.window))

@@ -11,9 +11,9 @@ from engine.maps.landmarks import LandmarkMap
 from engine.maps.prepared import enhanced_part
 from engine.maps.samples import SampleMap
 from engine.matching.align import SIDE_STEP_PX
-from engine.matching.evidence import nats_of, needed_nats
+from engine.matching.evidence import is_beyond_doubt, nats_of
 from engine.matching.explanation import Explanation, explain_features
-from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate, is_beyond_doubt
+from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
 from engine.matching.method import Method
 from engine.matching.query import Query
 from engine.matching.refinement import MIN_CORRELATION_AT_ONCE, Refinement, improved, with_unconfirmed_tilt
@@ -111,7 +111,7 @@ class Sift(Method):
             result = self._by_all_features(query)
             return self._refined(query, result) if isinstance(result, Fix) else result
         refined = self._refined(query, few)
-        is_refined, is_certain = refined.stage == "refined", self._is_certain(few)
+        is_refined, is_certain = refined.stage == "refined", _is_certain(query, few)
         if is_refined and (is_certain or refined.score >= MIN_CORRELATION_AT_ONCE):
             return refined
         result = self._by_all_after(query, few) if is_certain else self._by_all_features(query)
@@ -126,7 +126,7 @@ class Sift(Method):
                 one of all.
         """
         few = self._by_few_features(query)
-        if few is not None and self._is_certain(few) and agrees(few):
+        if few is not None and _is_certain(query, few) and agrees(few):
             return few
         return self._by_all_features(query)
 
@@ -137,7 +137,7 @@ class Sift(Method):
             return None
         with query.scheduler.costed(_FEW, self._work_px(query)[1.0]):
             found = FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
-        if isinstance(found, NoFix) or found.evidence.nats < needed_nats(self.options.risk):
+        if isinstance(found, NoFix) or found.evidence.nats < query.needed_nats:
             return None
         return found.fix
 
@@ -158,11 +158,6 @@ class Sift(Method):
             return True
         scheduler.costs.note_refusal(_FEW)
         return False
-
-    def _is_certain(self, fix: Fix) -> bool:
-        """Whether a pose is so probable that no null hypothesis is asked."""
-        assert fix.confidence is not None  # each pose has one
-        return is_beyond_doubt(nats_of(fix.confidence), self.options.risk)
 
     def _by_all_after(self, query: Query, few: Fix) -> Result:
         """A fix by all features, or that of few where there is no time: its covariance for a tilt that is wrong.
@@ -242,3 +237,9 @@ class Sift(Method):
         found = self.find(query, options)
         result = found if isinstance(found, NoFix) else self.judge(query, found)
         return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
+
+
+def _is_certain(query: Query, fix: Fix) -> bool:
+    """Whether a pose is so probable that no null hypothesis is asked."""
+    assert fix.confidence is not None  # each pose has one
+    return is_beyond_doubt(nats_of(fix.confidence), query.risk)

@@ -121,7 +121,7 @@ class AuditPlan:
     @property
     def exclusion_px(self) -> float:
         """Rivals nearer than this are the peak itself, in pixels of the level."""
-        return self.options.ncc.rule.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
+        return self.options.ncc.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
 
     @cached_property
     def centers_px(self) -> Array:

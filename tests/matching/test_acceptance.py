@@ -1,4 +1,4 @@
-"""Acceptance and covariance: the rules at their thresholds, and figures done by hand."""
+"""Sigmas of chance and covariance: figures done by hand."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from engine import Camera, OptionError, OrthoMap, Reason
-from engine.matching.acceptance import judge_peak
-from engine.matching.confidence import PeakFeatures, PriorAgreement
+from engine import Camera, MatcherOptions, OptionError, OrthoMap
 from engine.matching.covariance import (
     misalignment_covariance_px2,
     ncc_covariance_m2,
@@ -23,52 +21,15 @@ from engine.matching.covariance import (
     with_map_accuracy,
 )
 from engine.ncc_fft import find_peak, ncc
-from engine.options import AssumedErrors, PeakRule
+from engine.options import AssumedErrors
 from engine.values import GridPose, Peak
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 PIXELS = 2500  # 100 blocks of 5 x 5: one sigma of chance is 0.1
-AT_PRIOR = PeakFeatures(sigmas=10.0, ratio=0.6, score=0.4, agreement=PriorAgreement(0.0, 8.0))
-RULE = PeakRule(min_sigmas=2.0, min_margin_sigmas=0.5, min_margin_sigmas_whole_map=1.0)
 
 
 def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
     return Peak(10.0, 12.0, score, second, np.array(bend))
-
-
-@pytest.mark.parametrize(
-    ("score", "second", "whole_map", "reason"),
-    [
-        (0.8, 0.2, False, None),
-        (0.201, -0.3, False, None),
-        (0.199, -0.3, False, Reason.LOW_SCORE),
-        (0.0, 0.0, False, Reason.LOW_SCORE),
-        (-1.0, -1.0, True, Reason.LOW_SCORE),
-        (0.8, 0.74, False, None),
-        (0.8, 0.76, False, Reason.AMBIGUOUS),
-        (0.8, 0.8, False, Reason.AMBIGUOUS),
-        (0.8, 0.72, True, Reason.AMBIGUOUS),  # over the whole map nothing else vouches for the place
-        (0.8, 0.69, True, None),
-        (0.8, -1.0, True, None),
-    ],
-)
-def test_a_peak_is_believed_when_it_is_high_and_alone(score, second, whole_map, reason):
-    verdict = judge_peak(peak(score, second), PIXELS, None if whole_map else AT_PRIOR, None, RULE)
-    assert (verdict and verdict[0]) is reason
-    if verdict:
-        assert f"{score:.3f}" in verdict[1]  # the figures behind the reason
-
-
-def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
-    verdict = judge_peak(peak(0.9, -1.0, bend=np.zeros((2, 2))), PIXELS, AT_PRIOR, None, RULE)
-    assert verdict
-    assert verdict[0] is Reason.AMBIGUOUS
-
-
-def test_the_same_score_is_worth_more_over_a_larger_patch():
-    weak = peak(0.3, 0.1)
-    assert judge_peak(weak, 4 * PIXELS, AT_PRIOR, None, PeakRule()) is None
-    assert judge_peak(weak, PIXELS, AT_PRIOR, None, PeakRule())[0] is Reason.LOW_SCORE
 
 
 def test_a_score_of_chance_scatters_by_its_sigma():
@@ -82,8 +43,8 @@ def test_a_score_of_chance_scatters_by_its_sigma():
     assert score_sigma(1) == 1.0
 
 
-@pytest.mark.parametrize("options", [PeakRule, AssumedErrors])
-def test_options_are_positive_keyword_only_and_refused_by_name(options):
+def test_options_are_positive_keyword_only_and_refused_by_name():
+    options = AssumedErrors
     for name in options.__dataclass_fields__:
         for value in (0.0, -1.0, math.nan, math.inf):
             with pytest.raises(OptionError, match=rf"^{name}: expected a number above 0, got "):
@@ -94,11 +55,10 @@ def test_options_are_positive_keyword_only_and_refused_by_name(options):
         setattr(options(), name, 0.5)
 
 
-@pytest.mark.parametrize("name", ["min_confidence", "null_test_below"])
-def test_a_probability_of_98_is_refused(name):
-    with pytest.raises(OptionError, match=rf"^{name}: expected a probability .* 1, got 98"):
-        PeakRule(**{name: 98.0})
-    PeakRule(null_test_below=1.0)  # every peak must beat its own template upside down
+@pytest.mark.parametrize("risk", [0.0, 1.0, 98.0, math.nan])
+def test_a_risk_is_a_probability(risk):
+    with pytest.raises(OptionError, match=r"^risk: expected a probability above 0 and below 1, got "):
+        MatcherOptions(risk=risk)
 
 
 def test_what_is_assumed_of_telemetry_is_said_in_one_place():

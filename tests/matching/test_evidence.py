@@ -1,17 +1,28 @@
-"""Log-evidence of a pose: what adds to it, what takes away, and the probability that follows."""
+"""Log-evidence of poses and peaks: what adds to it, what takes away, and the probability that follows."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine import Reason
-from engine.matching.acceptance import judge_pose
-from engine.matching.evidence import PoseEvidence, nats_of, needed_nats, probability
+from engine import Fix, Reason
+from engine.matching.acceptance import judge_peak, judge_pose
+from engine.matching.evidence import (
+    PeakEvidence,
+    PoseEvidence,
+    independent_places,
+    nats_of,
+    needed_nats,
+    prior_chi_square,
+    probability,
+    sigmas_of,
+)
+from engine.values import Peak, Timings, Window
 
 PLAIN = PoseEvidence(-10.0, 2.0, 1.0, 0.3)
 known = st.one_of(st.none(), st.floats(0, 1e9))
@@ -74,3 +85,105 @@ def test_a_refusal_of_a_pose_tells_its_figures():
     for figure in ("0.0001 is allowed", "-1.5", "rival at 0%", "chi-square unknown"):
         assert figure in text
     assert "chi-square 3.2" in judge_pose(PoseEvidence(-1.5, 3.2, None), 1e-4)[1]
+
+
+# ------------------------------------------------------------------------------------------------------- peaks
+
+PEAK = PeakEvidence(8.0, 4.5, 1000.0, 1000.0, 2.0)
+
+
+def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
+    return Peak(10.0, 12.0, score, second, np.array(bend))
+
+
+@pytest.mark.parametrize(
+    ("better", "worse"),
+    [
+        ({"sigmas": 12.0}, {"sigmas": 6.0}),
+        ({"rival_sigmas": 4.0}, {"rival_sigmas": 6.0}),
+        ({"prior_chi_square": 0.0}, {"prior_chi_square": 9.0}),
+        ({}, {"tried": 1e5}),
+    ],
+    ids=lambda changed: " ".join(changed) or "no more tried",
+)
+def test_more_evidence_makes_a_peak_more_probable(better, worse):
+    assert replace(PEAK, **better).nats >= PEAK.nats > replace(PEAK, **worse).nats
+
+
+def test_the_best_of_many_places_is_worth_what_chance_makes_of_so_many():
+    """n draws reach s sigmas with a probability of n exp(-s^2 / 2); without a prior that is all."""
+    alone = PeakEvidence(8.0, 0.0, 1000.0, 1000.0, None)
+    assert alone.nats == pytest.approx(32.0 - math.log(1000.0))
+    assert replace(alone, tried=1e6).nats == pytest.approx(32.0 - math.log(1e6))
+
+
+def test_look_alikes_make_a_sigma_as_much_more():
+    """By hand: of 1000 places the best is expected at 3.72 sigmas; a rival at twice that halves every sigma."""
+    expected = math.sqrt(2.0 * math.log(1000.0))
+    twins = PeakEvidence(16.0, 2.0 * expected, 1000.0, 1000.0, None)
+    assert twins.nats == pytest.approx(PeakEvidence(8.0, expected, 1000.0, 1000.0, None).nats)
+
+
+def test_a_rival_that_is_as_high_leaves_no_evidence_but_the_priors():
+    for sigmas in (4.0, 40.0):
+        assert PeakEvidence(sigmas, sigmas, 1000.0, 1000.0, None).nats == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_rate_of_alarms_is_what_the_evidence_allows():
+    """Peaks of 20,000 surfaces of chance: evidence e comes no more often than exp(-e)."""
+    rng = np.random.default_rng(1)
+    scores = np.sort(rng.normal(size=(20_000, 500)), axis=1)
+    nats = np.array([PeakEvidence(high, rival, 500.0, 500.0, None).nats for rival, high in scores[:, -2:]])
+    for e in (1.0, 2.0, 4.0, 6.0):
+        assert np.mean(nats > e) <= math.exp(-e)
+
+
+def test_a_score_is_counted_in_sigmas_of_fishers_z():
+    assert sigmas_of(0.5, 0.1) == pytest.approx(math.atanh(0.5) / 0.1)
+    assert sigmas_of(-0.5, 0.1) == 0.0
+    assert independent_places(1600.0) == pytest.approx(100.0)
+    assert independent_places(0.0) == pytest.approx(math.e)
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(1e-3, 1), st.floats(3.0, 1e12), known)
+def test_every_peak_has_a_probability(score, second, sigma, places, off):
+    evidence = PeakEvidence(sigmas_of(score, sigma), sigmas_of(second, sigma), places, places, off)
+    assert 0.0 < probability(evidence.nats) < 1.0
+
+
+def test_a_place_is_held_against_the_errors_of_both():
+    fix = Fix(
+        timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=3.0, north_m=4.0, up_m=None,
+        covariance_m2=np.eye(3) * 9.0, attitude=None, score=0.5, method="ncc", window=Window(0, 0, 1, 1),
+        timings=Timings(), map_xy_px=(0.0, 0.0),
+    )  # fmt: skip
+    assert prior_chi_square(fix, np.zeros(2), 4.0) == pytest.approx(25.0 / 25.0)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "risk", "reason"),
+    [
+        (PEAK, 1e-3, None),
+        (PEAK, 1e-9, Reason.AMBIGUOUS),
+        (replace(PEAK, rival_sigmas=7.9), 1e-3, Reason.AMBIGUOUS),
+        (replace(PEAK, sigmas=3.0, rival_sigmas=2.0), 1e-3, Reason.LOW_SCORE),  # what chance reaches
+        (replace(PEAK, prior_chi_square=40.0), 1e-6, Reason.AMBIGUOUS),
+    ],
+)
+def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
+    verdict = judge_peak(peak(), evidence, risk)
+    assert (verdict and verdict[0]) is reason
+    if verdict:
+        assert f"{evidence.sigmas:.1f}" in verdict[1]  # the figures behind the reason
+
+
+def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
+    verdict = judge_peak(peak(0.9, -1.0, bend=np.zeros((2, 2))), PEAK, 0.5)
+    assert verdict
+    assert verdict[0] is Reason.AMBIGUOUS
+
+
+def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
+    verdict = judge_peak(peak(), replace(PEAK, sigmas=50.0), 1e-4, is_tested=False)
+    assert verdict
+    assert verdict[0] is Reason.UNCONFIRMED

@@ -10,7 +10,6 @@ import pytest
 from engine import Fix, MatcherOptions, NoFix, Reason, SceneMatcher
 from engine.matching.acceptance import judge_pose
 from engine.matching.evidence import PoseEvidence
-from engine.options import SiftOptions
 from tests.support.ground import Ground
 
 NADIR = np.array([310.0, 305.0])
@@ -33,7 +32,7 @@ NEARLY_NONE = 1e-20  # a risk that leaves nothing beyond doubt
 
 
 def locate(ground, camera, nadir, risk):
-    options = MatcherOptions(sift=SiftOptions(risk=risk))
+    options = MatcherOptions(risk=risk)
     return SceneMatcher(ground.site, camera, "sift", "cpu", options).locate(
         ground.frame(camera, nadir), ground.prior(nadir)
     )

@@ -169,7 +169,7 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
     result = make("ncc").locate(frame, prior, HURRY)
     assert isinstance(result, Fix) == is_fixed
     if is_fixed:  # refinement did not confirm the tilt, and a refused peak makes nothing more certain
-        assert result.confidence == (0.99 if off_m else pytest.approx(1.0, abs=1e-3))
+        assert result.confidence == pytest.approx(1.0, abs=1e-3)
         assert result.sigma_m > 1.5 * coarse(make("ncc")._query(frame, prior, Deadline(HURRY))).sigma_m
     assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
 
@@ -216,8 +216,9 @@ def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, mak
     assert fix.stage == "coarse"
 
 
-def test_a_refinement_at_once_that_was_too_dear_once_is_tried_again(site, camera, frame, prior):
+def test_a_refinement_at_once_that_was_too_dear_once_is_tried_again(site, camera, frame, prior, monkeypatch):
     """Without it every frame takes the long way, which is dearer yet."""
+    monkeypatch.setattr(Costs, "load", lambda _self: 1.0)  # whatever else this machine does
     matcher = SceneMatcher(site, camera, "ncc", "cpu")
     for _ in range(2):
         matcher._costs.learn("refinement at once", 9e4, 1e7, 1e7)

@@ -7,17 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, MatcherOptions, NoFix, SceneMatcher
+from engine import Fix, Frame, NoFix, SceneMatcher
 from engine.kernels.scores import orientation
-from engine.matching import ncc
-from engine.matching.acceptance import judge_second_look
-from engine.matching.confidence import SECOND_LOOK_MODEL, PeakFeatures, PriorAgreement, probability
-from engine.options import NccOptions, PeakRule
-from engine.values import Peak, Reason
 
 NADIR = np.array([310.0, 305.0])
-HERE = PriorAgreement(prior_chi_square=1.0, spread_m=8.0)
-CLEAR = PeakFeatures(sigmas=25.0, ratio=0.2, score=0.6, agreement=HERE)
 
 
 def test_an_edge_that_swaps_its_tones_keeps_its_orientation(ground):
@@ -47,19 +40,14 @@ def test_what_is_not_valid_has_no_orientation_and_is_not_seen(ground):
     assert not first[:, ~valid].any()
 
 
-@pytest.mark.parametrize("second_look", [False, True])
-def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_at_the_second_look(ground, camera, second_look):
+def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_at_the_second_look(ground, camera):
     """Fields that were darker than their neighbours are brighter: squares of the picture are inverted."""
     image = ground.picture(camera, NADIR, 150.0).copy()
     rows, columns = (np.arange(n) // 40 for n in image.shape[:2])
     swapped = (rows[:, None] + columns) % 2 == 0
     image[swapped] = 255 - image[swapped]
-    options = MatcherOptions(ncc=NccOptions(second_look=second_look))
-    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", options)
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
     result = matcher.locate(Frame(image, 0, 150.0, 0.0, 0.0, 0.0), ground.prior(NADIR))
-    if not second_look:
-        assert isinstance(result, NoFix)
-        return
     assert isinstance(result, Fix), result
     assert np.hypot(*(np.array(result.map_xy_px) - NADIR)) < 2.0
     assert "second look" in result.timings.stages_ms
@@ -72,25 +60,6 @@ def test_noise_is_refused_at_the_second_look_too(ground, camera):
         assert isinstance(matcher.locate(Frame(image, 0, 150.0, 0.0, 0.0, 0.0), ground.prior(NADIR)), NoFix)
 
 
-@pytest.mark.parametrize(
-    ("peak", "features"),
-    [
-        (Peak(1.0, 1.0, 0.6, 0.1, np.zeros((2, 2))), CLEAR),  # at the window's edge
-        (Peak(1.0, 1.0, 0.6, 0.1, -np.eye(2)), replace(CLEAR, agreement=PriorAgreement(50.0, 8.0))),
-        (Peak(1.0, 1.0, 0.3, 0.29, -np.eye(2)), replace(CLEAR, sigmas=5.0, ratio=0.97, score=0.1)),
-    ],
-)
-def test_what_is_at_the_edge_contradicts_the_prior_or_has_a_rival_is_refused(peak, features):
-    refusal = judge_second_look(peak, features, probability(features, SECOND_LOOK_MODEL), PeakRule())
-    assert refusal is not None
-    assert refusal[0] is Reason.AMBIGUOUS
-
-
-def test_a_clear_peak_is_accepted():
-    peak = Peak(1.0, 1.0, 0.6, 0.1, -np.eye(2))
-    assert judge_second_look(peak, CLEAR, probability(CLEAR, SECOND_LOOK_MODEL), PeakRule()) is None
-
-
 # Another heading
 
 
@@ -98,7 +67,7 @@ def test_a_clear_peak_is_accepted():
 def test_a_compass_that_is_a_few_degrees_off_is_found_out(ground, camera, turn_deg):
     frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
     rng = np.random.default_rng(3)  # dim and noisy, so that the turned patch does not do by itself
-    image = np.clip(0.25 * frame.image + 90 + rng.normal(0, 14, frame.image.shape), 0, 255).astype(np.uint8)
+    image = np.clip(0.12 * frame.image + 90 + rng.normal(0, 14, frame.image.shape), 0, 255).astype(np.uint8)
     stated = replace(frame, image=image, heading_deg=40.0 + turn_deg)
     result = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR))
     assert isinstance(result, Fix)
@@ -115,26 +84,3 @@ def test_no_heading_makes_another_place_look_right(ground, camera):
         assert isinstance(
             SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR)), NoFix
         )
-
-
-@pytest.mark.parametrize(("contrast", "turn_deg"), [(0.04, -4.0), (0.08, 4.5), (0.25, -4.0), (0.25, 0.0)])
-def test_a_heading_that_is_improbable_without_the_null_hypothesis_need_not_beat_it(
-    ground, camera, monkeypatch, turn_deg, contrast
-):
-    """The null hypothesis only lowers a probability: the answers are those of asking about every heading."""
-    frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
-    noise = np.random.default_rng(5).normal(0, 14, frame.image.shape)
-    image = np.clip(contrast * frame.image + 90 + noise, 0, 255).astype(np.uint8)
-    stated = replace(frame, image=image, heading_deg=40.0 + turn_deg)
-    quick = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR))
-    find = ncc.Ncc.find
-    monkeypatch.setattr(ncc.Ncc, "find", lambda self, query, *, coarser=0, **_: find(self, query, coarser=coarser))
-    thorough = SceneMatcher(ground.site, camera, "ncc", "cpu").locate(stated, ground.prior(NADIR))
-    assert type(quick) is type(thorough)
-    if isinstance(quick, Fix):
-        assert (quick.east_m, quick.north_m, quick.confidence) == (
-            thorough.east_m, thorough.north_m, thorough.confidence,
-        )  # fmt: skip
-    else:
-        assert quick.detail == thorough.detail
-        assert [fix.confidence for fix in quick.candidates] == [fix.confidence for fix in thorough.candidates]

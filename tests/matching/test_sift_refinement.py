@@ -73,7 +73,7 @@ def test_a_fix_keeps_the_confidence_of_its_features(ground, camera, matcher):
     """Refinement says how near the pose is, not whether the place is right."""
     fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
     assert fix.confidence is not None
-    assert 1.0 - fix.confidence <= SiftOptions().risk
+    assert 1.0 - fix.confidence <= MatcherOptions().risk
     assert fix.attitude_covariance_deg2 is not None
     assert fix.up_m is not None
 
