@@ -9,7 +9,7 @@ from typer.main import get_command
 
 from docs.draw_architecture import drawn, members, picture
 from docs.site_roles import on_page_content
-from engine.options import AssumedErrors, NavigatorOptions, PeakRule, PoseOptions, SiftOptions
+from engine.options import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import Reason
 from scenematch.cli.app import app
 from scenematch.files.track import COLUMNS
@@ -180,8 +180,11 @@ def test_every_reason_is_explained():
     assert {reason.value for reason in Reason} <= stated
 
 
+OWNERS = (MatcherOptions, NccOptions, PoseOptions, SiftOptions, NavigatorOptions, AssumedErrors)
+
+
 def test_defaults_are_those_of_the_code():
-    owners = {cls.__name__: cls() for cls in (PeakRule, PoseOptions, SiftOptions, NavigatorOptions, AssumedErrors)}
+    owners = {cls.__name__: cls() for cls in OWNERS}
     found = re.findall(r"^\| `(\w+)\.(\w+)` \| (\S+) \|", read("docs/integrity.md"), re.MULTILINE)
     assert len(found) > 10
     for owner, name, value in found:

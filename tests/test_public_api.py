@@ -41,7 +41,6 @@ PUBLIC = [
     "NoFix",
     "OptionError",
     "OrthoMap",
-    "PeakRule",
     "PoseOptions",
     "Prior",
     "Realtime",
@@ -104,7 +103,6 @@ WITHOUT_TORCH = (
     "MatcherOptions",
     "NavigatorOptions",
     "OrthoMap",
-    "PeakRule",
     "Prior",
 )
 

@@ -101,7 +101,7 @@ def read_settings(path: Path, cls: type[Options]) -> Options:
 
 
 def changed(options: Any, within: str = "") -> dict[str, Any]:
-    """Settings that differ from their defaults, by dotted name ("ncc.rule.min_sigmas")."""
+    """Settings that differ from their defaults, by dotted name ("ncc.errors.map_m")."""
     defaults = type(options)()
     out: dict[str, Any] = {}
     for name in _kinds(type(options)):

@@ -35,6 +35,7 @@ class TrackSettings:
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none takes the first
             position of the telemetry, and where that has none the whole map is searched.
         budget_ms: time that one frame may take, later answers are refused; none does not hurry.
+        risk: probability of a wrong fix that is allowed.
         telemetry_columns: what a telemetry.csv calls its columns, by our name: timestamp_us = "time",
             height_agl_m = "alt". A table, [telemetry_columns]; columns that are not in it have our names.
         ncc: settings of the NCC method.
@@ -52,6 +53,7 @@ class TrackSettings:
     device: str = "auto"
     start: str | None = None
     budget_ms: float | None = None
+    risk: float = 1e-4
     telemetry_columns: dict[str, str] = field(default_factory=dict)
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
@@ -78,7 +80,8 @@ class TrackSettings:
 
     def matcher_options(self) -> MatcherOptions:
         """What of it is the matcher's."""
-        return MatcherOptions(profile=self.profile, ncc=self.ncc, sift=self.sift, learned=self.learned)
+        parts = {"ncc": self.ncc, "sift": self.sift, "learned": self.learned}
+        return MatcherOptions(profile=self.profile, risk=self.risk, **parts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,16 +44,16 @@ def test_every_field_that_a_file_can_hold_is_explained():
 def test_values_arrive(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
-        'method = "sift"\n[ncc]\nmargin = 2\n[ncc.rule]\nmin_sigmas = 6.5\n[sift]\nmax_turn_deg = "none"\n',
+        'method = "sift"\n[ncc]\nmargin = 2\n[ncc.errors]\nmap_m = 6.5\n[sift]\nmax_turn_deg = "none"\n',
         encoding="utf-8",
     )
     found = read_settings(path, TrackSettings)
-    assert (found.method, found.ncc.margin, found.ncc.rule.min_sigmas) == ("sift", 2.0, 6.5)
+    assert (found.method, found.ncc.margin, found.ncc.errors.map_m) == ("sift", 2.0, 6.5)
     assert found.sift.max_turn_deg is None
     assert changed(found) == {
         "method": "sift",
         "ncc.margin": 2.0,
-        "ncc.rule.min_sigmas": 6.5,
+        "ncc.errors.map_m": 6.5,
         "sift.max_turn_deg": None,
     }
     assert changed(TrackSettings()) == {}
@@ -70,14 +70,14 @@ def test_the_command_line_counts_more_than_the_file(tmp_path):
     ("text", "message"),
     [
         ("marign = 1", "marign: not a setting; did you mean margin?"),
-        ("[rule]\nmin_sigmsa = 4", "rule.min_sigmsa: not a setting; did you mean min_sigmas?"),
+        ("[errors]\nmpa_m = 4", "errors.mpa_m: not a setting; did you mean map_m?"),
         ("zebra = 1", "zebra: not a setting; known here are margin, "),
         ('margin = "wide"', "margin: expected a number, got 'wide'"),
         ("margin = 0.5", "margin: expected 1 or more, got 0.5"),
         ("enhance_radius_px = 2.5", "enhance_radius_px: expected a whole number, got 2.5"),
         ("refine = 1", "refine: expected true or false, got 1"),
-        ("rule = 3", "rule: expected a table, got 3"),
-        ("[rule]\nmin_sigmas = -1", "rule.min_sigmas: expected a number above 0, got -1.0"),
+        ("errors = 3", "errors: expected a table, got 3"),
+        ("[errors]\nmap_m = -1", "errors.map_m: expected a number above 0, got -1.0"),
         ("margin = ", "expected TOML, got something else: "),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
-from engine.options import MatcherOptions, NccOptions, PeakRule, SiftOptions
+from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Reason, Window
 from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -185,7 +185,8 @@ def test_settings_are_read_back_from_the_record():
     settings = TrackSettings(
         method="sift",
         budget_ms=40.0,
-        ncc=NccOptions(fraction=0.6, rule=PeakRule(min_sigmas=6.0)),
+        risk=1e-3,
+        ncc=NccOptions(fraction=0.6),
         sift=SiftOptions(max_turn_deg=None),
     )
     record = json.loads(json.dumps(changed(settings)))

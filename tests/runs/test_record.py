@@ -12,7 +12,7 @@ from scenematch.runs.record import RunRecord, read_record
 RECORD = RunRecord(
     map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,
     frame_stamps="/s.csv", log_offset_s=0.5, heights={"take-off": 3}, method="ncc", profile="engine",
-    device="cpu", changed={"ncc.rule.null_test_below": 1.0}, origin={"lat_deg": 48.0, "lon_deg": 16.0},
+    device="cpu", changed={"ncc.errors.map_m": 1.0}, origin={"lat_deg": 48.0, "lon_deg": 16.0},
     ground_m=3.5, ground_amsl_m=None, more={"closed_loop": {"minutes": 1.0}},
 )  # fmt: skip
 NAMES = [each.name for each in fields(RunRecord) if each.name != "more"]
