@@ -21,7 +21,11 @@ from engine.errors import MapError
 from scenematch.files.flight import open_flight
 from scenematch.files.truth import read_truth
 
-SIDE_PX, LINE_PX, SPAN_M = 400, 40, 380.0  # of each half, of the line below, and the ground that the map's half shows
+SIDE_PX, LINE_PX, SPAN_M = (
+    360,
+    40,
+    380.0,
+)  # of each half, of the line below, and the ground that the map's half shows
 MAP_SIGMA_M = 0.07  # of this map, whose georeference is known from the world that it was drawn from
 ENLARGED = 10.0  # the ellipse
 TRAIL, FOUND, WINDOW, TEXT, BACK = "#ffd21f", "#22d35e", "#38a8ff", "#f4f6f8", "#14181d"
@@ -31,11 +35,13 @@ def main() -> None:
     """Follow the flight and write one picture of all its frames."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("flight", type=Path, help="a flight folder")
-    parser.add_argument("--step", type=int, default=12, help="one frame in so many")
+    parser.add_argument("--step", type=int, default=20, help="one frame in so many")
     parser.add_argument("--out", type=Path, default=DOCS / "img" / "flight.webp")
     options = parser.parse_args()
     pictures = draw_flight(options.flight, options.step)
-    pictures[0].save(options.out, save_all=True, append_images=pictures[1:], duration=180, loop=0, quality=55, method=6)
+    pictures[0].save(
+        options.out, save_all=True, append_images=pictures[1:], duration=250, loop=0, quality=50, method=6
+    )
 
 
 def draw_flight(folder: Path, step: int) -> list[Image.Image]:
@@ -80,12 +86,14 @@ def draw_frame(
         draw.line([*ellipse(result, at, zoom / gsd_m)], fill=FOUND, width=3)
     page.paste(shown, (SIDE_PX, 0))
     text = ImageDraw.Draw(page)
-    text.text((10, SIDE_PX + 9), caption(result), TEXT, font=ImageFont.load_default(size=19))
+    text.text((10, SIDE_PX + 9), caption(result), TEXT, font=ImageFont.load_default(size=18))
     text.line([(SIDE_PX, 0), (SIDE_PX, SIDE_PX)], fill=BACK, width=3)
     return page
 
 
-def ellipse(fix: Fix, at: Callable[[float, float], tuple[float, float]], px_per_m: float) -> list[tuple[float, float]]:
+def ellipse(
+    fix: Fix, at: Callable[[float, float], tuple[float, float]], px_per_m: float
+) -> list[tuple[float, float]]:
     """The outline of three sigmas about the fix, enlarged."""
     values, axes = np.linalg.eigh(fix.covariance_m2[:2, :2])
     turn = np.linspace(0.0, 2.0 * np.pi, 49)
@@ -100,7 +108,7 @@ def caption(result: Fix | NoFix) -> str:
     if isinstance(result, NoFix):
         return f"no fix: {result.reason.value}"
     place = f"{result.lat_deg:.6f}  {result.lon_deg:.6f}"
-    return f"{place}   \u00b1 {result.sigma_m:.2f} m   {result.timings.total_ms:.0f} ms    (ellipse: 3 sigma x {ENLARGED:.0f})"
+    return f"{place}   \u00b1 {result.sigma_m:.2f} m   {result.timings.total_ms:.0f} ms    ellipse: 3 sigma x {ENLARGED:.0f}"
 
 
 if __name__ == "__main__":
