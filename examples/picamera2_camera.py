@@ -2,9 +2,9 @@
 
 import sys
 
-from engine import Answer, Camera, Fix, Frame, Live, LiveOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from picamera2 import Picamera2
 
+from engine import Answer, Camera, Fix, Frame, Live, LiveOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from scenematch import RecentValues
 
 matcher = SceneMatcher(OrthoMap.open("map.tif"), Camera.load("camera.yaml"), method="auto")

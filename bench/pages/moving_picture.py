@@ -2,8 +2,8 @@
 
     python -m bench.pages.moving_picture FLIGHT [--step N] [--out docs/img/flight.webp]
 
-FLIGHT is a flight folder. Left the frame; right the map with the searched window, the frame where it was found, the
-fixes so far and the last fix with its ellipse, enlarged tenfold so that it can be seen.
+FLIGHT is a flight folder. Left the frame; right the map with the searched window, the fixes so far
+and the last fix with its ellipse, enlarged tenfold so that it can be seen.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ def caption(result: Fix | NoFix) -> str:
     if isinstance(result, NoFix):
         return f"no fix: {result.reason.value}"
     place = f"{result.lat_deg:.6f}  {result.lon_deg:.6f}"
-    return f"{place}   \u00b1 {result.sigma_m:.2f} m   {result.timings.total_ms:.0f} ms    ellipse: 3 sigma x {ENLARGED:.0f}"
+    how = f"\u00b1 {result.sigma_m:.2f} m   {result.timings.total_ms:.0f} ms"
+    return f"{place}   {how}    ellipse: 3 sigma x {ENLARGED:.0f}"
 
 
 if __name__ == "__main__":
