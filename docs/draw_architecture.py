@@ -1,4 +1,4 @@
-"""Draws docs/architecture.md from the code: its floors, imports and files, and img/architecture.svg.
+"""Draws docs/architecture.md from the code: its floors and imports, and img/architecture.svg.
 
 ``python docs/draw_architecture.py`` rewrites both; a test compares them with the code.
 """
@@ -106,17 +106,6 @@ def table(root: Path = ROOT) -> str:
     return "\n".join(lines)
 
 
-def listing(root: Path = ROOT) -> str:
-    """The files of every folder, by name."""
-    lines = ["| folder | files |", "|---|---|"]
-    for folder in sorted({path.parent for path in _files(root)}):
-        names = [f"`{path.stem}`" for path in sorted(folder.glob("*.py")) if path.stem != "__init__"]
-        where = folder.relative_to(root).as_posix()
-        if names:
-            lines.append(f"| {where}/ | {', '.join(names)} |")
-    return "\n".join(lines)
-
-
 def picture(root: Path = ROOT) -> str:
     """The floors as bands, with a line for each direct import, as SVG."""
     boxes: dict[str, tuple[float, float]] = {}
@@ -169,11 +158,9 @@ def _box(name: str, x: float, y: float) -> str:
 
 def drawn(text: str, root: Path = ROOT) -> str:
     """The page with what stands between its markers drawn anew."""
-    for name, part in (("floors", table(root)), ("files", listing(root))):
-        begin, end = f"<!-- drawn: {name} -->", f"<!-- end: {name} -->"
-        before, rest = text.split(begin)
-        text = f"{before}{begin}\n\n{part}\n\n{end}{rest.split(end)[1]}"
-    return text
+    begin, end = "<!-- drawn: floors -->", "<!-- end: floors -->"
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n\n{table(root)}\n\n{end}{rest.split(end)[1]}"
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,25 @@ class Frame:
             lag_deg = getattr(self, name)
             if lag_deg is not None and not 0.0 <= lag_deg < math.inf:
                 raise TelemetryError(f"{name}: expected 0 degrees or more, got {lag_deg}")
+
+    @classmethod
+    def from_bgr(cls, image: NDArray[np.uint8], *args: Any, **known: Any) -> Frame:
+        """A frame from a picture in OpenCV's channel order.
+
+        Args:
+            image: (H, W, 3) BGR, uint8, as ``cv2.VideoCapture`` and ``cv2.imread`` return it.
+            *args: as the frame takes them after its image.
+            **known: likewise, by name.
+
+        Returns:
+            Frame: with the picture as RGB, a copy.
+
+        Raises:
+            ShapeError: the image is not (H, W, 3).
+        """
+        if np.ndim(image) != 3 or np.shape(image)[2] != 3:
+            raise ShapeError(f"image: expected (H, W, 3) BGR, got {np.shape(image)}")
+        return cls(np.ascontiguousarray(image[:, :, ::-1]), *args, **known)
 
     @property
     def attitude(self) -> Attitude | None:

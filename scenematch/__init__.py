@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
+    from scenematch.bridges.vehicle import RecentValues
     from scenematch.files.corrections import Corrections
     from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.cameras import CameraInput
@@ -58,6 +59,7 @@ __all__ = [
     "MapInput",
     "MavlinkSettings",
     "Progress",
+    "RecentValues",
     "RosSettings",
     "TrackSettings",
     "WorldSettings",
@@ -81,6 +83,7 @@ __all__ = [
 ]
 
 _NAMES = {
+    "scenematch.bridges.vehicle": "RecentValues",
     "scenematch.files.corrections": "Corrections",
     "scenematch.runs.cameras": "CameraInput",
     "scenematch.runs.checking": "diagnose_flight",

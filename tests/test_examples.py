@@ -7,8 +7,10 @@ import subprocess
 import sys
 import time
 import types
+from contextlib import suppress
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -80,6 +82,73 @@ def test_a_video_and_its_telemetry_are_the_flight_again(flight, monkeypatch):
     for item, of_folder in zip(video, open_flight("frames", "telemetry.csv"), strict=True):
         assert fields_of(replace(item.frame, image=of_folder.frame.image)) == fields_of(of_folder.frame)
         assert np.abs(item.frame.image.astype(int) - of_folder.frame.image).mean() < 12.0  # compressed once more
+
+
+class CameraOfNoCamera:
+    """A camera that shows the flight's pictures, as OpenCV's, as picamera2's and as a pipe's."""
+
+    def __init__(self, flight):
+        self.frames = [item.frame for item in open_flight(flight / "frames", flight / "telemetry.csv")]
+        self.left = list(self.frames)
+
+    def known(self):
+        """What the vehicle knows at the picture that was taken last."""
+        frame = self.frames[len(self.frames) - len(self.left) - 1]
+        return frame.roll_deg, frame.pitch_deg, frame.heading_deg, frame.height_agl_m
+
+    def grab(self):
+        time.sleep(0.7)
+        return bool(self.left)
+
+    def retrieve(self):
+        return True, cv2.cvtColor(np.atleast_3d(self.left.pop(0).image), cv2.COLOR_RGB2BGR)
+
+    def pipe(self, source, exposure_to_grab_ms):
+        assert source.startswith("exec:gst-launch-1.0 ")
+        while self.grab():
+            yield self.retrieve()[1][:, :, ::-1].copy(), time.monotonic_ns()
+            yield None
+
+    def create_video_configuration(self, mode):
+        return mode
+
+    def configure(self, mode):
+        assert mode["format"] == "RGB888"
+
+    def start(self):
+        pass
+
+    def capture_request(self):
+        if not self.grab():
+            raise KeyboardInterrupt
+        return self
+
+    def make_array(self, stream):
+        return self.retrieve()[1]
+
+    def get_metadata(self):
+        return {"SensorTimestamp": time.monotonic_ns(), "ExposureTime": 1000}
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize("name", ["opencv_camera", "jetson_camera", "picamera2_camera"])
+def test_a_camera_is_followed(name, flight, monkeypatch, capsys):
+    camera, start = CameraOfNoCamera(flight), read_truth(flight / "truth.csv")[0]
+    picamera2 = types.ModuleType("picamera2")
+    picamera2.Picamera2 = lambda: camera
+    monkeypatch.setitem(sys.modules, "picamera2", picamera2)
+    monkeypatch.setattr("cv2.VideoCapture", lambda number: camera)
+    monkeypatch.setattr("scenematch.bridges.pictures.capture", camera.pipe)
+    monkeypatch.setattr("scenematch.bridges.vehicle.RecentValues.at", lambda self, ns: camera.known())
+    monkeypatch.setattr(sys, "argv", [name, str(start.lat_deg), str(start.lon_deg)])
+    monkeypatch.chdir(flight)
+    with suppress(KeyboardInterrupt):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"))
+    fixes = re.findall(r"^(\S+) (\S+), \d+ ms old$", capsys.readouterr().out, re.MULTILINE)
+    assert len(fixes) >= 2
+    assert all(abs(float(lat) - start.lat_deg) < 1e-3 for lat, _ in fixes)
 
 
 class NodeOfNoRos:

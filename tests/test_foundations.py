@@ -59,6 +59,15 @@ class Clock:
         self.now_ns += round(ms * 1e6)
 
 
+def test_a_frame_takes_pictures_of_opencv():
+    bgr = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    frame = Frame.from_bgr(bgr, 5, height_agl_m=9.0)
+    assert (frame.image == bgr[:, :, ::-1]).all()
+    assert (frame.timestamp_ns, frame.height_agl_m) == (5, 9.0)
+    with pytest.raises(ShapeError, match=r"^image: expected \(H, W, 3\) BGR, got \(2, 4\)"):
+        Frame.from_bgr(bgr[:, :, 0])
+
+
 # Budget and deadline
 
 

@@ -121,7 +121,7 @@ def test_true_north_is_the_planes_at_its_origin(lat_deg, lon_deg):
 
 
 def test_true_north_of_places_to_the_east_leans_to_the_west_in_the_north_of_the_earth():
-    # 30 km east of the origin, as docs/large-maps.md has it; 0.4 degrees of longitude.
+    # 30 km east of the origin; 0.4 degrees of longitude.
     assert LocalFrame(48.0, 15.0).convergence_deg(48.0, 15.4) == pytest.approx(-0.297, abs=1e-3)
     assert LocalFrame(-48.0, 15.0).convergence_deg(-48.0, 15.4) == pytest.approx(0.297, abs=1e-3)
     assert LocalFrame(0.0, 15.0).convergence_deg(0.0, 15.4) == 0.0

@@ -46,6 +46,8 @@ _FFMPEG_OPTIONS = (
 )
 _TIMEOUTS = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 2000]
 
+_GSTREAMER_HINT = "; read a GStreamer pipeline by 'exec:gst-launch-1.0 -q ... ! jpegenc ! fdsink'"
+
 _log = logging.getLogger("scenematch")
 
 
@@ -75,7 +77,10 @@ class _OpenCvSource:
         except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python accepts
             opened = False
         if not opened:
-            raise TelemetryError(f"camera_source: expected a camera or stream that opens, got {quoted(source)}")
+            hint = _GSTREAMER_HINT if "!" in source or source.split(" ")[0].endswith("src") else ""
+            raise TelemetryError(
+                f"camera_source: expected a camera or stream that opens, got {quoted(source)}{hint}"
+            )
         self._camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
 
     def read(self) -> tuple[Image, int] | None:

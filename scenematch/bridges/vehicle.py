@@ -83,7 +83,13 @@ class VehicleState:
 
 
 class RecentValues:
-    """Ring buffer of the newest samples of one quantity, interpolated in time.
+    """Ring buffer of the newest samples of one quantity, interpolated in time: the attitude at an exposure.
+
+    ::
+
+        vehicle = RecentValues((True, True, True))  # the first three values are angles
+        vehicle.add(time_ns, roll_deg, pitch_deg, heading_deg, height_agl_m)  # as the autopilot states them
+        roll_deg, pitch_deg, heading_deg, height_agl_m = vehicle.at(exposure_ns)
 
     Args:
         angles: which of the values are angles in degrees, interpolated along the shorter arc; empty for none.

@@ -106,6 +106,16 @@ def test_a_camera_that_does_not_open_is_told(source):
         next(capture(source))
 
 
+@pytest.mark.parametrize(
+    "source", ["nvarguscamerasrc", "nvarguscamerasrc ! nvvidconv ! appsink", "v4l2src ! appsink"]
+)
+def test_a_gstreamer_pipeline_is_told_how_it_is_read(source):
+    from scenematch.bridges.pictures import capture
+
+    with pytest.raises(TelemetryError, match=r"; read a GStreamer pipeline by 'exec:gst-launch-1\.0 "):
+        next(capture(source))
+
+
 @pytest.mark.parametrize("link", ["udpout:192.168..1:14550", f"udpout:{'x' * 300}:5", "tcp:a..b:5"])
 def test_a_host_that_cannot_be_one_is_told(link):
     from scenematch.bridges.links import parse_connection

@@ -1,0 +1,31 @@
+"""A USB camera by OpenCV into Live. Run it where map.tif and camera.yaml lie, with the start: LAT LON."""
+
+import sys
+import time
+
+import cv2
+
+from engine import Answer, Camera, Fix, Frame, Live, LiveOptions, Navigator, OrthoMap, Prior, SceneMatcher
+from scenematch import RecentValues
+
+matcher = SceneMatcher(OrthoMap.open("map.tif"), Camera.load("camera.yaml"), method="auto")
+matcher.warmup()  # lookups and plans exist before take-off
+start = Prior(lat_deg=float(sys.argv[1]), lon_deg=float(sys.argv[2]), sigma_m=15.0)
+KNOWN = ("roll_deg", "pitch_deg", "heading_deg", "height_agl_m")
+vehicle = RecentValues((True, True, True))  # call vehicle.add(ns, roll, pitch, heading, height) for your autopilot
+
+
+def deliver(answer: Answer) -> None:
+    """Print the fix; send it to your autopilot here."""
+    if isinstance(answer.result, Fix):
+        print(f"{answer.result.lat_deg:.7f} {answer.result.lon_deg:.7f}, {answer.age_ms:.0f} ms old")
+
+
+with Live(lambda prior: Navigator(matcher, prior or start), deliver, options=LiveOptions(deadline_ms=500)) as live:
+    camera = cv2.VideoCapture(0)
+    while camera.grab():
+        taken_ns = time.monotonic_ns()  # less what your camera takes from exposure to here
+        image = camera.retrieve()[1]
+        time.sleep(0.02)  # until the attitude after the exposure is there
+        known = dict(zip(KNOWN, vehicle.at(taken_ns) or (None,) * 4, strict=True))
+        live.submit(Frame.from_bgr(image, taken_ns, **known), captured_ns=taken_ns)
