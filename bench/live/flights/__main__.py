@@ -38,7 +38,7 @@ class Bridge:
             "--connect", f"udpin:127.0.0.1:{port}", "--map", str(folder / "map.tif"),
             "--surface", str(folder / "dsm.tif"), "--camera", str(folder / "camera.yaml"),
             "--camera-source", camera, "--start", f"{start.lat_deg},{start.lon_deg},15",
-            "--settings", f"output.message={message}",
+            "--settings", f"mavlink.message={message}",
         ]  # fmt: skip
         self._log = (folder / "bridge.log").open("w", encoding="utf-8")
         self.start()
