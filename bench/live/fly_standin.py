@@ -136,8 +136,13 @@ def off_m(message: Any, motion: Callable[[float], State], pilot: Standin) -> flo
         captured_us -= message.processing_time
     if kind in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
         east, north = pilot.place.enu_from_geodetic(message.lat * 1e-7, message.lon * 1e-7)[:2]
-    else:
-        east, north = message.y, message.x
+    else:  # about the autopilot's origin, which after a restart is the one that the bridge has set
+        lat_1e7, lon_1e7 = (
+            pilot.origin[:2] if pilot.origin else (pilot.place.lat_deg * 1e7, pilot.place.lon_deg * 1e7)
+        )
+        about = LocalFrame(lat_1e7 * 1e-7, lon_1e7 * 1e-7)
+        lat_deg, lon_deg = about.geodetic_from_enu(message.y, message.x)
+        east, north = pilot.place.enu_from_geodetic(lat_deg, lon_deg)[:2]
     was = motion(captured_us * 1e-6)
     return math.hypot(east - was.east_m, north - was.north_m)
 

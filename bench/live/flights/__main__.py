@@ -32,7 +32,9 @@ class Bridge:
 
     def __init__(self, folder: Path, port: int, method: str, message: str) -> None:
         start = recorded(folder)[1]
-        camera = f"exec:{sys.executable} -m bench.live.flights.camera {folder / 'frames'} {folder / 'begin'} {RATE_HZ}"
+        camera = (
+            f"exec:{sys.executable} -m bench.live.flights.camera {folder / 'frames'} {folder / 'begin'} {RATE_HZ}"
+        )
         self._command = [
             sys.executable, "-m", "scenematch.cli", "bridge", "mavlink", "--supervise", "--method", method,
             "--connect", f"udpin:127.0.0.1:{port}", "--map", str(folder / "map.tif"),
