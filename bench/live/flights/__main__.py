@@ -1,13 +1,14 @@
 """``python -m bench.live.flights FOLDER [--method auto|ncc] [--message NAME] [--town SEED]``: fly, and score.
 
-FOLDER is made where it is missing: a drawn town with the paper's flight over it. The bridge runs as a process of its
+FOLDER is made where it is missing: a drawn town with the paper's flight over it. The bridge is a process of its
 own with ``--supervise``; what goes wrong and when stands in :mod:`bench.live.flights.faults`. The stand-in has no
-estimator, so that the figures are of the fixes and not of an EKF. Prints tables for ``docs/results/vehicle.md``.
+estimator: the figures are of the fixes and not of an EKF. It prints the tables of ``docs/results/vehicle.md``.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import subprocess
@@ -32,9 +33,8 @@ class Bridge:
 
     def __init__(self, folder: Path, port: int, method: str, message: str) -> None:
         start = recorded(folder)[1]
-        camera = (
-            f"exec:{sys.executable} -m bench.live.flights.camera {folder / 'frames'} {folder / 'begin'} {RATE_HZ}"
-        )
+        shown = f"{folder / 'frames'} {folder / 'begin'} {RATE_HZ}"
+        camera = f"exec:{sys.executable} -m bench.live.flights.camera {shown}"
         self._command = [
             sys.executable, "-m", "scenematch.cli", "bridge", "mavlink", "--supervise", "--method", method,
             "--connect", f"udpin:127.0.0.1:{port}", "--map", str(folder / "map.tif"),
@@ -49,9 +49,14 @@ class Bridge:
         """Start it, in a group of its own."""
         self._process = subprocess.Popen(self._command, stdout=self._log, stderr=self._log, start_new_session=True)
 
+    def is_running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
     def kill(self) -> None:
         """All of it."""
-        os.killpg(self._process.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
     def kill_worker(self) -> None:
@@ -68,7 +73,7 @@ def fly(folder: Path, method: str, message: str) -> list[tuple[float, float, flo
     bridge = Bridge(folder, port, method, message)
     fixes: list[tuple[float, float, float]] = []
     try:
-        wait_for_bridge(port)
+        wait_for_bridge(port, bridge.is_running)
         begin_ns = clock()
         (folder / "begin").write_text(str(begin_ns), encoding="ascii")
 

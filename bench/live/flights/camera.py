@@ -1,7 +1,7 @@
 """The camera of a flight: ``python -m bench.live.flights.camera FRAMES BEGIN_FILE RATE_HZ``, for ``exec:``.
 
-It writes the JPEG pictures of a folder at their times after the begin that the file states, on the monotonic clock;
-the first one until there is such a file. Faults cover it, or freeze its picture.
+It writes the JPEG pictures of a folder at their times after the begin that the file states, on the monotonic
+clock; the first one until there is such a file. Faults cover it, or freeze its picture.
 """
 
 from __future__ import annotations
