@@ -19,9 +19,9 @@ def test_a_fault_is_scored_by_the_first_fix_after_its_end():
         [(1.0, 0.1, 10.0), (17.0, 9.0, 10.0), (20.5, 0.3, 10.0), (36.0, 0.4, 20.0)], "begun"
     ).splitlines()
     assert "| 4 | 4.51 | 9.00 | 1 | 10, 20 |" in lines
-    assert "| bridge killed 3 s | 2.50 | 0.30 |" in lines
-    assert "| worker killed | 1.00 | 0.40 |" in lines
-    assert "| camera covered 10 s | none | |" in lines
+    assert "| bridge killed 3 s | 2.50 | 0.30 | 14.5 |" in lines
+    assert "| worker killed | 1.00 | 0.40 | 9.0 |" in lines
+    assert "| camera covered 10 s | none | | 20.0 |" in lines
 
 
 def test_a_fault_covers_the_camera_or_freezes_its_picture():

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.live.bridge_counts import free_port
 from bench.live.flights.faults import FAULTS, FLIGHT_S, Fault
@@ -119,13 +120,20 @@ def report(fixes: list[tuple[float, float, float]], begun: str) -> str:
         begun, "", "| fixes | RMS m | worst m | beyond 5 m | age p50, p99 ms |", "|---|---|---|---|---|",
         f"| {len(off)} | {np.sqrt((off**2).mean()):.2f} | {off.max():.2f} | {(off > FAR_M).sum()} "
         f"| {np.median(age_ms):.0f}, {np.percentile(age_ms, 99):.0f} |",
-        "", "| fault | first fix after its end s | off by m |", "|---|---|---|",
+        "", "| fault | first fix after its end s | off by m | longest silence from its begin s |", "|---|---|---|---|",
     ]  # fmt: skip
     for fault, until_s in zip(FAULTS, (*(fault.begin_s for fault in FAULTS[1:]), FLIGHT_S), strict=True):
         after = np.flatnonzero((arrived_s >= fault.end_s) & (arrived_s < until_s))
         row = f"{arrived_s[after[0]] - fault.end_s:.2f} | {off[after[0]]:.2f}" if len(after) else "none |"
-        lines.append(f"| {fault.name} | {row} |")
+        silence_s = longest_silence_s(arrived_s, fault.begin_s, until_s)
+        lines.append(f"| {fault.name} | {row} | {silence_s:.1f} |")
     return "\n".join(lines)
+
+
+def longest_silence_s(arrived_s: NDArray[np.float64], begin_s: float, end_s: float) -> float:
+    """A fix that was under way when a fault began says nothing of the time after it; the gaps do."""
+    within = arrived_s[(arrived_s > begin_s) & (arrived_s < end_s)]
+    return float(np.diff([begin_s, *within, end_s]).max())
 
 
 def draw(folder: Path, seed: int) -> None:
