@@ -8,8 +8,8 @@ import pytest
 from engine.geo import LocalFrame
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
-from bench.live.flights.__main__ import report
-from bench.live.flights.camera import _shown
+from bench.live.flights.camera import shown_picture
+from bench.live.flights.fly import report
 from bench.live.fly_standin import off_m
 from bench.live.standin import State
 
@@ -26,7 +26,7 @@ def test_a_fault_is_scored_by_the_first_fix_after_its_end():
 
 def test_a_fault_covers_the_camera_or_freezes_its_picture():
     frames = [bytes([number]) for number in range(100)]
-    shown = [_shown(frames, b"black", second, 1.0) for second in (44, 45, 54, 55, 64, 66, 70, 71)]
+    shown = [shown_picture(frames, b"black", second, 1.0) for second in (44, 45, 54, 55, 64, 66, 70, 71)]
     assert shown == [frames[44], b"black", b"black", frames[55], frames[64], frames[65], frames[65], frames[71]]
 
 

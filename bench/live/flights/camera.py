@@ -28,11 +28,11 @@ def film(frames: list[bytes], begin_file: Path, rate_hz: float, out: BinaryIO) -
         gone_s = (time.monotonic_ns() - begin_ns) * 1e-9
         number = int(gone_s * rate_hz) + 1
         time.sleep(max(0.0, number / rate_hz - gone_s))
-        out.write(_shown(frames, black, number, rate_hz))
+        out.write(shown_picture(frames, black, number, rate_hz))
         out.flush()
 
 
-def _shown(frames: list[bytes], black: bytes, number: int, rate_hz: float) -> bytes:
+def shown_picture(frames: list[bytes], black: bytes, number: int, rate_hz: float) -> bytes:
     """The picture of a number, or what a fault makes of it."""
     for fault in FAULTS:
         if fault.reigns(number / rate_hz):

@@ -1,4 +1,4 @@
-"""``python -m bench.live.flights FOLDER [--method auto|ncc] [--message NAME] [--town SEED]``: fly, and score.
+"""``python -m bench.live.flights.fly FOLDER [--method auto|ncc] [--message NAME] [--town SEED]``: fly, and score.
 
 FOLDER is made where it is missing: a drawn town with the paper's flight over it. The bridge is a process of its
 own with ``--supervise``; what goes wrong and when stands in :mod:`bench.live.flights.faults`. The stand-in has no
@@ -120,7 +120,8 @@ def report(fixes: list[tuple[float, float, float]], begun: str) -> str:
         begun, "", "| fixes | RMS m | worst m | beyond 5 m | age p50, p99 ms |", "|---|---|---|---|---|",
         f"| {len(off)} | {np.sqrt((off**2).mean()):.2f} | {off.max():.2f} | {(off > FAR_M).sum()} "
         f"| {np.median(age_ms):.0f}, {np.percentile(age_ms, 99):.0f} |",
-        "", "| fault | first fix after its end s | off by m | longest silence from its begin s |", "|---|---|---|---|",
+        "", "| fault | first fix after its end s | off by m | longest silence from its begin s |",
+        "|---|---|---|---|",
     ]  # fmt: skip
     for fault, until_s in zip(FAULTS, (*(fault.begin_s for fault in FAULTS[1:]), FLIGHT_S), strict=True):
         after = np.flatnonzero((arrived_s >= fault.end_s) & (arrived_s < until_s))
