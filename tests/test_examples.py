@@ -67,8 +67,8 @@ def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
         finally:
             bridge.kill()
     assert bridge.returncode == 0
-    # A busy machine hears of autopilot, height and receiver after its first fix, and is late with some.
-    unheard = {"no autopilot", "no height", "receiver not heard yet"}
+    # A busy machine hears of autopilot, origin, height and receiver after its first fix, and is late with some.
+    unheard = {"no autopilot", "no origin", "no height", "receiver not heard yet"}
     assert set(re.findall(r"'([\w ]+)': \d+", said)) <= {"late", "unconfirmed"} | unheard
     assert came["fixes"] >= 1
     assert came["fixes"] == int(re.search(r"sent=(\d+)", said)[1])

@@ -89,11 +89,15 @@ def _velocity(time_s: NDArray[np.float64], east_north: NDArray[np.float64]) -> N
     return np.column_stack(moved) / (after_s - before_s)[:, None]
 
 
-def wait_for_bridge(port: int) -> None:
-    """Until somebody listens on a UDP port of loopback: what is sent to one that nobody has comes back refused."""
+def wait_for_bridge(port: int, is_running: Callable[[], bool] = lambda: True) -> None:
+    """Until somebody listens on a UDP port of loopback: what is sent to one that nobody has comes back refused.
+
+    Raises:
+        SystemExit: the bridge has ended.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("127.0.0.1", port))
-        while True:
+        while is_running():
             try:
                 probe.send(b"")
                 time.sleep(0.01)
@@ -101,6 +105,7 @@ def wait_for_bridge(port: int) -> None:
                 return
             except ConnectionRefusedError:
                 time.sleep(0.02)
+    raise SystemExit("the bridge has ended before it listened")
 
 
 def fly(flight: Path, port: int, firmware: str, seconds: float | None = None) -> dict[str, Any]:
@@ -136,8 +141,12 @@ def off_m(message: Any, motion: Callable[[float], State], pilot: Standin) -> flo
         captured_us -= message.processing_time
     if kind in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
         east, north = pilot.place.enu_from_geodetic(message.lat * 1e-7, message.lon * 1e-7)[:2]
-    else:
-        east, north = message.y, message.x
+    else:  # about the autopilot's origin, which after a restart is the one that the bridge has set
+        about = pilot.place
+        if pilot.origin is not None:
+            about = LocalFrame(pilot.origin[0] * 1e-7, pilot.origin[1] * 1e-7)
+        lat_deg, lon_deg = about.geodetic_from_enu(message.y, message.x)
+        east, north = pilot.place.enu_from_geodetic(lat_deg, lon_deg)[:2]
     was = motion(captured_us * 1e-6)
     return math.hypot(east - was.east_m, north - was.north_m)
 

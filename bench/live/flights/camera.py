@@ -1,0 +1,55 @@
+"""The camera of a flight: ``python -m bench.live.flights.camera FRAMES BEGIN_FILE RATE_HZ``, for ``exec:``.
+
+It writes the JPEG pictures of a folder at their times after the begin that the file states, on the monotonic
+clock; the first one until there is such a file. Faults cover it, or freeze its picture.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+
+from bench.live.flights.faults import FAULTS
+
+
+def film(frames: list[bytes], begin_file: Path, rate_hz: float, out: BinaryIO) -> None:
+    """Write pictures until nobody reads them or the last was shown."""
+    size = cv2.imdecode(np.frombuffer(frames[0], np.uint8), cv2.IMREAD_COLOR).shape
+    black = cv2.imencode(".jpg", np.zeros(size, np.uint8))[1].tobytes()
+    number = 0
+    while number < len(frames):
+        begin_ns = int(begin_file.read_text(encoding="ascii")) if begin_file.exists() else time.monotonic_ns()
+        gone_s = (time.monotonic_ns() - begin_ns) * 1e-9
+        number = int(gone_s * rate_hz) + 1
+        time.sleep(max(0.0, number / rate_hz - gone_s))
+        out.write(shown_picture(frames, black, number, rate_hz))
+        out.flush()
+
+
+def shown_picture(frames: list[bytes], black: bytes, number: int, rate_hz: float) -> bytes:
+    """The picture of a number, or what a fault makes of it."""
+    for fault in FAULTS:
+        if fault.reigns(number / rate_hz):
+            if fault.kind == "camera covered":
+                return black
+            if fault.kind == "picture frozen":
+                return frames[int(fault.begin_s * rate_hz)]
+    return frames[min(number, len(frames) - 1)]
+
+
+def main() -> None:
+    """Film until the pipe is closed."""
+    folder, begin_file, rate_hz = sys.argv[1:]
+    frames = [path.read_bytes() for path in sorted(Path(folder).glob("*.jpg"))]
+    with contextlib.suppress(BrokenPipeError):
+        film(frames, Path(begin_file), float(rate_hz), sys.stdout.buffer)
+
+
+if __name__ == "__main__":
+    main()
