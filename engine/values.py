@@ -304,8 +304,8 @@ class Fix:
         map_xy_px: the camera's nadir in map pixels (x, y).
         stage: last stage within the budget: "coarse" at reduced resolution, "fine" at full, "refined" in all of
             the pose, "verified" by both methods.
-        confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None where NCC
-            searched the map, the heading or the height, for which no model was fitted.
+        confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None if the
+            method states none, as the paper's does.
         map_sigma_m: the part of ``covariance_m2`` that is the map's georeference, one standard deviation per axis:
             one error, which all fixes on a map share.
     """

@@ -18,7 +18,7 @@ FOLDERS = (
     "scenematch/simulator",
 )  # fmt: skip
 CALLED = {  # by others; the steps of a method state shapes in a line
-    "engine/matching": "acceptance align confidence covariance matcher pnp pose",
+    "engine/matching": "acceptance align covariance evidence matcher pnp pose",
     "scenematch/check": "availability plan self_match",
 }
 MODULES = sorted(

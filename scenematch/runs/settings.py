@@ -80,8 +80,9 @@ class TrackSettings:
 
     def matcher_options(self) -> MatcherOptions:
         """What of it is the matcher's."""
-        parts = {"ncc": self.ncc, "sift": self.sift, "learned": self.learned}
-        return MatcherOptions(profile=self.profile, risk=self.risk, **parts)
+        return MatcherOptions(
+            profile=self.profile, risk=self.risk, ncc=self.ncc, sift=self.sift, learned=self.learned
+        )
 
 
 @dataclass(frozen=True, slots=True)

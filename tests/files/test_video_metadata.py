@@ -1,6 +1,5 @@
 """A video's metadata by the way that the documentation shows: KLV to subtitles, subtitles to telemetry."""
 
-import re
 import struct
 import subprocess
 import sys
@@ -33,11 +32,8 @@ def packet(k):
 
 def test_the_documented_script_makes_telemetry_of_klv(tmp_path):
     pytest.importorskip("klvdata", reason="klvdata is not installed")
-    page = (ROOT / "docs" / "map-and-flight-files.md").read_text(encoding="utf-8")
-    (script,) = re.findall(r"```py\n(.+?)```", page, re.DOTALL)
-    (tmp_path / "klv_to_srt.py").write_text(script, encoding="utf-8")
     (tmp_path / "flight.klv").write_bytes(b"".join(packet(k) for k in range(4)))
-    command = [sys.executable, "klv_to_srt.py", "flight.klv"]
+    command = [sys.executable, str(ROOT / "examples" / "klv_to_srt.py"), "flight.klv"]
     text = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True).stdout
     (tmp_path / "flight.srt").write_bytes(text)
     log = open_log(tmp_path / "flight.srt")
