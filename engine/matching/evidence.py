@@ -81,6 +81,9 @@ def prior_chi_square(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> 
         fix: not accepted yet; an error of the map is the prior's as well, which is a place on it.
         prior_m: (2,) east and north in metres.
         sigma_m: standard deviation of the prior, per axis.
+
+    Returns:
+        float: small if they agree.
     """
     apart_m = np.array([fix.east_m, fix.north_m]) - prior_m
     return chi_square(apart_m, fix.relative_covariance_m2 + sigma_m**2 * np.eye(2))
