@@ -144,7 +144,7 @@ class Bench:
         found = sift.find(query, options)
         fixed = isinstance(found, PoseCandidate) and isinstance(sift.judge(query, found), Fix)
         if isinstance(found, NoFix):
-            found = sift.find(query, replace(options, pose=LOOSE, risk=1.0 - 1e-9))
+            found = sift.find(replace(query, risk=1.0 - 1e-9), replace(options, pose=LOOSE))
         if isinstance(found, NoFix):
             return self.row(made, "SIFT", None, False, [], [])
         scores = [found.fix.confidence or 0.0, -found.evidence.log10_nfa, found.fix.score]
