@@ -51,7 +51,7 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
     quick = _quick_level(correlator, first, level)
     if quick is not None:
         best = _from_level(correlator, first, window, *quick)
-        if best is not None and _is_beyond_doubt(best[0]):
+        if best is not None and _is_clear(best[0]):
             return *best, len(poses)
     return *(_from_level(correlator, first, window, level, poses) or (None, first)), len(poses)
 
@@ -65,7 +65,7 @@ def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[in
     return above, _hypotheses(correlator.query.telemetry, turns, shares)
 
 
-def _is_beyond_doubt(peak: Peak) -> bool:
+def _is_clear(peak: Peak) -> bool:
     return peak.score >= _MIN_QUICK_SCORE and peak.second_score <= _MAX_QUICK_RIVAL * peak.score
 
 

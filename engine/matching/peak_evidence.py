@@ -50,7 +50,7 @@ class PeakCandidate:
     evidence: PeakEvidence
     tried: float
     searched: bool
-    is_tested: bool = True
+    is_tested: bool
 
 
 def quick_look(correlator: Correlator, aligned: Aligned, window: Window) -> QuickLook:
@@ -77,6 +77,7 @@ def candidate_of(
     searched: bool = False,
     tried: float = 0.0,
     sigma: float | None = None,
+    is_tested: bool = False,
 ) -> PeakCandidate:
     """What a peak means.
 
@@ -88,6 +89,7 @@ def candidate_of(
         searched: whether heading and height were fitted to the picture.
         tried: places, times headings and heights, among which it is the best, if more than those of the window.
         sigma: one standard deviation of a score of chance, if it was measured.
+        is_tested: whether the null hypothesis is among its rivals, or would change nothing.
     """
     query, (rows, columns) = correlator.query, aligned.template.shape
     fix, off = fix_of(correlator, aligned, peak, window, searched=searched), None
@@ -98,9 +100,8 @@ def candidate_of(
     tried = max(tried, measured)
     scores = (sigmas_of(peak.score, sigma), sigmas_of(peak.second_score, sigma))
     evidence = PeakEvidence(*scores, measured, tried, off)
-    return PeakCandidate(
-        peak, aligned, replace(fix, confidence=probability(evidence.nats)), evidence, tried, searched
-    )
+    fix = replace(fix, confidence=probability(evidence.nats))
+    return PeakCandidate(peak, aligned, fix, evidence, tried, searched, is_tested)
 
 
 def places_in(aligned: Aligned, window: Window) -> float:
@@ -115,11 +116,11 @@ def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
     """The candidate, unless beyond doubt with what its frame reaches upside down and mirrored."""
     query, peak, aligned, window = correlator.query, found.peak, found.aligned, found.fix.window
     if is_beyond_doubt(found.evidence.nats, query.risk):
-        return found
+        return replace(found, is_tested=True)
     matters = found.evidence.nats >= query.needed_nats
     null_score = _null_score(correlator, aligned, window, peak.second_score, matters=matters)
     peak = replace(peak, second_score=max(peak.second_score, null_score))
-    return candidate_of(correlator, aligned, peak, window, tried=found.tried)
+    return candidate_of(correlator, aligned, peak, window, tried=found.tried, is_tested=True)
 
 
 def _null_score(

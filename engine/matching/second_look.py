@@ -192,6 +192,6 @@ def confirmed(correlator: Correlator, found: PeakCandidate, looked: SecondLook, 
         peak = replace(peak, second_score=max(peak.second_score, elsewhere))
     own = candidate_of(
         correlator, found.aligned, peak, window,
-        searched=found.searched, tried=found.tried, sigma=looked.chance_sigma,
+        searched=found.searched, tried=found.tried, sigma=looked.chance_sigma, is_tested=True,
     )  # fmt: skip
     return replace(own, fix=replace(own.fix, window=found.fix.window))

@@ -19,7 +19,7 @@ from engine.values import Fix, Prior
 MAX_PROBABILITY = 0.9999
 """Of a match or of a track: the confidence models were tested on some ten thousand matches, not on more."""
 UNSTATED_PROBABILITY = 0.98
-"""Of a match that states none: what the matchers ask for where they do; a search of more has stricter rules."""
+"""Of a match that states none, as the paper's."""
 _SAME_GROUND = 0.5  # what a match of ground that was matched before counts
 _HEIGHT_M = 100.0  # assumed where it is unknown
 
