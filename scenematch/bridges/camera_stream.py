@@ -52,13 +52,13 @@ _log = logging.getLogger("scenematch")
 
 
 class _Source(Protocol):
-    """An open camera. ``read`` blocks until a picture arrives, and returns None where there are no more."""
+    """An open camera. ``read`` blocks until a picture arrives, and returns None if there are no more."""
 
     def read(self) -> tuple[Image, int] | None:
         """The next picture (H, W, 3) RGB and its time of arrival on ``time.monotonic_ns``."""
 
     def interrupt(self) -> None:
-        """Let a read that blocks return, where that can be done from another thread."""
+        """Let a read that blocks return, if possible from another thread."""
 
     def close(self) -> None:
         """Release the camera."""
@@ -170,7 +170,7 @@ class CameraStream:
         self._start(self._open())
 
     def next(self, timeout_s: float) -> tuple[Image, int] | None:
-        """The newest picture that differs from the one before it; None where none came in time."""
+        """The newest picture that differs from the one before it; None if none came in time."""
         until = time.monotonic() + timeout_s
         while (left_s := until - time.monotonic()) > 0.0:
             with self._changed:
@@ -251,7 +251,7 @@ def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple
         exposure_to_grab_ms: time from exposure to arrival, a property of the camera.
 
     Yields:
-        Picture and capture time; None where no new one came for half a second. A picture that is identical to the
+        Picture and capture time; None if no new one came for half a second. A picture that is identical to the
         last is none: a camera that hangs repeats its last one.
 
     Raises:

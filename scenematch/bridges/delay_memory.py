@@ -13,7 +13,7 @@ def remember_delay(least_age_ms: float | None) -> None:
     """Keep the least age of a fix; None, of a bridge that sent none, leaves what was kept."""
     if least_age_ms is None:
         return
-    with contextlib.suppress(OSError):  # a home that cannot be written is no reason to fail
+    with contextlib.suppress(OSError):  # a home that cannot be written must not end the run
         _file().parent.mkdir(parents=True, exist_ok=True)
         _file().write_text(f"{least_age_ms:.0f}\n", encoding="ascii")
 

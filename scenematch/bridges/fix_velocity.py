@@ -65,7 +65,7 @@ class VelocityFromFixes:
 
 
 def _own_velocities(samples: list[_Sample]) -> np.ndarray | None:
-    """(N, 2) velocities that the vehicle reported, or None where one is missing."""
+    """(N, 2) velocities that the vehicle reported, or None if one is missing."""
     known = [sample.velocity_mps for sample in samples]
     return None if None in known else np.array(known)
 

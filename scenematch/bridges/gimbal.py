@@ -34,7 +34,7 @@ def body_behind(enu_from_gimbal: Array, mount: Array) -> Attitude:
 
 
 def from_device(q: list[float], flags: int, heading_deg: float) -> Array | None:
-    """The rotation that GIMBAL_DEVICE_ATTITUDE_STATUS states; None where it states none.
+    """The rotation that GIMBAL_DEVICE_ATTITUDE_STATUS states; None if it states none.
 
     Args:
         q: w, x, y, z, of a level frame that faces north or, by the flags, where the vehicle faces.
@@ -51,7 +51,7 @@ def from_device(q: list[float], flags: int, heading_deg: float) -> Array | None:
 
 
 def from_mount(roll_deg: float, pitch_deg: float, yaw_deg: float, heading_deg: float) -> Array | None:
-    """The rotation that MOUNT_ORIENTATION states, whose yaw is about the vehicle; None where it states none."""
+    """The rotation that MOUNT_ORIENTATION states, whose yaw is about the vehicle; None if it states none."""
     if not all(map(math.isfinite, (roll_deg, pitch_deg, yaw_deg))):
         return None
     return enu_from_body(roll_deg, pitch_deg, yaw_deg + heading_deg)

@@ -78,7 +78,7 @@ class MavlinkBridge:
             unsent.
         use_velocity: whether the autopilot's velocity is used for dead reckoning between fixes.
         site: the map; None holds the first fixes against neither the start nor a receiver.
-        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
+        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, if it has a fix.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None is a fixed one.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
         component_id: component of the vehicle that the bridge is.

@@ -116,7 +116,7 @@ class AutopilotClock:
             now_ns: local time of arrival.
 
         Returns:
-            False where the offset jumped against earlier responses: the autopilot has rebooted.
+            False if the offset jumped against earlier responses: the autopilot has rebooted.
         """
         if stamp_ns not in self._requests:
             return True
@@ -133,7 +133,7 @@ class AutopilotClock:
         return True
 
     def local_ns(self, remote_ns: int, arrival_ns: int) -> int | None:
-        """Local time of a remote stamp, never after its arrival; None where it is a second old or more."""
+        """Local time of a remote stamp, never after its arrival; None if it is a second old or more."""
         self._by_arrival.append(remote_ns - arrival_ns)
         offset_ns = self.offset_ns
         assert offset_ns is not None  # one was just added
@@ -149,11 +149,11 @@ class MavlinkTelemetry:
         bridge_component: component of the vehicle that the bridge itself is.
 
     Attributes:
-        origin: NED origin of the autopilot; None where it has reported none.
+        origin: NED origin of the autopilot; None if it has reported none.
         firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
         armed: whether its motors are armed.
-        has_receiver: whether a GNSS receiver is connected to it; None where it has not said.
-        uptime_ms: how long it has run; None where it has not said.
+        has_receiver: whether a GNSS receiver is connected to it; None if it has not said.
+        uptime_ms: how long it has run; None if it has not said.
         gnss: the last three-dimensional fix of that receiver; None before the first.
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
@@ -196,7 +196,7 @@ class MavlinkTelemetry:
             self._clock.add_request(now_ns)
 
     def unix_ns(self, time_ns: int) -> int:
-        """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, where it has none, this machine's."""
+        """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, if it has none, this machine's."""
         offset_ns = self._unix_offset_ns
         return time_ns + (time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns)
 
@@ -212,7 +212,7 @@ class MavlinkTelemetry:
             told = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
             velocity = told or (None, None, None)
             roll, pitch, heading = attitude or (None, None, None)
-            # By another camera's odometry, where there is one: it does not depend on the fixes.
+            # By another camera's odometry, if there is one: it does not depend on the fixes.
             east, north, up, _ = self._vision.at(time_ns) or (*velocity, 0.0)
             *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 is not stated: nothing to interpolate
             return VehicleState(

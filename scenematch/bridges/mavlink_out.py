@@ -97,8 +97,8 @@ class FixReport:
         captured_ns: capture time of its frame on ``time.monotonic_ns``.
         age_ms: time since capture.
         vehicle: vehicle state at capture.
-        origin: origin of the autopilot's NED frame; None where it has none.
-        velocity: velocity from the last fixes; None where they do not give one.
+        origin: origin of the autopilot's NED frame; None if it has none.
+        velocity: velocity from the last fixes; None if they do not give one.
         reset_counter: steps by one where the position was acquired afresh, modulo 256.
         unix_ns: capture time in nanoseconds since 1970.
     """
@@ -114,7 +114,7 @@ class FixReport:
 
 
 def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
-    """Reason for which a fix is not sent, or None where it is sent."""
+    """Reason for which a fix is not sent, or None if it is sent."""
     vehicle, fix = report.vehicle, report.fix
     numbers = (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel(), *(fix.attitude_sigma_deg or ()))
     if not all(map(math.isfinite, numbers)):

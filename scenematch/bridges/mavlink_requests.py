@@ -1,4 +1,4 @@
-"""What the bridge asks an autopilot for: its telemetry and its origin, and to take one where it has none."""
+"""What the bridge asks an autopilot for: its telemetry and its origin, and to take one if it has none."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def signing_time() -> int:
 
 
 class PacketEncoder:
-    """Encodes messages as packets, signed where there is a key.
+    """Encodes messages as packets, signed if there is a key.
 
     Args:
         system_id: MAVLink system id of the vehicle, of which the bridge is a component.
@@ -81,7 +81,7 @@ class PacketDecoder:
         system_id: MAVLink system id whose messages are kept.
         message_ids: ids of the messages that are kept.
         is_stream: whether a packet may continue in the next bytes.
-        key: 32-byte signing key; where given, packets that are not signed with it are dropped.
+        key: 32-byte signing key; if given, packets that are not signed with it are dropped.
 
     Attributes:
         dropped: number of malformed or wrongly signed packets so far.
@@ -135,7 +135,7 @@ class PacketDecoder:
         return min(found, default=len(self._buffer))
 
     def _size(self, at: int) -> int | None:
-        """Length in bytes of the packet that begins here; None where its header is incomplete."""
+        """Length in bytes of the packet that begins here; None if its header is incomplete."""
         if at + 3 > len(self._buffer):
             return None
         payload = self._buffer[at + 1]
@@ -154,7 +154,7 @@ class PacketDecoder:
         return number in self._message_ids and (from_vehicle or number == mavlink.MAVLINK_MSG_ID_COMMAND_LONG)
 
     def _decode(self, packet: bytes) -> Any:
-        """The message, or None where the packet is invalid or its type unknown."""
+        """The message, or None if the packet is invalid or its type unknown."""
         if packet[0] == V2 and packet[2] & ~_SIGNED:
             return None  # incompatibility flags that this decoder does not support
         try:

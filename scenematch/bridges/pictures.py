@@ -58,7 +58,7 @@ def replay(
         frames: folder of images, or video.
         telemetry: telemetry.csv or a log, whose stamps set the pace; None uses the subtitles beside a video, the
             EXIF of photographs, else ``rate_hz``.
-        rate_hz: images per second where there are no stamps.
+        rate_hz: images per second if there are no stamps.
         every: one image in so many is played, at its own time.
         wait: called when the first image has been read; the replay starts when it returns.
 

@@ -107,7 +107,7 @@ class RecentValues:
 
     @property
     def last_ns(self) -> int | None:
-        """Time of the newest sample; None where there is none."""
+        """Time of the newest sample; None if there is none."""
         return self._samples[-1][0] if self._samples else None
 
     def clear(self) -> None:

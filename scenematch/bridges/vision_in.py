@@ -23,7 +23,7 @@ _FAILED = -1  # quality
 def vision_velocity(
     message: Any, attitude_deg: tuple[float, ...] | None, bridge_component: int
 ) -> tuple[float, float, float, float] | None:
-    """East, north and up in m/s, and one standard deviation per axis, 0 where it is not stated.
+    """East, north and up in m/s, and one standard deviation per axis, 0 if it is not stated.
 
     Args:
         message: VISION_SPEED_ESTIMATE or ODOMETRY.
@@ -31,7 +31,7 @@ def vision_velocity(
         bridge_component: component of the vehicle that the bridge itself is.
 
     Returns:
-        None where the message has no such velocity: of another estimator than a camera's, the autopilot's or the
+        None if the message has no such velocity: of another estimator than a camera's, the autopilot's or the
         bridge's own, in another frame, failed, of an absurd size, or of an unbounded variance.
     """
     if not _is_by_camera(message, bridge_component) or has_failed(message, bridge_component):
@@ -73,7 +73,7 @@ def _is_by_camera(message: Any, bridge_component: int) -> bool:
 
 
 def _turn(frame: int, attitude_deg: tuple[float, ...] | None) -> Array | None:
-    """To east, north, up from the frame of a velocity; None where that is not known."""
+    """To east, north, up from the frame of a velocity; None if that is not known."""
     if frame in _OVER_GROUND:
         return _ENU_FROM_NED
     if frame not in _OF_BODY or attitude_deg is None:

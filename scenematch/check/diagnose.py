@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 LOOKED_AT = 16
 _SPEED_MPS = 5.0  # by which a position grows uncertain with the time to the next that is known
-_MAX_SIGMA_M = 300.0  # of a prior; beyond, the whole map is searched where it can be
+_MAX_SIGMA_M = 300.0  # of a prior; beyond, the whole map is searched if possible
 # Nanoseconds in the units that stamps are given in by mistake, and the intervals between pictures that are usual.
 _UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}
 _USUAL_NS = (5e6, 2e10)
@@ -55,8 +55,8 @@ def diagnose(
         picture: reads the picture of an index; some thirty are read.
         site: the map.
         camera: the calibration.
-        priors: positions that came with the pictures, by another source; None where they have none.
-        start: where the flight begins; None where that is not known.
+        priors: positions that came with the pictures, by another source; None if they have none.
+        start: where the flight begins; None if that is not known.
         reference: positions that the map is held against; None takes ``priors``.
 
     Returns:

@@ -20,7 +20,7 @@ class Finding:
             "attitude" where none of the changes explains what does not fit.
         text: a sentence with the figures.
         cure: the option to try, or what to look at.
-        value: of the error in the unit of the text; None where it has none.
+        value: of the error in the unit of the text; None if it has none.
         sigma: standard deviation of the value.
     """
 

@@ -154,7 +154,7 @@ def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
     """Whether the telemetry confirms the turn: to a false sighting and back, both legs would show one offset."""
     first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2].tolist()
     off_deg: float = wrap_difference_deg(leg.turn_deg - (last_deg - first_deg))
-    return abs(off_deg) < _TURN_OFF_DEG  # not where it is unknown
+    return abs(off_deg) < _TURN_OFF_DEG  # not if it is unknown
 
 
 def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple[Array, Array]:

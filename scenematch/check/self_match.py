@@ -191,7 +191,7 @@ def _sharpness(scores: Pictures, x: int, y: int) -> float:
 
 
 def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:
-    """The same ground (h, w) on another map, or None where that does not cover it."""
+    """The same ground (h, w) on another map, or None if that does not cover it."""
     (height, width), scale = plan.shape, 2.0**plan.level
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
     full = plan.site.full_from_level(corners + np.array([extent.x0, extent.y0]), plan.level)

@@ -46,7 +46,7 @@ class Heights:
         corner: x and y of the north-western corner.
         step: size of a pixel in x and y.
         crs: compound where the vertical datum is known.
-        datum: name of the vertical datum; None where it is unknown.
+        datum: name of the vertical datum; None if it is unknown.
     """
 
     heights_m: NDArray[np.float32]
@@ -125,7 +125,7 @@ def read_part(
 
 
 def _opened(file: str) -> Any:
-    """The dataset of a file of heights; None where it is not there."""
+    """The dataset of a file of heights; None if it is not there."""
     import rasterio
     from rasterio.errors import RasterioError
 

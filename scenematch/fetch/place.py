@@ -81,8 +81,8 @@ class Wanted:
         gsd_m_per_px: as coarse as the map may be; of a WMS its pixels.
         max_tiles: as many pieces as may be asked for.
         layer: of a service; None is the only one that there is.
-        crs: of a service; None is one that it offers, in metres where it can be.
-        image_format: of a service; None is PNG where it can be.
+        crs: of a service; None is one that it offers, in metres if possible.
+        image_format: of a service; None is PNG if possible.
     """
 
     place: Place

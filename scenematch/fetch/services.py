@@ -66,12 +66,12 @@ def with_query(url: str, values: Mapping[str, str], *, without: Sequence[str] = 
 
 
 def query_value(url: str, name: str) -> str | None:
-    """The value of a query parameter, by its name in any case; None where it is missing or empty."""
+    """The value of a query parameter, by its name in any case; None if it is missing or empty."""
     return next((value for key, value in parse_qsl(urlsplit(url).query) if key.lower() == name.lower()), None)
 
 
 def text_of(element: Xml.Element, tag: str) -> str:
-    """The text of a child in one line, empty where there is none."""
+    """The text of a child in one line, empty if there is none."""
     return " ".join((element.findtext(f"{{*}}{tag}") or "").split())
 
 

@@ -57,7 +57,7 @@ def advice(missing: str, header: Sequence[str]) -> str:
 
 
 def question(header: Sequence[str], names: Mapping[str, str], columns: Sequence[str]) -> str | None:
-    """The question about columns that nobody reads and that are likely to be ours; None where there are none.
+    """The question about columns that nobody reads and that are likely to be ours; None if there are none.
 
     Args:
         header: the file's columns.
@@ -78,7 +78,7 @@ def question(header: Sequence[str], names: Mapping[str, str], columns: Sequence[
 
 
 def likely(name: str) -> str | None:
-    """Our column that a column of the file is likely to be; None where none is, or its unit is another."""
+    """Our column that a column of the file is likely to be; None if none is, or its unit is another."""
     words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]
     found = "_".join(word for word in words if word not in _UNITS)
     ours = next((column for column, others in _LIKELY.items() if found in others), None)

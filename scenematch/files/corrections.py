@@ -38,7 +38,7 @@ class Corrections:
         offset_s: added to the telemetry's times, but not to the pictures'.
 
     Raises:
-        OptionError: a value is none that can be.
+        OptionError: a value is invalid.
     """
 
     angles: str = "degrees"
@@ -69,7 +69,7 @@ class Corrections:
 
     @classmethod
     def from_facts(cls, values: Any) -> Corrections:
-        """From :meth:`facts`; None is the defaults."""
+        """From :meth:`facts`; None uses the defaults."""
         return cls() if values is None else cls(**{**values, "columns": tuple(values.get("columns", ()))})
 
     @classmethod

@@ -49,7 +49,7 @@ class PoseRow(TrackRow):
 
     @property
     def angles_deg(self) -> tuple[float, float, float] | None:
-        """Roll, pitch and heading, or None where one is unknown."""
+        """Roll, pitch and heading, or None if one is unknown."""
         if self.roll_deg is None or self.pitch_deg is None or self.heading_deg is None:
             return None
         return self.roll_deg, self.pitch_deg, self.heading_deg

@@ -38,7 +38,7 @@ class FlightFrame:
         name: file name of the image, or its index in a video or bag.
         frame: the image with its telemetry.
         prior: the position in the telemetry with its sigma, or None.
-        telemetry: the whole row, or None where the flight has no telemetry.
+        telemetry: the whole row, or None if the flight has no telemetry.
     """
 
     name: str
@@ -53,8 +53,8 @@ class Flight:
 
     Attributes:
         source: source of the images.
-        rows: the telemetry, one row per frame; empty where there is none.
-        height_sources: where a log or photographs were read, the source of each row's height, or empty.
+        rows: the telemetry, one row per frame; empty if there is none.
+        height_sources: if a log or photographs were read, the source of each row's height, or empty.
         names: names of the frames, in order.
         unused: number of images without a row of telemetry.
         has_gimbal: whether the attitude is that of a gimbal, and says by itself where the camera looks.
@@ -138,10 +138,10 @@ def open_flight(
             None uses the bag's own telemetry, the .SRT beside a video, or the EXIF of photographs; without EXIF
             times the images come in natural order and without telemetry.
         camera: checked against the size of the first image.
-        clock: capture times of the frames, where the telemetry is a log.
-        image_topic: topic of a bag's images; None where there is only one.
+        clock: capture times of the frames, if the telemetry is a log.
+        image_topic: topic of a bag's images; None if there is only one.
         columns: what a telemetry.csv calls a column, by its name in :data:`scenematch.files.telemetry.COLUMNS`.
-        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
+        odometry_topic: another odometry that the velocity is taken from, if the telemetry is a bag.
 
     Returns:
         The flight; no image but the first has been read.
@@ -187,7 +187,7 @@ def _check_is_table(telemetry: Path) -> None:
 
 
 def subtitles_beside(frames: str | Path) -> Path | None:
-    """The .SRT of a video's name beside it, as DJI writes it; None where there is none."""
+    """The .SRT of a video's name beside it, as DJI writes it; None if there is none."""
     path = Path(frames)
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         return None
@@ -212,7 +212,7 @@ def write_flight_folder(
     """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
 
     Args:
-        directory: the folder, created where it does not exist.
+        directory: the folder, created if it does not exist.
         frames: file name (.jpg or .png) and stamped frame, consumed one at a time and before ``truth``.
         truth: the true states, in the order of time.
         camera: intrinsics and mount.

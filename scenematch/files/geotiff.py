@@ -30,7 +30,7 @@ def write_geotiff(
         corner of the top-left pixel; the offset of half a pixel is applied here.
 
     Args:
-        path: the file, overwritten where it exists.
+        path: the file, overwritten if it exists.
         array: (H, W) or (H, W, 3) of uint8, uint16, int16, float32 or float64.
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs_epsg: EPSG code of the CRS.

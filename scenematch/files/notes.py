@@ -27,10 +27,10 @@ class FrameNote:
         sigma_up_m: standard deviation of the height, where it was measured.
         roll_deg: of the whole pose, where that was measured; positive right side down.
         pitch_deg: the same; positive nose up.
-        roll_sigma_deg: standard deviation of the roll, where it is known, as of the next two.
+        roll_sigma_deg: standard deviation of the roll, if it is known, as of the next two.
         pitch_sigma_deg: of the pitch.
         heading_sigma_deg: of the heading.
-        protection_level_m: radius beyond which the vehicle is with a probability of 1e-4 at most; None where none
+        protection_level_m: radius beyond which the vehicle is with a probability of 1e-4 at most; None if none
             holds.
     """
 

@@ -49,7 +49,7 @@ class PhotoTags:
         exif: tags of the camera by number.
         gps: tags of the position by number.
         xmp: numbers of DJI's XMP by name.
-        dewarp: DJI's DewarpData: fx, fy, cx, cy, k1, k2, p1, p2, k3; empty where there is none.
+        dewarp: DJI's DewarpData: fx, fy, cx, cy, k1, k2, p1, p2, k3; empty if there is none.
         software: what wrote the file last.
     """
 
@@ -127,14 +127,14 @@ def photo_telemetry(paths: Sequence[Path]) -> tuple[list[TelemetryRow], list[str
     """Telemetry from photographs' EXIF and DJI's XMP.
 
     ==================================  =====================================================================
-    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC where there is no offset
+    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC if there is no offset
     GPSLatitude, GPSLongitude           the prior; GPSHPositioningError its sigma
     GPSAltitude                         alt_amsl_m
     GPSImgDirection                     heading_deg, where its reference is true north
     drone-dji:RelativeAltitude          height_agl_m, above the take-off point
     drone-dji:Gimbal*Degree             heading, roll and pitch of a body with the camera mounted nadir; three
                                         zeros are no gimbal
-    drone-dji:FlightYawDegree           heading_deg, where there are no gimbal angles
+    drone-dji:FlightYawDegree           heading_deg, if there are no gimbal angles
     ==================================  =====================================================================
 
     Args:

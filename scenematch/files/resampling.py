@@ -63,8 +63,8 @@ class FlightLog:
         series: time series by the column of telemetry.csv that they fill; none is empty.
         heights: height above ground in metres by source, see :data:`HEIGHT_SOURCES`; the rangefinder's is along
             the body's down axis.
-        captures_ns: (N,) times of camera triggers; empty where none were logged.
-        utc_ns: offset that converts the log's clock to UTC; None where it is unknown.
+        captures_ns: (N,) times of camera triggers; empty if none were logged.
+        utc_ns: offset that converts the log's clock to UTC; None if it is unknown.
         frame_numbers: numbers of a video's frames, the first is 1, over time; None but for a video's subtitles.
     """
 
@@ -134,7 +134,7 @@ def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True
         valid: (N,) or one boolean.
 
     Returns:
-        The series, or None where no sample is left.
+        The series, or None if no sample is left.
     """
     with np.errstate(invalid="ignore"):  # damaged files may hold signalling NaNs
         stamps, numbers = np.asarray(stamps_ns, np.int64), np.asarray(values, np.float64)
@@ -155,7 +155,7 @@ def make_position_series(
         valid: (N,) or one boolean.
 
     Returns:
-        ``lat_deg`` and ``lon_deg``; None where no sample is left.
+        ``lat_deg`` and ``lon_deg``; None if no sample is left.
     """
     lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
     in_range = (np.abs(lat) <= 90.0) & (np.abs(lon) <= 180.0) & ((lat != 0.0) | (lon != 0.0))
@@ -210,7 +210,7 @@ def telemetry_at(
 def rows_and_sources_at(
     log: FlightLog, stamps_ns: Sequence[int], names: Sequence[str]
 ) -> tuple[list[TelemetryRow], list[str]]:
-    """As :func:`telemetry_at`, with the source of each row's height; empty where it is unknown."""
+    """As :func:`telemetry_at`, with the source of each row's height; empty if it is unknown."""
     times_ns = np.asarray(stamps_ns, np.int64) + log.clock_shift_ns(int(stamps_ns[0]))
     start_ns, end_ns = log.span_ns
     if not ((times_ns >= start_ns - END_HOLD_NS) & (times_ns <= end_ns + END_HOLD_NS)).any():

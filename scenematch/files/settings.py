@@ -134,7 +134,7 @@ def options_from_mapping(
 
     Args:
         cls: dataclass of the options.
-        values: values of its fields as parsed from TOML; "none" is None where a field is optional.
+        values: values of its fields as parsed from TOML; "none" is None if a field is optional.
         within: dotted name of the enclosing table, for messages.
         given: fields that are no setting, or count more.
 
@@ -174,7 +174,7 @@ def _is_expressible(kind: Any) -> bool:
 
 
 def _plain(kind: Any) -> type | None:
-    """The scalar type of ``kind`` without "or None"; None where it is not a scalar."""
+    """The scalar type of ``kind`` without "or None"; None if it is not a scalar."""
     if isinstance(kind, types.UnionType):
         kinds = [part for part in typing.get_args(kind) if part is not type(None)]
         kind = kinds[0] if len(kinds) == 1 else None

@@ -45,7 +45,7 @@ class Stamps:
 
     Attributes:
         ns: in nanoseconds, one a row, strictly increasing.
-        remark: how they were read, where their column does not say it; None where it does.
+        remark: how they were read, where their column does not say it; None if it does.
     """
 
     ns: list[int]
@@ -96,7 +96,7 @@ def _dated(rows: Sequence[CsvRow], column: str, dates: Sequence[re.Match[str] | 
 
 
 def _utc_ns(date: re.Match[str]) -> int | None:
-    """Nanoseconds since 1970 of a date; None where there is no such date."""
+    """Nanoseconds since 1970 of a date; None if there is no such date."""
     year, month, day, hour, minute, second = (int(date[k]) for k in range(1, 7))
     if not (1 <= month <= 12 and hour < 24 and minute < 60 and second <= 60 and year >= 1970):
         return None

@@ -78,7 +78,7 @@ class CsvRow:
         return self.values[column]
 
     def integer(self, column: str) -> int | None:
-        """A 64-bit integer, or None where blank."""
+        """A 64-bit integer, or None if blank."""
         text = self.values[column]
         if not text:
             return None
@@ -94,7 +94,7 @@ class CsvRow:
         return value
 
     def number(self, column: str, bounds: Bounds = ANY) -> float | None:
-        """A finite number within ``bounds``, or None where blank."""
+        """A finite number within ``bounds``, or None if blank."""
         text = self.values[column]
         if not text:
             return None

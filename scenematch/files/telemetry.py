@@ -56,16 +56,16 @@ class TelemetryRow:
         timestamp_ns: capture time on the vehicle's clock.
         frame: file name of the image, or for a video the index of the frame from 0.
         height_agl_m: height above the ground.
-        height_sigma_m: standard deviation of it, where it is known.
+        height_sigma_m: standard deviation of it, if it is known.
         alt_amsl_m: height above mean sea level.
         heading_deg: clockwise from true north in [0, 360).
-        heading_sigma_deg: standard deviation of it, where it is known.
+        heading_sigma_deg: standard deviation of it, if it is known.
         roll_deg: positive right side down.
         pitch_deg: positive nose up.
-        tilt_sigma_deg: standard deviation of roll and of pitch, where it is known.
+        tilt_sigma_deg: standard deviation of roll and of pitch, if it is known.
         east_velocity_mps: velocity over ground.
         north_velocity_mps: velocity over ground.
-        velocity_sigma_mps: standard deviation of it, per axis, where it is known.
+        velocity_sigma_mps: standard deviation of it, per axis, if it is known.
         lat_deg: WGS84 latitude of a prior.
         lon_deg: WGS84 longitude of the prior.
         sigma_m: standard deviation of the prior, per axis.

@@ -15,7 +15,7 @@ _MAX_SPEED_MPS = 150.0
 
 
 def velocity_sigma_mps(velocity_mps: ArrayLike, variances_m2ps2: Sequence[float], *, turned: bool) -> float | None:
-    """One standard deviation per axis of a velocity, or 0 where it is not stated.
+    """One standard deviation per axis of a velocity, or 0 if it is not stated.
 
     Args:
         velocity_mps: (3,) along any axes.
@@ -23,7 +23,7 @@ def velocity_sigma_mps(velocity_mps: ArrayLike, variances_m2ps2: Sequence[float]
         turned: whether it is turned to east and north by the vehicle's heading, whose error adds to it.
 
     Returns:
-        None where the velocity does not count: not finite, of an absurd size, or of an unbounded variance.
+        None if the velocity does not count: not finite, of an absurd size, or of an unbounded variance.
     """
     speed_mps = float(np.linalg.norm(np.asarray(velocity_mps, np.float64)))
     # What is not finite compares as false.

@@ -32,12 +32,12 @@ def motion_consistency(
 
     Args:
         rows: the track.
-        telemetry: one row per row of the track, or None where it is not known.
+        telemetry: one row per row of the track, or None if it is not known.
         frame: origin of east and north.
 
     Returns:
         JSON values: ``steps`` (their number), ``interval_s`` (their median), ``median_m``, ``p95_m`` and
-        ``max_m``; None where no step has a velocity at all of its frames.
+        ``max_m``; None if no step has a velocity at all of its frames.
     """
     if not telemetry or [row.timestamp_ns for row in rows] != [row.timestamp_ns for row in telemetry]:
         return None
@@ -66,7 +66,7 @@ def motion_consistency(
 
 
 def _velocity(telemetry: Sequence[TelemetryRow]) -> tuple[Array, Array]:
-    """(N,) seconds from the first frame, and (N, 2) velocity, NaN where it is unknown."""
+    """(N,) seconds from the first frame, and (N, 2) velocity, NaN if it is unknown."""
     time_s = np.array([row.timestamp_ns - telemetry[0].timestamp_ns for row in telemetry], np.float64) / 1e9
     pairs = [(row.east_velocity_mps, row.north_velocity_mps) for row in telemetry]
     return time_s, np.array([(np.nan, np.nan) if None in pair else pair for pair in pairs], np.float64)

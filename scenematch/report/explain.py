@@ -152,7 +152,7 @@ def match_again(
         note: its note.
 
     Returns:
-        The window and the explanation, or None where the window is unknown or the frame cannot be matched.
+        The window and the explanation, or None if the window is unknown or the frame cannot be matched.
     """
     window = _window(row, note)
     if window is None:

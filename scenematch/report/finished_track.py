@@ -27,8 +27,8 @@ class FinishedTrack:
         site: the map.
         ground: level of the ground.
         summary: contents of summary.json, its settings included.
-        notes: one per row, or None where the run left none.
-        telemetry: of the flight, or None where it is not known any more.
+        notes: one per row, or None if the run left none.
+        telemetry: of the flight, or None if it is not known any more.
         loop: plan and estimate of a closed loop, or None.
     """
 

@@ -104,7 +104,7 @@ class LiveView:
             name: name of the frame.
             frame: the frame as it was matched.
             result: the fix or the refusal.
-            state: state of the navigator after it; None where the navigator is dead.
+            state: state of the navigator after it; None if the navigator is dead.
             latency_ms: latency of the answer.
         """
         stream = self._stream
@@ -241,7 +241,7 @@ def open_live_view(matcher: SceneMatcher, recording: Path | None, address: str |
 
     Args:
         matcher: matcher of the flight.
-        recording: a file ``.rrd``, replaced where it exists; None for none.
+        recording: a file ``.rrd``, replaced if it exists; None for none.
         address: HOST:PORT of a rerun viewer; None for none.
 
     Raises:

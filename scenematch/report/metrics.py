@@ -1,7 +1,7 @@
 """summary.json: availability, latency and, with truth, accuracy of a track.
 
 Convention:
-    An error is fix minus truth, in metres east and north. A frame is scored where it has a fix and truth is known
+    An error is fix minus truth, in metres east and north. A frame is scored if it has a fix and truth is known
     at its time; frames without truth are counted, not scored.
 """
 
@@ -35,7 +35,7 @@ class Ground:
 
     Attributes:
         ground_m: in the surface model's datum (0 for flat ground).
-        ground_amsl_m: the same level above mean sea level, or None where unknown.
+        ground_amsl_m: the same level above mean sea level, or None if unknown.
     """
 
     ground_m: float = 0.0
@@ -74,7 +74,7 @@ class TrackErrors:
 
     @property
     def beyond(self) -> NDArray[np.bool_]:
-        """(N,) whether the error exceeds three stated sigmas; False where either is unknown."""
+        """(N,) whether the error exceeds three stated sigmas; False if either is unknown."""
         return np.asarray(self.normalised_squared_errors > FALSE_SIGMAS**2, dtype=np.bool_)
 
 

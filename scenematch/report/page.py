@@ -27,7 +27,7 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
     """Write the page; equal inputs give equal bytes.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         track: the track.
         shown: frames of the slider with their images.
         why_not: reason why there are none.

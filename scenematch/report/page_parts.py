@@ -30,7 +30,7 @@ def fill_page(
     """Write a page; equal parts give equal bytes.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         heading: plain text.
         subheading: plain text.
         grade: of the verdict, a class of the style sheet.

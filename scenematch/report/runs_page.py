@@ -32,7 +32,7 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     """Write the page; equal inputs give equal bytes.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         tracks: by the names of their runs, all of them with the same map.
 
     Raises:

@@ -128,7 +128,7 @@ class Canvas:
 
         Returns:
             Slices of rows and columns, and offsets (h, w) of the pixels from the centre in u and in v, in metres;
-            None where the canvas cuts the window off.
+            None if the canvas cuts the window off.
         """
         x, y = np.rint(self.px(np.array([[u, v]]))[0]).astype(int)
         r = math.ceil(radius_m / self.gsd) + 1

@@ -65,7 +65,7 @@ class Condition:
 
     @property
     def air(self) -> Atmosphere | None:
-        """The air between camera and ground, None where it is perfectly clear."""
+        """The air between camera and ground, None if it is perfectly clear."""
         return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
 
     @property
@@ -150,7 +150,7 @@ def apply_season(
         albedo: (H, W, 3) drawn colours of summer.
         height_m: (H, W) of the highest surface.
         material: (H, W) indices of the materials of :mod:`scenematch.simulator.canvas`.
-        ground_m: (H, W) of the bare ground, None where it is flat at 0.
+        ground_m: (H, W) of the bare ground, None if it is flat at 0.
         condition: of the day.
         gsd_m_per_px: pixel in metres.
         rng: of the snow's patches and the bare branches.

@@ -210,7 +210,7 @@ def fuse_gps(state: FilterState, sample: GpsSample, suite: SensorSuite) -> Filte
 
 
 def fuse_fix(state: FilterState, fix: Fix) -> FilterState:
-    """Fuse a fix of the engine with its covariance, and its height where it has one.
+    """Fuse a fix of the engine with its covariance, and its height if it has one.
 
     Args:
         state: at the capture of the frame, about the same origin and in the same datum of heights.

@@ -145,7 +145,7 @@ class LoopAnswer:
         timestamp_ns: of its capture.
         truth: the vehicle's true state then.
         result: of the engine.
-        state: the navigator's after it; None where the engine was killed.
+        state: the navigator's after it; None if the engine was killed.
         arrives_s: when the vehicle receives the answer.
     """
 

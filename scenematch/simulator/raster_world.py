@@ -41,7 +41,7 @@ def world_from_map(
 ) -> Town:
     """A world of the user's rasters, flown over as a built town is; its map is the rasters themselves.
 
-    Colours are those of the file where it has three uint8 bands on a north-up metric grid, else grey. Walls, which
+    Colours are those of the file if it has three uint8 bands on a north-up metric grid, else grey. Walls, which
     no orthophoto shows, have the darkened colour of the roof.
 
     Args:

@@ -46,7 +46,7 @@ def raise_by_ground(canvas: Canvas, ground_m: Float32, river: Image | None) -> F
     Args:
         canvas: its heights are raised.
         ground_m: (H, W) of the hills.
-        river: (H, W) uint8, above 0 in its water; None where there is none.
+        river: (H, W) uint8, above 0 in its water; None if there is none.
 
     Returns:
         (H, W) float32 heights of the ground, levelled under houses and ponds.

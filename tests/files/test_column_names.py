@@ -98,7 +98,7 @@ def test_the_settings_name_them(tmp_path):
     ("line", "words"),
     [
         ('altitude = "alt"', "telemetry_columns: expected one of timestamp_ns, "),
-        ('frame = " "', "telemetry_columns.frame: expected the name of a column, got a blank one"),
+        ('frame = " "', "telemetry_columns.frame: expected the name of a column, got an empty one"),
         ("frame = 3", "telemetry_columns.frame: expected a quoted string, got 3"),
     ],
 )

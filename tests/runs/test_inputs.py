@@ -331,7 +331,7 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
     write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
     arguments = ["locate", str(photos / "0.jpg"), "--map", str(path), "--camera", str(calibration)]
     assert run(arguments) == 1
-    assert "made smaller or larger as a whole, add --settings input.scale_calibration" in capsys.readouterr().err
+    assert "resized without cropping, add --settings input.scale_calibration" in capsys.readouterr().err
 
 
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
@@ -343,7 +343,9 @@ def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
         load(files)
     unscaled = FlightFiles(map="m.tif", frames=photos, camera=calibration)
     flight = unscaled.open_flight()
-    with pytest.raises(CalibrationError, match="320 x 240; their shapes differ: give the calibration of these"):
+    with pytest.raises(
+        CalibrationError, match="320 x 240; their aspect ratios differ: give the calibration of these"
+    ):
         check_pictures(flight, unscaled.load_camera(flight))
 
 

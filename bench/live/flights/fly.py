@@ -1,6 +1,6 @@
 """``python -m bench.live.flights.fly FOLDER [--method auto|ncc] [--message NAME] [--town SEED]``: fly, and score.
 
-FOLDER is made where it is missing: a drawn town with the paper's flight over it. The bridge is a process of its
+FOLDER is made if it is missing: a drawn town with the paper's flight over it. The bridge is a process of its
 own with ``--supervise``; what goes wrong and when stands in :mod:`bench.live.flights.faults`. The stand-in has no
 estimator: the figures are of the fixes and not of an EKF. It prints the tables of ``docs/results/vehicle.md``.
 """

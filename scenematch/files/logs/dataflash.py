@@ -138,7 +138,7 @@ class _Format:
 
 
 def _parse_format(body: bytes) -> _Format | None:
-    """The format that a FMT message defines, or None where it is inconsistent."""
+    """The format that a FMT message defines, or None if it is inconsistent."""
     _, length, *texts = struct.unpack("<BB4s16s64s", body)
     name, kinds, columns = (text.split(b"\0")[0].decode("ascii", "replace") for text in texts)
     defined = _Format(name, length, kinds, tuple(columns.split(",")) if columns else ())

@@ -65,7 +65,7 @@ def read_srt(path: Path) -> FlightLog:
 
 
 def _frame_numbers(stamps_ns: list[int], counts: list[float | None]) -> TimeSeries | None:
-    """Number of the video's frame at each cue, from 1; None where cues do not tell."""
+    """Number of the video's frame at each cue, from 1; None if cues do not tell."""
     if all(count is not None for count in counts) and len(counts) > 1:
         known = [count for count in counts if count is not None]
         if all(a < b for a, b in itertools.pairwise(known)):

@@ -159,7 +159,7 @@ def _stamps_by_number(source: FrameSource, log: FlightLog, numbers: TimeSeries) 
 
 
 def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
-    """Read truth from truth.csv, or from the positions of a log; from a bag's ``/truth`` topics where it has them.
+    """Read truth from truth.csv, or from the positions of a log; from a bag's ``/truth`` topics if it has them.
 
     Args:
         path: truth.csv, a log, or a folder of photographs whose EXIF has positions.

@@ -55,7 +55,7 @@ _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FLOAT, _CALIBRATION = ("std_msgs/msg/Float64",), ("sensor_msgs/msg/CameraInfo",)
 
 Sample = tuple[int, tuple[float | None, ...]]
-"""Stamp in nanoseconds, and values; None where one is unknown."""
+"""Stamp in nanoseconds, and values; None if one is unknown."""
 
 
 def is_bag(path: str | Path) -> bool:
@@ -71,7 +71,7 @@ class BagFrames(FrameSource):
 
     Args:
         path: the bag.
-        topic: topic of the images; None where there is only one.
+        topic: topic of the images; None if there is only one.
 
     Raises:
         TelemetryError: the bag cannot be read, has no images, or has several image topics and none was given.
@@ -84,7 +84,7 @@ class BagFrames(FrameSource):
             stamps_ns = [time_ns for _, time_ns, _ in _messages(path, reader, {self.topic}, _IMAGES)]
         if not stamps_ns:
             raise TelemetryError(f"{path}: expected pictures on {self.topic}, got none")
-        # Simulators publish a picture again where there is no new one yet.
+        # Simulators publish a picture again if there is no new one yet.
         fresh = [k for k in range(len(stamps_ns)) if k == 0 or stamps_ns[k] != stamps_ns[k - 1]]
         self.names, self._stamps_ns = [str(index) for index in fresh], [stamps_ns[index] for index in fresh]
         self._reset()
@@ -147,7 +147,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
 
     Args:
         path: the bag.
-        topic: topic of the images; None where there is only one.
+        topic: topic of the images; None if there is only one.
 
     Raises:
         TelemetryError: the bag cannot be read, or has no calibration.
@@ -181,7 +181,7 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
 
     Args:
         path: the bag.
-        truth: whether the ``/truth`` topics replace these, where the bag has them.
+        truth: whether the ``/truth`` topics replace these, if the bag has them.
         odometry_topic: of another camera's odometry, whose velocity and its accuracy are used: nav_msgs/Odometry,
             geometry_msgs/TwistWithCovarianceStamped or TwistStamped.
 
@@ -234,7 +234,7 @@ _TAKEN: dict[str, tuple[tuple[str, ...], Callable[[Any], tuple[float | None, ...
     "place": (("sensor_msgs/msg/NavSatFix",), position_from_message),
     "odometry": (tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
 }
-"""Message types of each quantity, and the function that extracts its values; None where a message has none."""
+"""Message types of each quantity, and the function that extracts its values; None if a message has none."""
 _SUFFIXES = {
     "imu": ("/imu/data", ""),
     "compass": ("/compass_hdg",),

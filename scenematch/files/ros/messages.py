@@ -146,7 +146,7 @@ def camera_from_message(message: Any) -> Camera:
 
 
 def attitude_from_message(message: Any) -> tuple[float, float, float] | None:
-    """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None where it has no orientation."""
+    """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None if it has no orientation."""
     rotation = _rotation(message.orientation)
     if message.orientation_covariance[0] == _NOT_STATED or rotation is None:
         return None
@@ -163,8 +163,8 @@ def body_velocity_from_message(message: Any) -> tuple[float, float, float, float
             Or geometry_msgs/TwistWithCovarianceStamped or TwistStamped, along the axes of ``header.frame_id``.
 
     Returns:
-        None where the message has no velocity that counts, by
-        :func:`scenematch.files.velocities.velocity_sigma_mps`, or no orientation where one is needed. The standard
+        None if the message has no velocity that counts, by
+        :func:`scenematch.files.velocities.velocity_sigma_mps`, or no orientation if one is needed. The standard
         deviation is per axis, and 0 where the covariance is not stated: zeros, -1, not finite, or none at all.
 
     Raises:
@@ -221,7 +221,7 @@ def _rotation(q: Any) -> Array | None:
 def range_from_message(message: Any) -> float | None:
     """Distance in metres along the beam of a sensor_msgs/Range; None outside the range that it states.
 
-    None also where it states that of any sensor: beyond its reach, a sonar then reports its largest distance.
+    None also if it states that of any sensor: beyond its reach, a sonar then reports its largest distance.
     """
     range_m = float(message.range)
     if (message.min_range, message.max_range) == _ANY_SENSOR_M:
@@ -230,7 +230,7 @@ def range_from_message(message: Any) -> float | None:
 
 
 def position_from_message(message: Any) -> tuple[float, float, float | None] | None:
-    """Latitude and longitude in degrees and sigma in metres of a sensor_msgs/NavSatFix; None where unknown."""
+    """Latitude and longitude in degrees and sigma in metres of a sensor_msgs/NavSatFix; None if unknown."""
     lat_deg, lon_deg = float(message.latitude), float(message.longitude)
     if message.status.status == NO_POSITION or not (math.isfinite(lat_deg) and math.isfinite(lon_deg)):
         return None
