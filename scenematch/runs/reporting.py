@@ -31,8 +31,7 @@ def report(
     Args:
         folders: one run, whose page is rewritten, or several, drawn on the first one's map.
         out: the page on several runs; None is ``comparison.html`` in the working directory.
-        force: whether that may already exist; of one run, whether its page may lose frames that are not there
-            any more.
+        force: allow that file to exist; for one run, allow its page to lose frames that no longer exist.
         progress: receives progress and messages.
 
     Returns:

@@ -343,9 +343,7 @@ def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
         load(files)
     unscaled = FlightFiles(map="m.tif", frames=photos, camera=calibration)
     flight = unscaled.open_flight()
-    with pytest.raises(
-        CalibrationError, match="320 x 240; their aspect ratios differ: give the calibration of these"
-    ):
+    with pytest.raises(CalibrationError, match="320 x 240; their aspect ratios differ: give the calibration of"):
         check_pictures(flight, unscaled.load_camera(flight))
 
 
