@@ -240,7 +240,7 @@ def open_run_truth(path: Path, stamp_ns: int | None, progress: Progress = SILENT
     truth = open_truth(path, stamp_ns)
     if is_photographs(path):
         progress.message(
-            f"truth: {len(truth)} positions from the photographs' EXIF, by their receiver: errors include its own, "
+            f"truth: {len(truth)} positions from the photographs' EXIF, by a receiver: errors include its own, "
             "of metres"
         )
     return truth
