@@ -76,7 +76,7 @@ def regressors(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Array:
 
 
 WEIGHTS = np.array([-16.41, 1.7, 1.89, 1.04])
-"""Weights of the logistic rule (constant, texture, score, lead), fitted by ``python -m bench.accuracy.audit --fit``."""
+"""Logistic weights (constant, texture, score, lead), fitted by ``python -m bench.accuracy.audit --fit``."""
 
 
 # ---------------------------------------------------------------------------------------------------- audits

@@ -38,9 +38,7 @@ def capabilities(url: str, timeout_s: float) -> Xml.Element:
         with error:
             raise MapError(f"{shown(asked)}: the server answers {error.code} {error.reason}") from None
     except (URLError, OSError, HTTPException, ValueError) as error:
-        raise MapError(
-            f"{shown(asked)}: cannot reach it: {shown(str(getattr(error, 'reason', error)))}"
-        ) from None
+        raise MapError(f"{shown(asked)}: cannot reach it: {shown(str(getattr(error, 'reason', error)))}") from None
     except Xml.ParseError:
         root = None
     if root is None or root.tag.rpartition("}")[2] not in _ROOTS:

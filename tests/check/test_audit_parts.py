@@ -147,7 +147,7 @@ def test_a_part_of_nothing_is_refused(options, words):
 
 
 def test_a_part_beside_the_map_is_refused(site):
-    with pytest.raises(OptionError, match="part: expected one on the map arrays, got one beside it"):
+    with pytest.raises(OptionError, match="part: expected one on the map arrays, got one off it"):
         plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [-5000, 100], 100.0)))
 
 
