@@ -1,4 +1,4 @@
-"""Writer of GeoTIFF files from an array and its affine transform."""
+"""Write GeoTIFF files from an array and its affine transform."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_geotiff(
         tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG`.
 
     Raises:
-        ShapeError: an argument has another shape.
+        ShapeError: an argument has the wrong shape.
         DtypeError: the element type is not one of those above.
         OptionError: the affine transform is not finite, or is singular.
         MapError: the EPSG code is unknown, or the file cannot be written.

@@ -1,8 +1,8 @@
 """Bags of ROS 1 and ROS 2 (sqlite3, mcap): the images, telemetry and calibration of a flight.
 
 Convention:
-    Stamps are those of the headers, of capture. A message without a header (std_msgs/Float64), or with a zero
-    stamp, has the time of its recording. Frames are named by their index from 0, as those of a video.
+    Timestamps are capture times from the headers. A message without a header (std_msgs/Float64) or with a zero
+    stamp gets its recording time. Frames are named by their index from 0, like those of a video.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ from scenematch.files.ros.messages import (
 )
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-"""Suffixes of bag files, in lower or upper case; a folder is a bag where it contains metadata.yaml."""
+"""Suffixes of bag files, in lower or upper case; a folder is a bag if it contains metadata.yaml."""
 IMAGE, CAMERA_INFO = "/camera/image_raw", "/camera/camera_info"
 IMU, COMPASS = "/mavros/imu/data", "/mavros/global_position/compass_hdg"
 HEIGHT, RANGE = "/mavros/global_position/rel_alt", "/mavros/rangefinder/rangefinder"
 VELOCITY, POSITION = "/mavros/local_position/velocity_local", "/mavros/global_position/global"
 TRUTH, TRUTH_ATTITUDE = "/truth/fix", "/truth/imu"
 TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
-"""Topics that are written, and preferred where a bag has several of a type."""
+"""Topics to write, preferred if a bag has several of a type."""
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FLOAT, _CALIBRATION = ("std_msgs/msg/Float64",), ("sensor_msgs/msg/CameraInfo",)
@@ -67,7 +67,7 @@ def is_bag(path: str | Path) -> bool:
 class BagFrames(FrameSource):
     """The images of one topic of a bag, read forward; going back restarts at the first.
 
-    Of pictures with the same stamp the first counts; names are indices among all of the topic.
+    Of pictures with the same timestamp the first counts; names are indices among all pictures of the topic.
 
     Args:
         path: the bag.
@@ -182,7 +182,7 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     Args:
         path: the bag.
         truth: whether the ``/truth`` topics replace these, if the bag has them.
-        odometry_topic: of another camera's odometry, whose velocity and its accuracy are used: nav_msgs/Odometry,
+        odometry_topic: another camera's odometry, used for velocity and its accuracy: nav_msgs/Odometry,
             geometry_msgs/TwistWithCovarianceStamped or TwistStamped.
 
     Raises:
@@ -262,7 +262,7 @@ def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
 def _odometry_series(
     path: Path, topic: str, samples: list[Sample], series: Mapping[str, TimeSeries | None]
 ) -> dict[str, TimeSeries | None]:
-    """East and north velocity and its accuracy: what is along the body, turned by the attitude at that time."""
+    """East and north velocity and its accuracy: the body velocity rotated by the attitude at that time."""
     stamps_ns = np.array([time_ns for time_ns, _ in samples], np.int64)
 
     def angle_deg(name: str) -> Floats:
@@ -270,7 +270,7 @@ def _odometry_series(
         unknown = np.full(len(stamps_ns), np.nan)
         return unknown if found is None else interpolate(found, stamps_ns, is_angle=name != "pitch_deg")
 
-    # Without roll and pitch the vehicle counts as level, as a picture's does.
+    # Without roll and pitch the vehicle counts as level, as for pictures.
     roll_deg, pitch_deg = np.nan_to_num(angle_deg("roll_deg")), np.nan_to_num(angle_deg("pitch_deg"))
     attitudes = zip(roll_deg, pitch_deg, angle_deg("heading_deg"), strict=True)
     along_body = np.array([values for _, values in samples], np.float64).reshape(-1, 4)
@@ -287,7 +287,7 @@ def _odometry_series(
 
 
 def _is_same_mavros(imu: str | None, compass: str | None) -> bool:
-    """Whether both topics are of one MAVROS, whose Imu has the same heading, with the time of its measurement."""
+    """Whether both topics are from one MAVROS; its Imu has the same heading, with the time of measurement."""
     ends = "/imu/data", "/global_position/compass_hdg"
     if imu is None or compass is None or not (imu.endswith(ends[0]) and compass.endswith(ends[1])):
         return False
