@@ -27,8 +27,8 @@ from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
 COMPASS_SIGMA_DEG = 3.0
 """Standard deviation of a heading by a drone's compass."""
 GIMBAL_SIGMA_DEG = 2.0
-"""Standard deviation of a gimbal's roll and pitch: in a survey with constant 0.0 and -89.9, poses by SIFT differ by
-up to 3 degrees, 1.5 RMS."""
+"""Standard deviation of a gimbal's roll and pitch: in a survey with constant 0.0 and -89.9, poses by SIFT differ
+by up to 3 degrees, 1.5 RMS."""
 _VIEWERS = ("Photo Viewer", "Photo Gallery", "Picasa")
 """Parts of names of programs that rotate photographs without updating their metadata."""
 _SOFTWARE = 0x0131

@@ -122,7 +122,7 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
         for part in path:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
-                raise OptionError(f"{name}: expected a setting inside a table, but {part} is a setting itself")
+                raise OptionError(f"{name}: expected a setting inside a table, but {part} is a setting")
         table[last] = NONE if value is None else value
     return out
 

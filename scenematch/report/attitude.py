@@ -1,4 +1,4 @@
-"""Check of the telemetry's attitude against that of the fixes: its time lag and its offset."""
+"""Check the telemetry's attitude against the fixes': time lag and offset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAX_LAG_S = 0.5  # of the search
 _LAG_STEP_S = 0.01
 _MIN_FRAMES = 20
 _MIN_MOTION_DEG = 0.7  # standard deviation of roll or pitch below which no lag can be estimated
-_MAX_INTERVAL_S = 0.25  # between frames; with longer ones the attitude in between is unknown
+_MAX_INTERVAL_S = 0.25  # between frames; over longer intervals the attitude is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,8 @@ class AttitudeCheck:
 
     Attributes:
         frames: number of frames compared.
-        lag_ms: age of the telemetry's attitude at the capture of its frame; None if the flight is too calm or
-            its frames are too far apart.
+        lag_ms: age of the telemetry's attitude at the capture of its frame; None if the flight is too calm or its
+            frames are too far apart.
         roll_offset_deg: median of telemetry minus fix at that lag.
         pitch_offset_deg: the same for pitch.
     """

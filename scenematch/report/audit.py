@@ -1,4 +1,4 @@
-"""The figure of a map audit: the map, the probability of a fix at each position, and the causes of low ones."""
+"""Draw a map audit: the map, the probability of a fix at each position, and the causes of low ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A finished track with all that its report is drawn from."""
+"""A finished track with all inputs of its report."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FinishedTrack:
         ground: level of the ground.
         summary: contents of summary.json, its settings included.
         notes: one per row, or None if the run left none.
-        telemetry: of the flight, or None if it is not known any more.
+        telemetry: of the flight, or None if no longer known.
         loop: plan and estimate of a closed loop, or None.
     """
 

@@ -226,7 +226,7 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     if files.every > 1:
         progress.message(f"using one frame in {files.every}, {len(flight)} in all")
     if flight.unused:
-        progress.message(f"frames left out for want of a row in the telemetry: {flight.unused}")
+        progress.message(f"frames left out because the telemetry has no row: {flight.unused}")
     for remark in flight.remarks:
         progress.message(remark)
     if flight.heights:

@@ -213,7 +213,7 @@ def test_a_huge_map_is_audited_along_a_route(huge_path, route_file, tmp_path, ca
     [
         (
             [],
-            "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is not",
+            "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is too",
         ),
         (["--around=40.6,-97.7"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got '40.6,-97.7'"),
         (["--around=north"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got 'north'"),

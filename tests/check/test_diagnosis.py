@@ -172,7 +172,7 @@ def test_a_clock_that_is_off_is_named(shift_s):
 
 @pytest.mark.parametrize(
     ("velocity", "word"),
-    [(VELOCITY[:, ::-1], "place"), (-VELOCITY, "sign"), (3.6 * VELOCITY, "km/h"), (VELOCITY / 0.5144, "knots"),
+    [(VELOCITY[:, ::-1], "swapped"), (-VELOCITY, "sign"), (3.6 * VELOCITY, "km/h"), (VELOCITY / 0.5144, "knots"),
      (VELOCITY / 1.7, "times as far")],
 )  # fmt: skip
 def test_a_velocity_that_is_wrong_is_named(velocity, word):

@@ -125,7 +125,7 @@ def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     assert progress.updates["auto, engine profile"] == counted
     assert progress.updates["checking pictures"] == counted
     assert progress.finished[-1] == "auto, engine profile"
-    assert progress.messages == ["frames without a row in the telemetry, left out: 1"]
+    assert progress.messages == ["frames left out because the telemetry has no row: 1"]
 
 
 def test_a_task_that_is_interrupted_is_finished():
