@@ -17,7 +17,7 @@ class Finding:
     Attributes:
         cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "mount",
             "height", "height_feet", "focal", "clock", "velocity", "stamps", "frozen", "mirrored", "map"; or
-            "attitude" where none of the changes explains what does not fit.
+            "attitude" if none of the changes explains the disagreement.
         text: a sentence with the figures.
         cure: the option to try, or what to look at.
         value: size of the error in the unit of the text; None if it has none.

@@ -101,6 +101,6 @@ def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
         listed = ", ".join(codes[:20]) + (f" and {len(codes) - 20} more" if len(codes) > 20 else "")
         raise OptionError(
             f"crs: expected one for {place.lat_deg:g},{place.lon_deg:g} that PROJ knows, got {listed}; "
-            "one of them is used if it is asked for"
+            "name one of them to use it"
         )
     return chosen

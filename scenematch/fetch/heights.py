@@ -45,7 +45,7 @@ class Heights:
         heights_m: (H, W) float32, NaN where unknown.
         corner: x and y of the north-western corner.
         step: size of a pixel in x and y.
-        crs: compound where the vertical datum is known.
+        crs: compound if the vertical datum is known.
         datum: name of the vertical datum; None if it is unknown.
     """
 

@@ -171,7 +171,7 @@ class _Drawer:
     errors: TrackErrors
 
     def images(self, index: int, item: FlightFrame, row: TrackRow, note: FrameNote) -> list[SliderImage]:
-        """The frame, its rectified form, the window, and the score surface or the matches, where they exist."""
+        """The frame, its rectified form, the window, and the score surface or the matches, if they exist."""
         image = item.frame.image
         assert isinstance(image, np.ndarray)  # read from a file
         frame = _slider_image(image, "the frame as it was taken", f"Frame {item.name} as the camera took it.")

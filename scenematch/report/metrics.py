@@ -44,7 +44,7 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class TrackErrors:
-    """Errors of each row of a track; NaN where a row is not scored.
+    """Errors of each row of a track; NaN if a row is not scored.
 
     Attributes:
         truth_en_m: (N, 2) true position; NaN where unknown.

@@ -99,7 +99,7 @@ def fly_closed_loop(
         world: what to fly over; None is the first town.
         loop: settings of the loop; None uses the defaults.
         force: whether the folder may already exist.
-        live_view: where the live view goes.
+        live_view: where to send the live view.
         progress: receives progress and messages.
 
     Returns:

@@ -191,7 +191,7 @@ def _write(out: Path, audit: Audit, route: RouteAvailability | None, title: str)
 
 
 def _cells_to_crs(audit: Audit) -> tuple[NDArray[np.float64], int]:
-    """(2, 3) from cells to the map's CRS, and its EPSG code; WGS84 where the map's CRS has no code."""
+    """(2, 3) from cells to the map's CRS, and its EPSG code; WGS84 if the map's CRS has no code."""
     from pyproj import Transformer
 
     plan = audit.plan

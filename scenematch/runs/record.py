@@ -56,7 +56,7 @@ class RunRecord:
         origin: ``lat_deg`` and ``lon_deg`` of the plane of the track.
         ground_m: height of the ground on the map.
         ground_amsl_m: the same above the sea, by the telemetry.
-        surface_datum: vertical system of the heights, where the surface is above the sea by its file.
+        surface_datum: vertical system of the heights, if the file states heights above the sea.
         attitude: check of the telemetry's attitude against the fixes.
         diagnosis: errors found in the inputs if few frames were fixed, sentences by cause.
         more: other contents of the file, by name.

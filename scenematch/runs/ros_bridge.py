@@ -85,7 +85,7 @@ def run_ros_bridge(
         ros: what to subscribe to and publish.
         settings: how frames are matched; None uses the defaults.
         node: the ROS node; None creates one.
-        live_view: where the live view goes.
+        live_view: where to send the live view.
         progress: receives progress and messages.
 
     Returns:

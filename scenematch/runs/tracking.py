@@ -61,7 +61,7 @@ def track(
         force: whether the folder may already exist.
         report: whether to draw the page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
         diagnosis: whether to check the inputs if few frames were fixed.
-        live_view: where the live view goes.
+        live_view: where to send the live view.
         inputs: the inputs, if :func:`scenematch.runs.inputs.open_inputs` has already read them.
         progress: receives progress and messages.
 

@@ -538,7 +538,7 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
     log, table = str(flown / "flight.BIN"), str(flown / "telemetry.csv")
     assert follow("log", "--telemetry", log, "--truth", log) == 0
     stated = capfd.readouterr()
-    assert "height above ground, by source, of 3 frames: take-off 3" in stated.err
+    assert "height above ground of 3 frames, by source: take-off 3" in stated.err
     summary = json.loads(stated.out)
     assert summary["fixes"] == summary["scored_fixes"] == 3
     assert summary["settings"]["heights"] == {"take-off": 3}

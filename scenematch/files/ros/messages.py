@@ -51,7 +51,7 @@ NO_POSITION = -1
 
 
 def stamp_ns(message: Any) -> int:
-    """The stamp of the header in nanoseconds; 0 where it is not set."""
+    """The stamp of the header in nanoseconds; 0 if not set."""
     stamp = message.header.stamp
     seconds = stamp.secs if hasattr(stamp, "secs") else stamp.sec
     nanoseconds = stamp.nsecs if hasattr(stamp, "nsecs") else stamp.nanosec
