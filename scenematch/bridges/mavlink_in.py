@@ -154,8 +154,8 @@ class MavlinkTelemetry:
         origin: NED origin of the autopilot; None if it has reported none.
         firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
         armed: whether its motors are armed.
-        has_receiver: whether a GNSS receiver is connected to it; None if it has not said.
-        uptime_ms: how long it has run; None if it has not said.
+        has_receiver: whether a GNSS receiver is connected to it; None if not reported.
+        uptime_ms: how long it has run; None if not reported.
         gnss: the last three-dimensional fix of that receiver; None before the first.
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """

@@ -78,8 +78,8 @@ class PacketDecoder:
     """Extracts the messages of one autopilot, and the velocities of its companion computers, from bytes.
 
     Args:
-        system_id: MAVLink system id whose messages are kept.
-        message_ids: ids of the messages that are kept.
+        system_id: MAVLink system id of the messages to keep.
+        message_ids: ids of the messages to keep.
         is_stream: whether a packet may continue in the next bytes.
         key: 32-byte signing key; if given, other packets are dropped.
 

@@ -109,7 +109,7 @@ def argument_of(text: str) -> str | None:
     """The argument that an error is about, as it was typed: by its name, or by the file or folder that it holds.
 
     Args:
-        text: message of the error; what stands before its first colon and space is the subject.
+        text: message of the error; the part before its first colon and space is the subject.
 
     Returns:
         The option or positional argument, several joined by ", "; None if no argument is at fault.

@@ -64,7 +64,7 @@ MountOption = Annotated[
     typer.Option(
         "--mount",
         metavar="NAME",
-        help="forward-45, or by where the top of the picture points: nadir, nadir-right, nadir-tail, nadir-left.",
+        help="nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
         rich_help_panel=INPUT,
     ),
 ]

@@ -60,8 +60,8 @@ def files_for(template: str, bounds_deg: Bounds) -> list[str]:
     """The files or URLs of a source of heights for an area.
 
     Args:
-        template: one file or URL, or many with ``{lat}`` and ``{lon}`` in place of the degrees of their
-            south-western corner, as N48 and E016.
+        template: one file or URL, or many, with ``{lat}`` and ``{lon}`` for the degrees of their south-western
+            corner, such as N48 and E016.
         bounds_deg: west, south, east, north.
 
     Raises:

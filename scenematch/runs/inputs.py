@@ -178,7 +178,7 @@ class FlightFiles:
         return flight.every(self.every)
 
     def find_truth(self) -> Path | None:
-        """The truth that was named, else ``truth.csv`` beside the telemetry if there is one."""
+        """The given truth, else ``truth.csv`` beside the telemetry if it exists."""
         if self.truth is not None or self.telemetry is None:
             return self.truth
         beside = self.telemetry.with_name(FOLDER_LAYOUT["truth"])

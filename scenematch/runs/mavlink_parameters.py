@@ -52,7 +52,7 @@ def write_parameter_file(
         force: whether the file may already exist.
 
     Returns:
-        The delay that was written, and where it came from.
+        The delay written, and its source.
     """
     require("pymavlink", "mavlink")
     out, outgoing, settings = Path(out), link.outgoing(), settings or ParameterSettings()

@@ -28,7 +28,7 @@ from scenematch.runs.record import RunRecord
 
 TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"
 LOOP = "loop.csv"
-"""Of a closed loop, beside its track."""
+"""File of a closed loop, besides its track."""
 OWNED = (TRACK, SUMMARY, NOTES, PAGE)
 """The files of an output folder."""
 

@@ -115,7 +115,9 @@ def run_ros_bridge(
         try:
             scheduling = settings.scheduling()
             if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(scheduling, cores=()))  # of which a camera's command would inherit
+                set_realtime(
+                    replace(scheduling, cores=())
+                )  # without ``cores``, which a camera's command would inherit
             report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat, suppress(KeyboardInterrupt):  # the usual end, with its counts
 

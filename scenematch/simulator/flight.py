@@ -80,7 +80,7 @@ def picture_at(
     """The picture from a camera at a position.
 
     Args:
-        town: what it looks at.
+        town: the scene.
         camera: intrinsics and mount.
         origin: of the local east-north-up frame.
         east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
@@ -105,8 +105,8 @@ class FlightPlan:
     """A flight before its pictures are rendered.
 
     Attributes:
-        town: what it flies over.
-        camera: what it looks through.
+        town: the ground flown over.
+        camera: of the drone.
         origin: of the local east-north-up frame of its motions: the map's centre; up from the world's height 0.
         truth: the exact motion, one entry per frame.
         telemetry: the motion as the sensors measure it.

@@ -177,7 +177,7 @@ def generator(seed: int, stream: int) -> np.random.Generator:
 
 
 def _shrink(raster: NDArray[Any], times: int) -> NDArray[Any]:
-    """The raster's means over squares of so many pixels."""
+    """The raster's means over squares of pixels."""
     size = (raster.shape[1] // times, raster.shape[0] // times)
     return np.asarray(cv2.resize(raster, size, interpolation=cv2.INTER_AREA))
 

@@ -139,7 +139,9 @@ class WantedMap:
     radius_m: Annotated[
         float | None,
         typer.Option(
-            "--radius-m", metavar="M", help="Least distance to each edge (default: what the photographs cover)."
+            "--radius-m",
+            metavar="M",
+            help="Minimum distance from the centre to each edge (default: what the photographs cover).",
         ),
     ] = None
     gsd_m_per_px: Annotated[
