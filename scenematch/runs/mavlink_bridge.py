@@ -245,9 +245,7 @@ def run_mavlink_bridge(
         with bridge:
             scheduling = settings.scheduling()
             if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(
-                    replace(scheduling, cores=())
-                )  # without ``cores``, which a camera's command would inherit
+                set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
             # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
             with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress, beat)

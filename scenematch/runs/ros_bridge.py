@@ -115,9 +115,7 @@ def run_ros_bridge(
         try:
             scheduling = settings.scheduling()
             if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(
-                    replace(scheduling, cores=())
-                )  # without ``cores``, which a camera's command would inherit
+                set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
             report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat, suppress(KeyboardInterrupt):  # the usual end, with its counts
 
